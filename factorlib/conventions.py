@@ -1,0 +1,74 @@
+"""Frames, directions and units: every convention of the project, said once.
+
+Camera frame  OpenCV: x right, y down, z forward; pixel centres at 0.5 as in COLMAP.  The viewer stands at −z,
+              so the paper's "front" is (0, 0, −1).
+Light frame   the camera frame turned y-up: x right, y up, z toward the viewer (`YUP_FROM_CAMERA`).
+Lat-long map  OpenEXR's "LatLong Environment", shared by Mitsuba's `envmap`: top row +y, the image's centre +z,
+              +x a quarter of the width from the left edge; texel (i, j) has its centre at ((i+½)/H, (j+½)/W).
+Transforms    are named for their frames: `cam_from_object` takes object coordinates to camera coordinates.
+Lobe          w · exp(−σ|ω−z|²) of the paper is a spherical Gaussian w · exp(λ(ω·z − 1)) of sharpness λ = 2σ.
+Roughness     α = roughness².
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+FRONT = np.array([0.0, 0.0, -1.0])  # direction from the scene to the viewer, camera frame
+YUP_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])  # a rotation by π about x, its own inverse
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
+
+
+def lat_long_directions(height: int, width: int) -> Float[np.ndarray, "height width 3"]:
+    """Unit directions of the texel centres of a lat-long map, in the light (y-up) frame.
+
+    >>> lat_long_directions(2, 4)[0].round(3).tolist()[0]
+    [0.5, 0.707, -0.5]
+    """
+    theta = (np.arange(height) + 0.5) / height * np.pi  # from +y, down
+    phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi  # about +y, from +z toward +x
+    sin = np.sin(theta)[:, None]
+    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
+
+
+def lat_long_of_direction(direction: Float[np.ndarray, "*batch 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column in units of the map's height and width, [0, 1], of unit directions in the light frame.
+
+    >>> [float(t) for t in lat_long_of_direction(np.array([1.0, 0.0, 0.0]))]
+    [0.5, 0.25]
+    """
+    x, y, z = np.moveaxis(np.asarray(direction, dtype=float), -1, 0)
+    row = np.arctan2(np.hypot(x, z), y) / np.pi
+    column = 0.5 - np.arctan2(x, z) / (2 * np.pi)
+    return row, column
+
+
+def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, "height"]:
+    """Exact solid angle of one texel of each row, steradians; height × width texels sum to 4π.
+
+    >>> round(float(lat_long_solid_angles(8, 16).sum() * 16 / (4 * np.pi)), 12)
+    1.0
+    """
+    edges = np.cos(np.arange(height + 1) / height * np.pi)
+    return (edges[:-1] - edges[1:]) * 2 * np.pi / width
+
+
+def half_of_normal_and_view(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """The URM's `half` = (2(n·o)n − o + (0,0,−1)) / 2, as in the paper (not of unit length).
+
+    >>> half_of_normal_and_view(FRONT, FRONT).tolist()
+    [0.0, 0.0, -1.0]
+    """
+    cosine = np.sum(normal * view, axis=-1, keepdims=True)
+    return (2 * cosine * normal - view + FRONT) / 2
+
+
+def sharpness_of_precision(precision):
+    """λ = 2σ: the sharpness of the paper's w·exp(−σ|ω−z|²)."""
+    return 2 * precision
+
+
+def alpha_of_roughness(roughness):
+    """GGX α = roughness²."""
+    return roughness**2

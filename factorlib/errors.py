@@ -1,0 +1,48 @@
+"""The one error a user can mend.
+
+Whatever is wrong with a user's files or words is an `InputError`: it says what was found and where, what was
+expected, and how to mend it.  Everything else that is raised is a defect of this project.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from os import PathLike
+
+
+class InputError(ValueError):
+    """Something in a user's input that the user can mend.
+
+    >>> print(InputError("unknown material 'rde'", file="dataset.yaml", key="photos[0]", cure="did you mean 'red'?"))
+    dataset.yaml: photos[0]: unknown material 'rde'
+      did you mean 'red'?
+    """
+
+    def __init__(self, found: str, *, file: str | PathLike | None = None, key: str | None = None, cure: str | None = None):
+        self.found, self.file, self.key, self.cure = found, file, key, cure
+        super().__init__(found)
+
+    def __str__(self) -> str:
+        where = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
+        cure = f"\n  {self.cure}" if self.cure else ""
+        return f"{where}{self.found}{cure}"
+
+    def __reduce__(self):  # survives the trip back from a worker process
+        return _rebuild, (self.found, self.file, self.key, self.cure)
+
+
+def _rebuild(found, file, key, cure):
+    return InputError(found, file=file, key=key, cure=cure)
+
+
+def did_you_mean(word: str, known) -> str:
+    """A cure that names the nearest of the `known` words, or all of them.
+
+    >>> did_you_mean("soruce", ["source", "target"])
+    "did you mean 'source'?"
+    >>> did_you_mean("x", ["source", "target"])
+    "known are: 'source', 'target'"
+    """
+    known = sorted(str(k) for k in known)
+    near = get_close_matches(word, known, n=1)
+    return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known))

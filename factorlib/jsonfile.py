@@ -1,0 +1,31 @@
+"""JSON on disk: sorted keys, shortest round-trip floats, no NaN, so that the same value is the same bytes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from factorlib.errors import InputError
+
+
+def json_text(value: Any) -> str:
+    """`value` (plain, or msgspec structs) as indented JSON; raises ValueError for NaN and infinity.
+
+    >>> json_text({"b": 1, "a": [0.1]})
+    '{\\n "a": [\\n  0.1\\n ],\\n "b": 1\\n}\\n'
+    """
+    return json.dumps(msgspec.to_builtins(value), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    Path(path).write_text(json_text(value), encoding="utf-8")
+
+
+def read_json(path: str | Path) -> Any:
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"not readable as JSON ({error})", file=path, cure="delete it and run its stage again") from error
