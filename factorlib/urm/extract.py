@@ -1,0 +1,66 @@
+"""From a photo's radiance and its aligned geometry to observations.
+
+A pixel is observed where the mask and the mesh name the same material, the radiance is valid, and the shading
+normal faces the camera: elsewhere the normal belongs to something else than the radiance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.urm.observations import Observations
+
+Channels = Mapping[str, Float[np.ndarray, "h w"]]
+GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint can be trusted
+
+
+def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float = 0.0) -> Bool[np.ndarray, "h w"]:
+    """Where mask and mesh agree on the material and the surface faces the camera."""
+    facing = sum(geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz") > GRAZING
+    agrees = np.rint(photo["label"]) == np.rint(geometry["label"])
+    labelled = photo["label"] > 0.5
+    return labelled & agrees & facing & (photo["valid"] > 0.5) & (geometry["confidence"] > least_confidence)
+
+
+def observations_of_photo(
+    photo: Channels,
+    geometry: Channels,
+    *,
+    name: str,
+    illumination: str,
+    materials: Sequence[str],
+    least_confidence: float = 0.0,
+) -> Observations:
+    """One observation per observed pixel, in row order; `weight` is the confidence of its normal, 0 to 1.
+
+    photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
+    geometry:  channels normal.x/y/z, view.x/y/z, label, confidence of the stage `align`
+    """
+    seen = observed_pixels(photo, geometry, least_confidence)
+    y, x = np.nonzero(seen)
+
+    def gather(channels: Channels, names: Sequence[str]) -> np.ndarray:
+        return np.stack([channels[n][seen] for n in names], axis=-1)
+
+    return Observations(
+        normal=_unit(gather(geometry, ["normal.x", "normal.y", "normal.z"])),
+        view=_unit(gather(geometry, ["view.x", "view.y", "view.z"])),
+        radiance=np.maximum(gather(photo, "RGB"), 0.0),
+        clipped=gather(photo, ["clipped.R", "clipped.G", "clipped.B"]) > 0.5,
+        material=np.rint(photo["label"][seen]).astype("i2") - 1,
+        photo=np.zeros(len(x), "i4"),
+        illumination=np.zeros(len(x), "i4"),
+        x=x.astype("i4"),
+        y=y.astype("i4"),
+        weight=geometry["confidence"][seen],
+        materials=tuple(materials),
+        photos=(name,),
+        illuminations=(illumination,),
+    )
+
+
+def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

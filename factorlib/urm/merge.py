@@ -1,0 +1,59 @@
+"""Merging observations of nearly the same normal and view into weighted ones.
+
+Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
+Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
+mean: normal, view and radiance alike, so that what is lost is second order in the cell's size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.urm.observations import Observations
+
+
+def merge(observations: Observations, degrees: float) -> Observations:
+    """Merge within cells of about `degrees`; 0 merges nothing.  The total weight is kept.
+
+    `x` and `y` become those of the group's first pixel.
+    """
+    if degrees <= 0 or len(observations) == 0:
+        return observations
+    cell = np.radians(degrees)
+    mirror = 2 * np.sum(observations.normal * observations.view, -1, keepdims=True) * observations.normal - observations.view
+    flags = observations.clipped @ np.array([1, 2, 4])
+    keys = np.column_stack([observations.photo, observations.material, flags, _cells(observations.normal, cell), _cells(mirror, 2 * cell)])
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return _merged(observations, first, group.reshape(-1))
+
+
+def _cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n 3"]:
+    """Cells of roughly `size` radians: an octahedral map of the sphere, cut into squares."""
+    x, y, z = np.moveaxis(direction / np.abs(direction).sum(-1, keepdims=True), -1, 0)
+    fold = z > 0  # the viewer's side (z < 0) stays whole in the middle
+    u = np.where(fold, (1 - np.abs(y)) * np.sign(x), x)
+    v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
+    step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
+    return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)
+
+
+def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[np.ndarray, "n"]) -> Observations:
+    weight = np.maximum(observations.weight.astype(float), 1e-12)
+    total = np.bincount(group, weight)
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
+        return np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
+
+    def unit(vectors: np.ndarray) -> np.ndarray:
+        return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype("f4")
+
+    kept = observations.take(first)
+    return Observations(
+        normal=unit(mean(observations.normal)),
+        view=unit(mean(observations.view)),
+        radiance=mean(observations.radiance).astype("f4"),
+        weight=total.astype("f4"),
+        **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
+        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations")},
+    )

@@ -1,0 +1,108 @@
+"""Observations of materials in photos: one row per pixel (or per merged group of pixels), as a struct of arrays.
+
+The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, radiance linear, the names behind the
+indices and the units in the schema metadata under the key `factorlib`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float, Int
+
+from factorlib.conventions import half_of_normal_and_view
+from factorlib.errors import InputError
+
+VECTORS = ("normal", "half", "view", "radiance")
+UNITS = {
+    "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
+    "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo", "x": "pixels", "y": "pixels", "weight": "pixels"},
+}
+
+
+class Observations(msgspec.Struct, frozen=True):
+    """n observations of `materials` in `photos`; indices are positions in the tuples of names."""
+
+    normal: Float[np.ndarray, "n 3"]
+    view: Float[np.ndarray, "n 3"]  # unit, toward the camera
+    radiance: Float[np.ndarray, "n 3"]
+    clipped: Bool[np.ndarray, "n 3"]  # radiance is a lower bound
+    material: Int[np.ndarray, "n"]
+    photo: Int[np.ndarray, "n"]
+    illumination: Int[np.ndarray, "n"]
+    x: Int[np.ndarray, "n"]
+    y: Int[np.ndarray, "n"]
+    weight: Float[np.ndarray, "n"]
+    materials: tuple[str, ...]
+    photos: tuple[str, ...]
+    illuminations: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    @property
+    def half(self) -> Float[np.ndarray, "n 3"]:
+        return half_of_normal_and_view(self.normal, self.view)
+
+    def take(self, rows: np.ndarray) -> Observations:
+        """The observations of `rows` (indices or a mask), with the same names."""
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+
+
+COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
+DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
+          "x": "i4", "y": "i4", "weight": "f4"}  # fmt: skip
+
+
+def write_observations(path: str | Path, observations: Observations) -> None:
+    """Write the fixed Parquet columns."""
+    columns = {}
+    for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:]):
+        dtype = DTYPES.get(name, "f4")
+        values = np.ascontiguousarray(getattr(observations, name), dtype=dtype)
+        flat = pa.array(values.reshape(-1))
+        columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
+    names = {"materials": observations.materials, "photos": observations.photos, "illuminations": observations.illuminations}
+    metadata = {"factorlib": json.dumps({**UNITS, **names}, sort_keys=True, ensure_ascii=False)}
+    pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
+
+
+def read_observations(path: str | Path) -> Observations:
+    """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
+    try:
+        table = pq.read_table(path)
+        names = json.loads(table.schema.metadata[b"factorlib"])
+        columns = {name: _array(table[name].combine_chunks(), DTYPES[name]) for name in COLUMNS}
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"not a reflectance map ({error})", file=path, cure="run the stage `urm` again") from error
+    return Observations(**columns, **{k: tuple(names[k]) for k in ("materials", "photos", "illuminations")})
+
+
+def concatenate(parts: Sequence[Observations]) -> Observations:
+    """All observations of `parts`, indices renumbered over the sorted union of names: the order of parts changes no index."""
+    parts = sorted(parts, key=lambda part: part.photos)
+    materials = parts[0].materials
+    if any(part.materials != materials for part in parts):
+        raise InputError("reflectance maps of different material lists", cure="run the stage `urm` again for all photos")
+    names = {kind: tuple(sorted({n for part in parts for n in getattr(part, kind)})) for kind in ("photos", "illuminations")}
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
+        renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
+        columns[column] = np.concatenate(renumbered).astype("i4")
+    return Observations(**columns, materials=materials, **names)
+
+
+def _renumber(index: np.ndarray, old: Sequence[str], new: Sequence[str]) -> np.ndarray:
+    return np.array([new.index(name) for name in old], dtype="i4")[index] if len(old) else index
+
+
+def _array(column: pa.Array, dtype: str) -> np.ndarray:
+    if pa.types.is_fixed_size_list(column.type):
+        return column.flatten().to_numpy(zero_copy_only=False).astype(dtype).reshape(-1, column.type.list_size)
+    return column.to_numpy(zero_copy_only=False).astype(dtype)

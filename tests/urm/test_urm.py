@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from factorlib.conventions import FRONT
+from factorlib.errors import InputError
+from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import COLUMNS, concatenate, read_observations, write_observations
+
+
+def photo_and_geometry(size=64):
+    """A unit sphere seen from the front by a distant camera: normals are known by hand."""
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
+    inside = x**2 + y**2 < 0.98
+    z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    one = inside.astype("f4")
+    geometry = {"normal.x": x * one, "normal.y": y * one, "normal.z": z * one, "view.x": 0 * one, "view.y": 0 * one, "view.z": -one}
+    geometry |= {"label": np.where(x < 0, 1, 2) * one, "confidence": one}
+    photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": np.where(x < 0, 1, 2) * one, "valid": one}
+    photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}
+    return photo, geometry
+
+
+def observations(name="kitchen", illumination="kitchen", **changed):
+    photo, geometry = photo_and_geometry()
+    return observations_of_photo({**photo, **changed}, geometry, name=name, illumination=illumination, materials=("red", "white"))
+
+
+def test_a_pixel_is_observed_where_mask_and_mesh_agree():
+    photo, _ = photo_and_geometry()
+    everything = observations()
+    swapped = observations(label=np.where(photo["label"] == 1, 2, photo["label"]))
+    invalid = observations(valid=np.zeros_like(photo["label"]))
+    assert set(everything.material) == {0, 1}
+    assert set(swapped.material) == {1}
+    assert len(invalid) == 0
+
+
+def test_what_faces_away_or_grazes_is_not_observed():
+    seen = observations()
+    assert (np.sum(seen.normal * seen.view, -1) > 0.05).all()
+
+
+def test_half_of_a_normal_facing_the_viewer_is_the_front():
+    seen = observations()
+    middle = np.argmax(seen.normal @ FRONT)
+    np.testing.assert_allclose(seen.half[middle], FRONT, atol=0.05)
+
+
+def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path):
+    seen = observations()
+    write_observations(tmp_path / "a.parquet", seen)
+    write_observations(tmp_path / "b.parquet", read_observations(tmp_path / "a.parquet"))
+    again = read_observations(tmp_path / "b.parquet")
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(seen, name).astype(getattr(again, name).dtype))
+    assert (again.materials, again.photos) == (("red", "white"), ("kitchen",))
+
+
+def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
+    (tmp_path / "x.parquet").write_bytes(b"PAR1 nonsense")
+    with pytest.raises(InputError, match="not a reflectance map"):
+        read_observations(tmp_path / "x.parquet")
+
+
+def test_the_order_of_photos_changes_nothing():
+    a, b = observations("a", "room"), observations("b", "garden")
+    one, other = concatenate([a, b]), concatenate([b, a])
+    assert one.illuminations == ("garden", "room")
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert [one.illuminations[i] for i in one.illumination[one.photo == 0][:1]] == ["room"]
+
+
+@pytest.mark.parametrize("degrees", [1.0, 3.0, 10.0])
+def test_merging_keeps_weight_and_mean_and_moves_normals_by_less_than_a_cell(degrees):
+    seen = observations()
+    merged = merge(seen, degrees)
+    assert len(merged) < len(seen)
+    np.testing.assert_allclose(merged.weight.sum(), seen.weight.sum(), rtol=1e-5)
+    for m in range(2):  # per material: groups never mix materials
+        of_m, of_m_merged = seen.material == m, merged.material == m
+        total = (merged.radiance * merged.weight[:, None])[of_m_merged].sum(0)
+        np.testing.assert_allclose(total, (seen.radiance * seen.weight[:, None])[of_m].sum(0), rtol=1e-4)
+    nearest = np.arccos(np.clip((seen.normal @ merged.normal.T).max(1), -1, 1))
+    assert np.degrees(nearest.max()) < 1.5 * degrees
+    np.testing.assert_allclose(np.linalg.norm(merged.normal, axis=1), 1, atol=1e-5)
+
+
+def test_merging_never_mixes_clipped_with_unclipped():
+    seen = observations()
+    merged = merge(seen, 10.0)
+    kept = merged.weight[merged.clipped[:, 0]].sum()
+    np.testing.assert_allclose(kept, seen.weight[seen.clipped[:, 0]].sum(), rtol=1e-5)
+
+
+def test_merging_nothing_is_the_identity():
+    seen = observations()
+    assert merge(seen, 0.0) is seen
