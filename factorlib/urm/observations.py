@@ -48,7 +48,7 @@ class Observations(msgspec.Struct, frozen=True):
 
     @property
     def half(self) -> Float[np.ndarray, "n 3"]:
-        return half_of_normal_and_view(self.normal, self.view)
+        return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
