@@ -1,0 +1,222 @@
+"""What can be wrong with a dataset without opening a single image or mesh; each is refused with its key and a cure.
+
+`check_dataset` and `check_truth` walk a decoded file once and raise at the first thing that does not hold.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import msgspec
+
+from factorlib.dataset.schema import ENCODINGS, FORMAT, MAX_MATERIALS, DatasetFile, MeshEntry, ObjectEntry, PhotoEntry, TruthFile
+from factorlib.errors import InputError, did_you_mean
+
+NAME = re.compile(r"[A-Za-z0-9_-]+")
+IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr")
+MASKS = (".png", ".json")
+MESHES = (".obj", ".ply", ".gltf", ".glb")
+MAPS = (".exr", ".hdr")
+RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
+ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1: matrices typed with four digits pass
+
+
+class Refusal:
+    """The file that is being checked, the folder its paths stay in, and how to refuse a key of it."""
+
+    def __init__(self, file: Path, folder: Path):
+        self.file, self.folder = file, folder
+
+    def __call__(self, key: str, found: str, cure: str) -> NoReturn:
+        raise InputError(found, file=self.file, key=key, cure=cure)
+
+
+def check_dataset(spec: DatasetFile, file: Path) -> None:
+    """Raise InputError, naming `file`, key and cure, unless everything in dataset.yaml holds together."""
+    refuse = Refusal(file, file.parent)
+    if spec.format != FORMAT:
+        refuse("format", f"format {spec.format} is not known", f"this version reads format: {FORMAT}")
+    _check_numbers(spec, refuse)
+    _check_materials(spec.materials, refuse)
+    for name, mesh in spec.meshes.items():
+        _check_mesh(name, mesh, spec.materials, refuse)
+    if not spec.photos:
+        refuse("photos", "there are no photos", "add at least one: {name: …, image: …, masks: …}")
+    _check_unique("photos", (photo.name for photo in spec.photos), "photo", refuse)
+    for index, photo in enumerate(spec.photos):
+        _check_photo(f"photos[{index}]", photo, spec, refuse)
+    _check_lights(spec.photos, refuse)
+    if spec.truth is not None:
+        check_path("truth", spec.truth, (".yaml", ".yml"), refuse, must_exist=False)
+
+
+def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -> None:
+    """The same for truth.yaml: every name in it is one of the dataset's, every map a path inside `folder`."""
+    refuse = Refusal(file, folder)
+    _check_numbers(truth, refuse)
+    photos = {photo.name: photo for photo in spec.photos}
+    lights = {photo.illumination or photo.name for photo in spec.photos}
+    for name in truth.materials:
+        _check_known(f"materials.{name}", name, spec.materials, "material", refuse)
+    for group, known, kind in (("illumination", lights, "illumination"), ("normals", photos, "photo")):
+        for name, path in getattr(truth, group).items():
+            _check_known(f"{group}.{name}", name, known, kind, refuse)
+            check_path(f"{group}.{name}", path, MAPS, refuse, must_exist=False)
+    for name, poses in truth.poses.items():
+        _check_known(f"poses.{name}", name, photos, "photo", refuse)
+        for thing, pose in poses.items():
+            _check_known(f"poses.{name}.{thing}", thing, [o.name for o in photos[name].objects], "object", refuse)
+            _check_rotation(f"poses.{name}.{thing}.rotation", pose.rotation, refuse)
+
+
+def check_path(key: str, path: str, suffixes: Iterable[str], refuse: Refusal, must_exist: bool = True) -> None:
+    """A path of a known suffix that leads to a file inside the dataset's folder, links followed."""
+    target, root = refuse.folder / path, refuse.folder.resolve()
+    if not path or Path(path).is_absolute() or not target.resolve().is_relative_to(root):
+        refuse(key, f"{path!r} leads outside the dataset", f"copy the file into {root} and name it relative to that folder")
+    if target.suffix.lower() not in suffixes:
+        refuse(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
+    if must_exist and not target.is_file():
+        refuse(key, f"there is no file {path!r}", _nearby(target))
+
+
+def _nearby(target: Path) -> str:
+    names = [entry.name for entry in target.parent.iterdir() if entry.is_file()] if target.parent.is_dir() else []
+    cure = did_you_mean(target.name, names)
+    return cure if cure.startswith("did") else f"put it at {target}, or correct the path"
+
+
+def _check_numbers(value: Any, refuse: Refusal) -> None:
+    for key, number in _numbers(msgspec.to_builtins(value), ""):
+        if not math.isfinite(number):
+            refuse(key, f"{number} is not a finite number", "give a number, or leave the key out")
+
+
+def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, float):
+        yield key, value
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _numbers(item, f"{key}.{name}" if key else name)
+    elif isinstance(value, (list, tuple)):
+        for index, item in enumerate(value):
+            yield from _numbers(item, f"{key}[{index}]")
+
+
+def _check_name(key: str, name: str, refuse: Refusal) -> None:
+    if not NAME.fullmatch(name):
+        refuse(key, f"{name!r} is not a name", "names are made of A-Z a-z 0-9 _ and -, for they name files")
+
+
+def _check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:
+    known = list(known)
+    if name not in known:
+        refuse(key, f"unknown {kind} {name!r}", did_you_mean(name, known) if known else f"the dataset has no {kind} here")
+
+
+def _check_unique(key: str, names: Iterable[str], kind: str, refuse: Refusal) -> None:
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if name in first:
+            refuse(f"{key}[{index}].name", f"duplicate {kind} name {name!r}", f"{key}[{first[name]}] has it already: rename one")
+        first[name] = index
+
+
+def _check_materials(materials: list[str], refuse: Refusal) -> None:
+    if not 0 < len(materials) <= MAX_MATERIALS:
+        refuse("materials", f"{len(materials)} materials", f"give 1 to {MAX_MATERIALS}: a mask has no more labels")
+    for index, name in enumerate(materials):
+        _check_name(f"materials[{index}]", name, refuse)
+        if name in materials[:index]:
+            refuse(f"materials[{index}]", f"material {name!r} is named twice", "label k is the k-th material: name each once")
+
+
+def _check_mesh(name: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
+    key = f"meshes.{name}"
+    _check_name(key, name, refuse)
+    check_path(f"{key}.file", mesh.file, MESHES, refuse)
+    if mesh.parts and mesh.material is not None:
+        refuse(key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one")
+    if not mesh.parts and mesh.material is None:
+        refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
+    if mesh.parts and mesh.file.lower().endswith(".ply"):
+        refuse(f"{key}.parts", "a PLY file has no parts", "give one `material:`, or save the mesh as OBJ or glTF")
+    if mesh.material is not None:
+        _check_known(f"{key}.material", mesh.material, materials, "material", refuse)
+    for part, material in (mesh.parts or {}).items():
+        _check_known(f"{key}.parts.{part}", material, materials, "material", refuse)
+
+
+def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
+    _check_name(f"{key}.name", photo.name, refuse)
+    if photo.name in RESERVED_PHOTOS:
+        refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
+    check_path(f"{key}.image", photo.image, IMAGES, refuse)
+    if photo.encoding is not None:
+        _check_known(f"{key}.encoding", photo.encoding, ENCODINGS, "encoding", refuse)
+    if photo.illumination is not None:
+        _check_name(f"{key}.illumination", photo.illumination, refuse)
+    if photo.world_from_camera is not None:
+        _check_rotation(f"{key}.world_from_camera", photo.world_from_camera, refuse)
+    if photo.camera is not None and photo.camera.focal_px is not None and photo.camera.focal_px <= 0:
+        refuse(f"{key}.camera.focal_px", f"a focal length of {photo.camera.focal_px}", "give pixels, more than 0, or leave it out")
+    _check_masks(f"{key}.masks", photo, spec.materials, refuse)
+    if not photo.objects:
+        refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", "add {name: …, mesh: …}: a mesh gives its pixels their normals")
+    _check_unique(f"{key}.objects", (thing.name for thing in photo.objects), "object", refuse)
+    for index, thing in enumerate(photo.objects):
+        _check_object(f"{key}.objects[{index}]", thing, spec, refuse)
+
+
+def _check_masks(key: str, photo: PhotoEntry, materials: list[str], refuse: Refusal) -> None:
+    if isinstance(photo.masks, str):
+        return check_path(key, photo.masks, MASKS, refuse)
+    if not photo.masks:
+        refuse(key, "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
+    for material, path in photo.masks.items():
+        _check_known(f"{key}.{material}", material, materials, "material", refuse)
+        check_path(f"{key}.{material}", path, (".png",), refuse)
+
+
+def _check_object(key: str, thing: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
+    _check_name(f"{key}.name", thing.name, refuse)
+    _check_known(f"{key}.mesh", thing.mesh, spec.meshes, "mesh", refuse)
+    parts = spec.meshes[thing.mesh].parts
+    for part, material in thing.materials.items():
+        if not parts:
+            refuse(f"{key}.materials", f"mesh {thing.mesh!r} has no parts to override", "add a mesh entry of the same file with that material")
+        _check_known(f"{key}.materials.{part}", part, parts, "part", refuse)
+        _check_known(f"{key}.materials.{part}", material, spec.materials, "material", refuse)
+    if thing.mask is not None:
+        check_path(f"{key}.mask", thing.mask, (".png",), refuse)
+    if thing.pose is not None:
+        _check_rotation(f"{key}.pose.rotation", thing.pose.rotation, refuse)
+
+
+def _check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
+    gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
+    worst = max(abs(entry) for row in gram for entry in row)
+    if worst > ROTATION_TOLERANCE:
+        refuse(key, f"not a rotation: RᵀR differs from 1 by {worst:.3g}", "its columns must be unit vectors at right angles (no scale)")
+    a, b, c = rows
+    determinant = sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3))
+    if determinant < 0:
+        refuse(key, "not a rotation but a reflection (determinant −1)", "one axis is flipped: the camera frame is x right, y down, z forward")
+
+
+def _check_lights(photos: list[PhotoEntry], refuse: Refusal) -> None:
+    """Photos that share a light are all fixed to the camera, or all to the world."""
+    first: dict[str, int] = {}
+    for index, photo in enumerate(photos):
+        light = photo.illumination or photo.name
+        other = first.setdefault(light, index)
+        if (photos[other].world_from_camera is None) != (photo.world_from_camera is None):
+            refuse(
+                f"photos[{index}].world_from_camera",
+                f"of the photos in illumination {light!r}, only one of {photos[other].name!r} and {photo.name!r} has it",
+                "give it for every photo that shares a light fixed to the world, or for none (a light fixed to the camera)",
+            )

@@ -1,0 +1,160 @@
+"""The fixed dataset format as types, and the slices of it that stages are handed.
+
+`DatasetFile` and `TruthFile` mirror dataset.yaml and truth.yaml key by key.  The `…Slice` structs are what a stage
+converts its facts to: `msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)`.  Every path is relative to the
+dataset's folder.  Frames, units and directions are those of `factorlib.conventions`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+FORMAT = 1
+LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
+MAX_MATERIALS = LEFT_OUT - 1
+ENCODINGS = ("srgb", "linear", "gamma2.2")
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Mat3 = tuple[Vec3, Vec3, Vec3]  # rows
+Masks = str | dict[str, str]  # a label PNG, a COCO json, or {material: PNG}
+
+
+class _Format(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A piece of a file a user writes: an unknown key is an error."""
+
+
+class MeshEntry(_Format):
+    """A mesh of several parts (OBJ group or usemtl, glTF primitive or material -> material), or of one material."""
+
+    file: str
+    parts: dict[str, str] | None = None
+    material: str | None = None
+
+
+class Camera(_Format):
+    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is found."""
+
+    focal_px: float | None = None
+    principal_point: Vec2 | None = None
+
+
+class Pose(_Format):
+    """cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
+
+    rotation: Mat3
+    translation: Vec3
+
+
+class ObjectEntry(_Format):
+    """One instance of a mesh in a photo; `materials` overrides the mesh's parts, `mask` is its own silhouette."""
+
+    name: str
+    mesh: str
+    materials: dict[str, str] = {}
+    mask: str | None = None
+    pose: Pose | None = None
+
+
+class PhotoEntry(_Format):
+    """One photo.  `illumination` defaults to the photo's name; `world_from_camera` fixes its light to the world."""
+
+    name: str
+    image: str
+    masks: Masks
+    encoding: str | None = None
+    illumination: str | None = None
+    world_from_camera: Mat3 | None = None
+    camera: Camera | None = None
+    objects: list[ObjectEntry] = []
+
+
+class DatasetFile(_Format):
+    """dataset.yaml."""
+
+    format: int
+    materials: list[str]
+    photos: list[PhotoEntry]
+    meshes: dict[str, MeshEntry] = {}
+    truth: str | None = None
+
+
+class TrueMaterial(_Format):
+    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
+
+    diffuse: Vec3
+    specular: Vec3
+    roughness: float
+
+
+class TruthFile(_Format):
+    """truth.yaml; its paths are relative to the dataset's folder too."""
+
+    materials: dict[str, TrueMaterial] = {}
+    illumination: dict[str, str] = {}
+    normals: dict[str, str] = {}
+    poses: dict[str, dict[str, Pose]] = {}
+
+
+class Dataset(msgspec.Struct, frozen=True):
+    """A dataset that has been read and found good.
+
+    companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
+    """
+
+    folder: Path
+    spec: DatasetFile
+    companions: dict[str, list[str]] = {}
+    truth: TruthFile | None = None
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    def photo(self, name: str) -> PhotoEntry:
+        return next(photo for photo in self.spec.photos if photo.name == name)
+
+
+class ObjectMask(msgspec.Struct, frozen=True):
+    """An object in the order of dataset.yaml and its own silhouette, if it has one."""
+
+    name: str
+    mask: str | None
+
+
+class PhotoSlice(msgspec.Struct, frozen=True):
+    """What is needed to read a photo and its masks."""
+
+    image: str
+    encoding: Literal["srgb", "linear", "gamma2.2"] | None
+    masks: Masks
+    focal_px: float | None
+    illumination: str
+    objects: list[ObjectMask]
+
+
+class ObjectsSlice(msgspec.Struct, frozen=True):
+    """What is needed to lay meshes over a photo: its camera, its objects, and the meshes these use."""
+
+    camera: Camera
+    objects: list[ObjectEntry]
+    meshes: dict[str, MeshEntry]
+
+
+class LightSlice(msgspec.Struct, frozen=True):
+    """Which light a photo is in, and the rotation that fixes it to the world (None: fixed to the camera)."""
+
+    illumination: str
+    world_from_camera: Mat3 | None
+
+
+class SetSlice(msgspec.Struct, frozen=True):
+    """The set as a whole, in the order of dataset.yaml."""
+
+    name: str
+    materials: list[str]
+    meshes: dict[str, MeshEntry]
+    photos: list[str]

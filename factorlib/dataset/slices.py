@@ -1,0 +1,93 @@
+"""The slice of a dataset that a stage sees: its facts (JSON-able) and the files these name.
+
+A step's key holds the slices it declares and the hashes of their files, so a slice carries only what its readers
+need, with defaults filled in: naming the default illumination, or reordering photos, changes no photo's facts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from factorlib.dataset import schema
+from factorlib.dataset.read import truth_paths
+from factorlib.dataset.schema import Dataset, PhotoEntry
+from factorlib.errors import did_you_mean
+
+
+class Slice(msgspec.Struct, frozen=True):
+    """facts: plain JSON-able values; files: the dataset-relative paths in them, sorted, each once."""
+
+    facts: Any
+    files: list[str]
+
+
+def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
+    """The slice `name` of one photo, or of the set.
+
+    photo, objects, light are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
+    materials, set, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
+    """
+    if name in _OF_SET:
+        facts, files = _OF_SET[name](dataset)
+    elif name not in _OF_PHOTO:
+        raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
+    elif photo is not None:
+        facts, files = _OF_PHOTO[name](dataset, dataset.photo(photo))
+    else:
+        parts = {entry.name: _OF_PHOTO[name](dataset, entry) for entry in dataset.spec.photos}
+        facts = {key: part[0] for key, part in parts.items()}
+        files = [file for part in parts.values() for file in part[1]]
+    return Slice(facts=_json_able(facts), files=sorted(set(files)))
+
+
+def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list[str]]:
+    facts = schema.PhotoSlice(
+        image=photo.image,
+        encoding=photo.encoding,
+        masks=photo.masks,
+        focal_px=photo.camera.focal_px if photo.camera else None,
+        illumination=photo.illumination or photo.name,
+        objects=[schema.ObjectMask(thing.name, thing.mask) for thing in photo.objects],
+    )
+    masks = [photo.masks] if isinstance(photo.masks, str) else list(photo.masks.values())
+    return facts, [photo.image, *masks, *_object_masks(photo)]
+
+
+def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
+    meshes = {thing.mesh: dataset.spec.meshes[thing.mesh] for thing in photo.objects}
+    facts = schema.ObjectsSlice(camera=photo.camera or schema.Camera(), objects=photo.objects, meshes=meshes)
+    files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
+    return facts, files + _object_masks(photo)
+
+
+def _light(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.LightSlice, list[str]]:
+    return schema.LightSlice(photo.illumination or photo.name, photo.world_from_camera), []
+
+
+def _materials(dataset: Dataset) -> tuple[list[str], list[str]]:
+    return dataset.spec.materials, []
+
+
+def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
+    spec = dataset.spec
+    return schema.SetSlice(dataset.name, spec.materials, spec.meshes, [photo.name for photo in spec.photos]), []
+
+
+def _truth(dataset: Dataset) -> tuple[schema.TruthFile | None, list[str]]:
+    return dataset.truth, truth_paths(dataset.truth) if dataset.truth else []
+
+
+def _object_masks(photo: PhotoEntry) -> list[str]:
+    return [thing.mask for thing in photo.objects if thing.mask]
+
+
+def _json_able(facts: Any) -> Any:
+    return msgspec.json.decode(msgspec.json.encode(facts))
+
+
+_OF_PHOTO: dict[str, Callable] = {"photo": _photo, "objects": _objects, "light": _light}
+_OF_SET: dict[str, Callable] = {"materials": _materials, "set": _set, "truth": _truth}
+SLICES = (*_OF_PHOTO, *_OF_SET)
