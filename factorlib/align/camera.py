@@ -1,0 +1,66 @@
+"""The pinhole camera of a photo and rigid poses: OpenCV axes, pixel centres at 0.5, as in COLMAP."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+
+class Camera(msgspec.Struct, frozen=True):
+    """COLMAP's SIMPLE_PINHOLE, all in pixels of the photo as displayed."""
+
+    width: int
+    height: int
+    focal: float
+    centre: tuple[float, float]  # principal point
+
+    def colmap(self) -> pycolmap.Camera:
+        parameters = [self.focal, *self.centre]
+        return pycolmap.Camera(model="SIMPLE_PINHOLE", width=self.width, height=self.height, params=parameters)
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Pixels of points in the camera frame, z > 0."""
+        return self.focal * points[..., :2] / points[..., 2:] + np.array(self.centre)
+
+    def window(self, left: float, top: float, pixel: float, width: int, height: int) -> "Camera":
+        """The camera of a width × height image whose corner lies at (left, top) and whose pixels are `pixel` wide here."""
+        centre = ((self.centre[0] - left) / pixel, (self.centre[1] - top) / pixel)
+        return Camera(width, height, self.focal / pixel, centre)
+
+    def rays(self) -> Float[np.ndarray, "h w 3"]:
+        """Directions through the pixel centres, z = 1, camera frame."""
+        x = (np.arange(self.width) + 0.5 - self.centre[0]) / self.focal
+        y = (np.arange(self.height) + 0.5 - self.centre[1]) / self.focal
+        grid = np.empty((self.height, self.width, 3))
+        grid[..., 0], grid[..., 1], grid[..., 2] = x[None, :], y[:, None], 1.0
+        return grid
+
+
+class Pose(msgspec.Struct, frozen=True):
+    """cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        return points @ self.rotation.T + self.translation
+
+    def colmap(self) -> pycolmap.Rigid3d:
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), self.translation)
+
+
+def rotation_of_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Turn about `vector` by its length in radians."""
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 3"]) -> float:
+    """Angle in degrees of the turn between two rotations.
+
+    >>> round(angle_between(np.eye(3), rotation_of_vector(np.array([0.0, 0.5, 0.0]))), 6)
+    28.647890
+    """
+    return float(np.rad2deg(Rotation.from_matrix(first @ second.T).magnitude()))

@@ -1,0 +1,128 @@
+"""What each pixel sees: normals, view directions, depth, material label and object, by Open3D's ray casting on the CPU.
+
+Rays are cast in each mesh's own frame, moved to its centre and scaled to unit radius, so that a mesh in millimetres
+far from its origin keeps single precision; a mesh's acceleration structure is built once and serves every pose.
+
+Sides.  A face seen from behind is a face: the inside of an open shell, or a face that the file wound the wrong way.
+Its normal is turned to the viewer and the pixel marked `back`.
+Shading normals.  Interpolated normals near the contour can face away from the viewer though the face does not; they
+are bent in the plane of normal and view to the nearest direction with n·v ≥ MIN_COSINE and marked `bent`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import open3d as o3d
+from jaxtyping import Bool, Float, Int
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.meshes.mesh import Mesh
+
+MIN_COSINE = 0.01
+NO_FACE = o3d.t.geometry.RaycastingScene.INVALID_ID
+
+
+class Maps(msgspec.Struct, frozen=True):
+    """Per pixel; 0 or False where no mesh is seen.
+
+    normal  [h, w, 3] unit, shading, camera frame, facing the viewer      view  [h, w, 3] unit, toward the camera
+    depth   [h, w] z in mesh units      label [h, w] int, mesh's material    object [h, w] int, from 1
+    back    seen from behind            bent  the smooth normal faced away and was bent to face the viewer
+    edge    cosine between face normal and view, 0..1
+    """
+
+    normal: Float[np.ndarray, "h w 3"]
+    view: Float[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]
+    label: Int[np.ndarray, "h w"]
+    object: Int[np.ndarray, "h w"]
+    back: Bool[np.ndarray, "h w"]
+    bent: Bool[np.ndarray, "h w"]
+    edge: Float[np.ndarray, "h w"]
+
+
+class Hits(msgspec.Struct, frozen=True):
+    """First intersections of one mesh: depth (inf for none) and face (−1), barycentric uv of the 2nd and 3rd corner."""
+
+    depth: Float[np.ndarray, "h w"]
+    face: Int[np.ndarray, "h w"]
+    uv: Float[np.ndarray, "h w 2"]
+
+
+class Caster:
+    """A mesh ready for rays; build once, use for any pose and camera."""
+
+    def __init__(self, mesh: Mesh):
+        self.mesh, self.centre, self.radius = mesh, mesh.centre, mesh.radius
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        vertices = ((mesh.vertices - self.centre) / self.radius).astype(np.float32)
+        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+
+    def cast(self, camera: Camera, pose: Pose) -> Hits:
+        """What the rays through the pixel centres of `camera` meet first."""
+        origin = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
+        rays = np.empty((camera.height, camera.width, 6), np.float32)
+        rays[..., :3] = origin
+        rays[..., 3:] = camera.rays() @ (pose.rotation / self.radius)  # z = 1: distance along the ray is depth
+        found = self._scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
+        face = found["primitive_ids"].numpy()
+        return Hits(
+            depth=found["t_hit"].numpy().astype(float),
+            face=np.where(face == NO_FACE, -1, face.astype(np.int64)),
+            uv=found["primitive_uvs"].numpy().astype(float),
+        )
+
+
+def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Sequence[Pose]) -> Maps:
+    """Maps of one mesh or several, each at its pose (cam_from_object); the nearest wins."""
+    if isinstance(meshes, (Mesh, Caster)):
+        meshes, poses = [meshes], [poses]
+    shape = camera.height, camera.width
+    maps = Maps(
+        np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, np.int32),
+        np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape),
+    )  # fmt: skip
+    nearest = np.full(shape, np.inf)
+    for number, (mesh, pose) in enumerate(zip(meshes, poses, strict=True), start=1):
+        caster = mesh if isinstance(mesh, Caster) else Caster(mesh)
+        hits = caster.cast(camera, pose)
+        wins = (hits.face >= 0) & (hits.depth < nearest)
+        nearest[wins] = hits.depth[wins]
+        _fill(maps, wins, number, caster.mesh, hits, camera, pose)
+    return maps
+
+
+def _fill(maps: Maps, wins: np.ndarray, number: int, mesh: Mesh, hits: Hits, camera: Camera, pose: Pose) -> None:
+    corners = mesh.faces[hits.face[wins]]  # [n, 3]
+    u, v = hits.uv[wins].T
+    weight = np.stack([1 - u - v, u, v], axis=1)
+    smooth = np.einsum("nk,nkd->nd", weight, mesh.normals[corners]) @ pose.rotation.T
+    flat = face_normals(mesh, hits.face[wins]) @ pose.rotation.T
+    view = -unit(camera.rays()[wins])
+    facing = np.sum(flat * view, axis=1)
+    side = np.where(facing < 0, -1.0, 1.0)
+    maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
+    maps.view[wins], maps.depth[wins] = view, hits.depth[wins]
+    maps.label[wins], maps.object[wins] = mesh.face_label[hits.face[wins]], number
+    maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
+
+
+def toward_viewer(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Normals bent, where n·v < MIN_COSINE, to n·v = MIN_COSINE in the plane of normal and view; and where that was."""
+    cosine = np.sum(normal * view, axis=1)
+    bent = cosine < MIN_COSINE
+    across = unit(normal - cosine[:, None] * view)
+    limit = np.sqrt(1 - MIN_COSINE**2) * across + MIN_COSINE * view
+    return np.where(bent[:, None], limit, normal), bent
+
+
+def face_normals(mesh: Mesh, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    return unit(np.cross(b - a, c - a))
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

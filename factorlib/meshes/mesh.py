@@ -1,0 +1,62 @@
+"""A triangle mesh that the pipeline can use: finite, without degenerate faces, with normals and material labels."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class Mesh(msgspec.Struct, frozen=True):
+    """Triangles in the object's own frame and units.
+
+    vertices    [V, 3] float64; a vertex on a crease stands once per smooth side of it
+    faces       [F, 3] int32, counter-clockwise seen from outside where the file says so
+    normals     [V, 3] float64, unit, smooth
+    face_label  [F] int16, material label k = position in the dataset's `materials`, from 1
+    open        True where the surface has a border, so that its inside can be seen
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    face_label: Int[np.ndarray, " f"]
+    open: bool = False
+
+    @property
+    def labels(self) -> tuple[int, ...]:
+        """The labels that occur, ascending."""
+        return tuple(int(label) for label in np.unique(self.face_label))
+
+    @property
+    def centre(self) -> Float[np.ndarray, "3"]:
+        """Middle of the bounding box of what the faces use."""
+        used = self.vertices[np.unique(self.faces)]
+        return (used.min(axis=0) + used.max(axis=0)) / 2
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a vertex from `centre`."""
+        return float(np.linalg.norm(self.vertices[np.unique(self.faces)] - self.centre, axis=1).max())
+
+
+def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Face normals times face areas.
+
+    >>> area_vectors(np.eye(3)[[0, 1, 2]] * 2, np.array([[0, 1, 2]])).tolist()
+    [[2.0, 2.0, 2.0]]
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def surface_samples(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """`count` points spread over the surface by area (stratified, so evenly), and the label of each."""
+    rng = np.random.default_rng(seed)
+    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
+    cumulative = np.cumsum(area)
+    face = np.searchsorted(cumulative, (np.arange(count) + rng.random(count)) / count * cumulative[-1])
+    face = np.minimum(face, len(area) - 1)
+    root, other = np.sqrt(rng.random(count)), rng.random(count)
+    weight = np.stack([1 - root, root * (1 - other), root * other], axis=1)  # uniform in the triangle
+    return np.einsum("nk,nkd->nd", weight, mesh.vertices[mesh.faces[face]]), mesh.face_label[face]

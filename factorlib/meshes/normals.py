@@ -1,0 +1,113 @@
+"""Smooth vertex normals of rough meshes.
+
+Three ideas.  Faces are first turned to agree with their neighbours (the two orientations of every face are the nodes
+of a graph whose connected parts are the consistent orientations), so that a few flipped faces do not cancel the
+normals around them.  A corner's normal is then the angle-weighted mean (Thürmer and Wüthrich 1998) of the faces about
+its vertex, but only of those within the crease angle of its own face: an edge stays sharp, a curve stays smooth.
+Duplicate vertices are one vertex here, by position.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from factorlib.meshes.mesh import area_vectors
+
+PAIRS_AT_ONCE = 2_000_000
+
+
+def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
+    """Number of the position of each vertex: equal for vertices closer than about `tolerance` × the extent."""
+    low = vertices.min(axis=0)
+    extent = float((vertices.max(axis=0) - low).max()) or 1.0
+    grid = np.round((vertices - low) / (extent * tolerance)).astype(np.int64)
+    return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def edges_of(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Bool[np.ndarray, " e"], Int[np.ndarray, " e"]]:
+    """The 3F half-edges sorted by edge: (low, high) vertex, whether it runs from low to high, and its face."""
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    face = np.repeat(np.arange(len(faces)), 3)
+    pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
+    order = np.lexsort((face, pair[:, 1], pair[:, 0]))
+    return pair[order], (start < end)[order], face[order]
+
+
+def neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"], bool]:
+    """Pairs of faces across edges that exactly two share, whether each pair agrees in winding, and whether any edge has one face only."""
+    pair, forward, face = edges_of(faces)
+    starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
+    counts = np.diff(np.r_[starts, len(pair)])
+    first = starts[counts == 2]
+    return np.stack([face[first], face[first + 1]], axis=1), forward[first] != forward[first + 1], bool((counts == 1).any())
+
+
+def consistently_wound(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[Bool[np.ndarray, " f"], bool]:
+    """Which faces to flip so that neighbours agree, and whether the surface is open.
+
+    Of a connected patch's two orientations, an open patch takes the one that flips less area, a closed one the one
+    that encloses positive volume.  A patch that has no orientation (Möbius) is left as it is.
+    """
+    count = len(faces)
+    pairs, agrees, has_border = neighbours(faces)
+    a, b = pairs.T
+    other = np.where(agrees, 0, count)  # node f: as it is; node f + count: flipped
+    rows, columns = np.r_[a, a + count], np.r_[b + other, b + count - other]
+    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
+    _, part = connected_components(graph, directed=False)
+    kept, flipped = part[:count], part[count:]
+    area = area_vectors(vertices, faces)
+    size = np.linalg.norm(area, axis=1)
+    volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
+    gain = volume if not has_border else size
+    total = np.bincount(kept, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
+    return (total[kept] < 0) & (kept != flipped), has_border
+
+
+def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], crease_deg: float) -> Float[np.ndarray, "f 3 3"]:
+    """Unit normal at each corner of each face: angle-weighted over the faces of its vertex within `crease_deg` of its own."""
+    area = area_vectors(vertices, faces)
+    normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
+    weight = corner_angles(vertices, faces).reshape(-1)
+    order = np.argsort(faces.reshape(-1), kind="stable")  # corners, grouped by vertex
+    vertex = faces.reshape(-1)[order]
+    starts = np.flatnonzero(np.r_[True, vertex[1:] != vertex[:-1]])
+    counts = np.diff(np.r_[starts, len(vertex)])
+    result = np.empty((len(order), 3))
+    threshold = np.cos(np.deg2rad(crease_deg))
+    for group in _chunks(counts.astype(np.int64) ** 2):
+        mine, theirs = _pairs(starts[group], counts[group])
+        own, others = normal[order[mine] // 3], normal[order[theirs] // 3]
+        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, others) >= threshold - 1e-12)
+        low, high = starts[group][0], starts[group][-1] + counts[group][-1]
+        summed = [np.bincount(mine - low, share * others[:, d], high - low) for d in range(3)]
+        result[order[low:high]] = np.stack(summed, axis=1)
+    length = np.linalg.norm(result, axis=1, keepdims=True)
+    own = np.repeat(normal, 3, axis=0)
+    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+
+
+def corner_angles(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Interior angle at each corner, radians; each face's sum to π."""
+    corner = vertices[faces]
+    onward, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    return np.arctan2(np.linalg.norm(np.cross(onward, back), axis=-1), np.einsum("fkd,fkd->fk", onward, back))
+
+
+def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All ordered pairs of positions within each run [start, start + count)."""
+    squares = counts**2
+    run = np.repeat(np.arange(len(counts)), squares)
+    within = np.arange(squares.sum()) - np.repeat(np.cumsum(squares) - squares, squares)
+    return starts[run] + within // counts[run], starts[run] + within % counts[run]
+
+
+def _chunks(sizes: np.ndarray):
+    """Slices of consecutive items whose sizes sum to about PAIRS_AT_ONCE."""
+    block = np.cumsum(sizes) // PAIRS_AT_ONCE
+    edges = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])
+    for low, high in zip(edges, np.r_[edges[1:], len(sizes)]):
+        yield slice(int(low), int(high))
