@@ -1,0 +1,71 @@
+"""Pictures for people: linear radiance as 8-bit sRGB, and PNG files that are the same bytes for the same pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+from jaxtyping import Bool, Float, UInt8
+
+from factorlib.errors import InputError
+from factorlib.images.transfer import srgb_encode
+
+PERCENTILE = 99.0
+
+
+def exposure_of(
+    radiance: Float[np.ndarray, "*batch 3"], where: Bool[np.ndarray, "*batch"] | None = None, percentile: float = PERCENTILE
+) -> float:
+    """The factor that takes the `percentile` of each pixel's brightest channel, over `where`, to white.
+
+    1 where there is nothing to expose for (no finite pixel, or all black).
+
+    >>> exposure_of(np.full((4, 4, 3), 0.25))
+    4.0
+    """
+    brightest = np.asarray(radiance).max(axis=-1)
+    brightest = brightest[np.isfinite(brightest) & (True if where is None else where)]
+    white = float(np.percentile(brightest, percentile)) if brightest.size else 0.0
+    return 1 / white if white > 0 else 1.0
+
+
+def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = None) -> UInt8[np.ndarray, "*batch 3"]:
+    """`radiance` (linear Rec. 709) times `exposure`, cut to [0, 1], sRGB-encoded, rounded; NaN is black.
+
+    exposure: None takes `exposure_of` the whole picture; give the same number to pictures to be compared.
+
+    >>> picture(np.array([[0.0, 0.18, 2.0]]), exposure=1.0).tolist()
+    [[0, 118, 255]]
+    """
+    exposure = exposure_of(radiance) if exposure is None else exposure
+    shown = np.clip(np.nan_to_num(np.asarray(radiance) * exposure, nan=0.0, posinf=1.0, neginf=0.0), 0, 1)
+    return np.rint(255 * srgb_encode(shown)).astype(np.uint8)
+
+
+def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
+    """Write an 8-bit PNG of 1, 3 or 4 channels (alpha not multiplied in), without date or program name."""
+    pixels = np.ascontiguousarray(np.asarray(pixels, dtype=np.uint8))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(str(path))
+    if output is None or not output.open(str(path), spec):
+        raise OSError(f"{path}: cannot be written: {oiio.geterror() if output is None else output.geterror()}")
+    written = output.write_image(pixels)
+    error = output.geterror()
+    output.close()
+    del output  # only then is the file whole
+    if not written:
+        raise OSError(f"{path}: cannot be written: {error}")
+
+
+def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:
+    """The 8-bit pixels of a PNG as `write_png` wrote them."""
+    wish = oiio.ImageSpec()
+    wish.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), wish)
+    pixels = source.read_image(oiio.UINT8) if source is not None else None
+    if pixels is None:
+        error = oiio.geterror() if source is None else source.geterror()
+        raise InputError(f"not readable as a PNG ({error.strip()})", file=path, cure="is it whole?")
+    return pixels

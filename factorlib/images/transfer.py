@@ -1,0 +1,58 @@
+"""Transfer functions between encoded values in [0, 1] and linear radiance.
+
+sRGB: IEC 61966-2-1:1999, section 5.2.  All functions work on any shape, keep NaN, and go on as odd functions below 0
+and by the same formula above 1, so that they invert each other everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+Values = Float[np.ndarray, "*shape"]
+ENCODINGS = ("srgb", "linear", "gamma2.2")
+
+
+def srgb_decode(encoded: Values) -> Values:
+    """Linear value of an sRGB-encoded one.
+
+    >>> srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])).round(6).tolist()
+    [0.0, 0.003131, 0.214041, 1.0]
+    """
+    size = np.abs(encoded)
+    return np.copysign(np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4), encoded)
+
+
+def srgb_encode(linear: Values) -> Values:
+    """sRGB-encoded value of a linear one.
+
+    >>> srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])).round(6).tolist()
+    [0.0, 0.04045, 0.461356, 1.0]
+    """
+    size = np.abs(linear)
+    return np.copysign(np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055), linear)
+
+
+def gamma_decode(encoded: Values, gamma: float = 2.2) -> Values:
+    """encoded^γ.
+
+    >>> gamma_decode(np.array([0.5])).round(6).tolist()
+    [0.217638]
+    """
+    return np.copysign(np.abs(encoded) ** gamma, encoded)
+
+
+def gamma_encode(linear: Values, gamma: float = 2.2) -> Values:
+    """linear^(1/γ).
+
+    >>> gamma_encode(np.array([0.217638])).round(6).tolist()
+    [0.5]
+    """
+    return np.copysign(np.abs(linear) ** (1 / gamma), linear)
+
+
+def decoder(encoding: str) -> Callable[[Values], Values]:
+    """The function from values of `encoding` (one of ENCODINGS) to linear ones."""
+    return {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}[encoding]

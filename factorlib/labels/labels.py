@@ -1,0 +1,139 @@
+"""The labels of a photo, whichever way its masks are given, as one map of material labels.
+
+A mask has the photo's own pixels, as displayed.  Whatever cannot be told apart for certain is refused: another size,
+a label without a material, two materials in one pixel, no labelled pixel at all.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, UInt8, UInt16
+
+from factorlib.errors import InputError
+from factorlib.labels.coco import read_coco
+from factorlib.labels.png import read_inside, read_values
+
+LEFT_OUT = 255
+DRAWN_OVERLAP = 0.05  # outlines drawn by hand share some edge pixels: so much of the smaller one is left out, not refused
+Masks = str | Mapping[str, str]
+log = logging.getLogger("factorlib.labels")
+
+
+class Labels(msgspec.Struct, frozen=True):
+    """label: 0 background, k the k-th material; left_out: neither background nor a material (there label is 0)."""
+
+    label: UInt8[np.ndarray, "h w"]
+    left_out: Bool[np.ndarray, "h w"]
+
+
+def read_labels(
+    masks: Masks, file: Callable[[str], Path], materials: list[str], size: tuple[int, int], image: str, key: str = "masks"
+) -> Labels:
+    """The labels of one photo.
+
+    masks: a label PNG, a COCO json, or {material: PNG}, as in dataset.yaml; file: path of such a name.
+    size: (height, width) of the photo as displayed; image: its name, for COCO; key: of `masks`, for messages.
+    Raises InputError naming file and key.
+    """
+    if not isinstance(masks, str):
+        labels = _of_materials(masks, file, materials, size, key)
+    elif masks.lower().endswith(".json"):
+        labels = _of_coco(file(masks), materials, size, image, key)
+    else:
+        labels = _of_values(read_values(file(masks), key), file(masks), materials, size, key)
+    if not labels.label.any():
+        where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
+        raise InputError("the mask is empty: no pixel has a material", file=where, key=key, cure="paint at least one material, or drop the photo")
+    return labels
+
+
+def read_objects(
+    masks: list[tuple[str, str | None]], file: Callable[[str], Path], size: tuple[int, int], key: str = "objects"
+) -> UInt16[np.ndarray, "h w"]:
+    """1-based index of the object whose own mask covers a pixel, 0 where none says so; masks: (name, PNG or None)."""
+    objects = np.zeros(size, dtype=np.uint16)
+    for index, (name, path) in enumerate(masks):
+        if path is None:
+            continue
+        where = f"{key}[{index}].mask"
+        inside = read_inside(file(path), where)
+        _check_size(inside.shape, size, file(path), where)
+        if not inside.any():
+            raise InputError(f"the mask of object {name!r} is empty", file=file(path), key=where, cure="paint it, or leave the key out")
+        if objects[inside].any():
+            other = int(objects[inside & (objects > 0)][0]) - 1
+            count = int((objects[inside] == other + 1).sum())
+            found = f"objects {masks[other][0]!r} and {name!r} share {count} pixels"
+            raise InputError(found, file=file(path), key=where, cure="a pixel shows one object: erase it from the one behind")
+        objects[inside] = index + 1
+    return objects
+
+
+def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], size: tuple[int, int], key: str) -> Labels:
+    _check_size(values.shape, size, path, key)
+    found, counts = np.unique(values, return_counts=True)
+    if set(found.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in found:
+        cure = f"if 255 means inside, write masks: {{{materials[0]}: <this file>}}: in a label mask it means leave out"
+        raise InputError("the mask is empty: it holds only 0 and 255", file=path, key=key, cure=cure)
+    for value, count in zip(found.tolist(), counts.tolist()):
+        if value > len(materials) and value != LEFT_OUT:
+            known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
+            raise InputError(f"unknown label {value} ({count} pixels)", file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out")
+    left_out = values == LEFT_OUT
+    return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
+
+
+def _of_materials(masks: Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], key: str) -> Labels:
+    inside = {}
+    for material in sorted(masks, key=materials.index):
+        inside[material] = read_inside(file(masks[material]), f"{key}.{material}")
+        _check_size(inside[material].shape, size, file(masks[material]), f"{key}.{material}")
+    where = {material: (file(masks[material]), f"{key}.{material}") for material in inside}
+    return _merged(inside, materials, size, where, shared=0.0)
+
+
+def _of_coco(path: Path, materials: list[str], size: tuple[int, int], image: str, key: str) -> Labels:
+    inside, shape = read_coco(path, image, materials, size)
+    _check_size(shape, size, path, key)
+    return _merged(inside, materials, size, {material: (path, key) for material in inside}, shared=DRAWN_OVERLAP)
+
+
+def _merged(
+    inside: Mapping[str, np.ndarray], materials: list[str], size: tuple[int, int], where: Mapping[str, tuple[Path, str]], shared: float
+) -> Labels:
+    """One map of several masks; what two of them claim is refused above the part `shared` of the smaller, else left out."""
+    label, left_out = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=bool)
+    for number, material in enumerate(materials, 1):
+        if material not in inside:
+            continue
+        for other in np.unique(label[inside[material] & (label > 0)]).tolist():
+            both = inside[material] & (label == other)
+            _refuse_overlap(materials[other - 1], material, both, inside, where, shared)
+            left_out |= both
+        label[inside[material]] = number
+    label[left_out] = 0
+    return Labels(label=label, left_out=left_out)
+
+
+def _refuse_overlap(one: str, other: str, both: np.ndarray, inside: Mapping, where: Mapping, shared: float) -> None:
+    count, smaller = int(both.sum()), int(min(inside[one].sum(), inside[other].sum()))
+    (path, key), also = where[other], where[one][0]
+    found = f"materials {one!r} and {other!r} share {count} pixels" + (f" with {also.name}" if also != path else "")
+    if count > shared * smaller:
+        raise InputError(found, file=path, key=key, cure="a pixel shows one material: erase it from the one behind")
+    log.warning("%s: %s: %s along their outlines: these are left out", path, key, found)
+
+
+def _check_size(found: tuple[int, ...], size: tuple[int, int], path: Path, key: str) -> None:
+    if tuple(found) == tuple(size):
+        return
+    cure = "save the mask with the photo's own pixels"
+    if tuple(found) == tuple(size)[::-1]:
+        cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
+    message = f"the mask is {found[1]} × {found[0]} pixels, the photo {size[1]} × {size[0]}"
+    raise InputError(message, file=path, key=key, cure=cure)

@@ -1,0 +1,60 @@
+"""Values of a one-channel PNG as they are stored: palette indices, not the palette's colours.
+
+Pillow, for it alone keeps the indices; grey of 2 or 4 bits, which it stretches to 8, is undone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt16
+from PIL import Image, UnidentifiedImageError
+
+from factorlib.errors import InputError
+
+_STRETCH = {2: 85, 4: 17}  # what 1 becomes when grey of so many bits is stretched to 8
+_GREY, _PALETTE = 0, 3  # PNG colour types
+
+
+def read_values(path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
+    """The stored values of the PNG at `path`.  RGB is read only where R = G = B, alpha only where it is opaque."""
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            values = np.asarray(image)
+    except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise InputError(f"not readable as a PNG ({error})", file=path, key=key, cure="save the mask again, as PNG") from error
+    depth, colour_type = _depth_and_type(path)
+    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow would keep the upper byte alone
+        found = "has several channels of 16 bits"
+        raise InputError(found, file=path, key=key, cure="save labels in one channel of 8 bits")
+    if values.ndim == 3:
+        values = _one_channel(values, path, key)
+    return (values // (_STRETCH.get(depth, 1) if colour_type == _GREY else 1)).astype(np.uint16)
+
+
+def read_inside(path: str | Path, key: str) -> Bool[np.ndarray, "h w"]:
+    """A mask of one thing: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
+    values = read_values(path, key)
+    return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
+
+
+def _one_channel(values: np.ndarray, path: str | Path, key: str) -> np.ndarray:
+    colours, alpha = (values[..., :-1], values[..., -1]) if values.shape[-1] in (2, 4) else (values, None)
+    if (colours != colours[..., :1]).any():
+        colour = colours.reshape(-1, 3)[(colours != colours[..., :1]).any(axis=-1).ravel()][0]
+        raise InputError(
+            f"is a colour picture (one pixel is {tuple(int(c) for c in colour)})",
+            file=path,
+            key=key,
+            cure="save labels in one channel: 0 background, k for the k-th material, 255 leave out",
+        )
+    if alpha is not None and (alpha != np.iinfo(alpha.dtype).max).any():
+        raise InputError("has transparent pixels", file=path, key=key, cure="save it without alpha: 0 is background")
+    return colours[..., 0]
+
+
+def _depth_and_type(path: str | Path) -> tuple[int, int]:
+    """Bits per sample and colour type: bytes 24 and 25, after the signature, IHDR's length and name, and the size."""
+    with Path(path).open("rb") as stream:
+        return tuple(stream.read(26)[24:26])
