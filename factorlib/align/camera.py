@@ -61,6 +61,6 @@ def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 
     """Angle in degrees of the turn between two rotations.
 
     >>> round(angle_between(np.eye(3), rotation_of_vector(np.array([0.0, 0.5, 0.0]))), 6)
-    28.647890
+    28.64789
     """
     return float(np.rad2deg(Rotation.from_matrix(first @ second.T).magnitude()))

@@ -1,0 +1,46 @@
+"""How far to believe the normal of each pixel, 0 to 1."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
+
+from factorlib.align.evidence import Evidence
+from factorlib.align.raster import Maps
+
+FULL_DISTANCE = 0.01  # of the mask's extent: nearer to a contour, a small error of pose or mesh shows another place
+FULL_COSINE = 0.3  # flatter than this, a small error of shape turns the normal much
+INSIDE_OF_SHELL = 0.3  # the inside of an open shell is often another surface than the outside
+DEPTH_JUMP = 0.02  # of the object's depth range to the next pixel: one part hides another
+
+
+def confidence(maps: Maps, evidence: Evidence) -> Float[np.ndarray, "h w"]:
+    """Product of: distance to where mask and mesh disagree, to the contour and to depth jumps; slant; side seen.
+
+    0 where the mask and the mesh name different materials, where there is no mesh, and where the normal was bent.
+    """
+    agree = (maps.label > 0) & (evidence.label == maps.label) & ~depth_jumps(maps)
+    if not agree.any():
+        return np.zeros(agree.shape)
+    rows, columns = np.nonzero(agree)
+    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
+    result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
+    return result * np.where(maps.back, INSIDE_OF_SHELL, 1.0) * ~maps.bent
+
+
+def depth_jumps(maps: Maps) -> np.ndarray:
+    """Pixels whose depth, or object, changes abruptly to the pixel right of or below them (both of the two)."""
+    seen = maps.label > 0
+    if not seen.any():
+        return seen
+    limit = DEPTH_JUMP * max(float(np.ptp(maps.depth[seen])), 1e-12)
+    result = np.zeros(seen.shape, bool)
+    for axis in (0, 1):
+        first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        jump = (np.abs(maps.depth[first] - maps.depth[second]) > limit) | (maps.object[first] != maps.object[second])
+        jump &= seen[first] & seen[second]
+        result[first] |= jump
+        result[second] |= jump
+    return result

@@ -1,0 +1,86 @@
+"""What the masks of a photo say about where its objects are, and what they leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+UNKNOWN = -1
+
+
+class Evidence(msgspec.Struct, frozen=True):
+    """What one photo says about one object, or about all of them together.
+
+    label  [h, w] int16: material k, 0 background, UNKNOWN where the photo does not say: left out by the user,
+           or covered by something that may stand in front of the object
+    """
+
+    label: Int[np.ndarray, "h w"]
+
+    @property
+    def inside(self) -> Bool[np.ndarray, "h w"]:
+        return self.label > 0
+
+    @property
+    def known(self) -> Bool[np.ndarray, "h w"]:
+        return self.label != UNKNOWN
+
+
+def whole_evidence(channels: Mapping[str, Float[np.ndarray, "h w"]]) -> Evidence:
+    """Of the whole photo, from the channels that the masks stage wrote."""
+    label = np.round(channels["label"]).astype(np.int16)
+    if "left_out" in channels:
+        label[channels["left_out"] > 0.5] = UNKNOWN
+    return Evidence(label)
+
+
+def object_evidence(
+    channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool
+) -> Evidence:
+    """Of object `number` (from 1), whose mesh carries `labels`.
+
+    With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object
+    claims.  Pixels of other objects and of foreign materials may hide it: UNKNOWN.
+    """
+    label = whole_evidence(channels).label.copy()
+    owner = np.round(channels["object"]).astype(int) if "object" in channels else np.zeros(label.shape, int)
+    mine = owner == number if own_mask else np.isin(label, labels) & ((owner == 0) | (owner == number))
+    foreign = ~mine & ((label > 0) | ((owner > 0) & (owner != number)))
+    label[foreign] = UNKNOWN
+    return Evidence(label)
+
+
+def silhouette_iou(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+    """Intersection over union of mask and mesh over the pixels that are known; 0 where there is neither.
+
+    >>> silhouette_iou(Evidence(np.array([[0, 1, 1, UNKNOWN]])), np.array([[1, 1, 0, 1]]))
+    0.3333333333333333
+    """
+    mask, mesh = evidence.inside & evidence.known, (mesh_label > 0) & evidence.known
+    union = np.count_nonzero(mask | mesh)
+    return float(np.count_nonzero(mask & mesh) / union) if union else 0.0
+
+
+def label_agreement(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+    """Share of the pixels in both mask and mesh whose material is the same in both; 0 where there are none.
+
+    >>> label_agreement(Evidence(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
+    0.5
+    """
+    both = evidence.inside & (mesh_label > 0)
+    total = np.count_nonzero(both)
+    return float(np.count_nonzero(both & (evidence.label == mesh_label)) / total) if total else 0.0
+
+
+def labelled_iou(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+    """IoU that counts a pixel as shared only if its material is the same too: what the search maximises.
+
+    >>> labelled_iou(Evidence(np.array([[0, 1, 2, 1]])), np.array([[1, 1, 1, 1]]))
+    0.5
+    """
+    known = evidence.known
+    union = np.count_nonzero(known & (evidence.inside | (mesh_label > 0)))
+    return float(np.count_nonzero(evidence.inside & (evidence.label == mesh_label)) / union) if union else 0.0
