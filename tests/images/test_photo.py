@@ -1,0 +1,173 @@
+"""Reading photos: the same scene is the same radiance whatever file it came in."""
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from factorlib.errors import InputError
+from factorlib.images.focal import FILM_DIAGONAL, focal_px_of_exif
+from factorlib.images.photo import read_photo
+from factorlib.images.transfer import gamma_encode, srgb_encode
+
+RNG = np.random.default_rng(3)
+RADIANCE = RNG.uniform(0, 0.9, (12, 18, 3)).astype(np.float32)  # 3:2, below clipping
+
+
+def save(path, pixels, names=None, **attributes):
+    """Write an image in the type of `pixels`; attribute names with `__` for `:`."""
+    kind = {np.uint8: oiio.UINT8, np.uint16: oiio.UINT16, np.float16: oiio.HALF, np.float32: oiio.FLOAT}[pixels.dtype.type]
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    if names:
+        spec.channelnames = names
+        spec.alpha_channel = names.index("A") if "A" in names else -1
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels)), output.geterror()
+    output.close()
+    return path
+
+
+def codes(encoded, kind=np.uint8):
+    return np.rint(encoded * np.iinfo(kind).max).astype(kind)
+
+
+@pytest.mark.parametrize(
+    "file, pixels, tolerance",
+    [
+        ("a.png", codes(srgb_encode(RADIANCE)), 5e-3),
+        ("b.png", codes(srgb_encode(RADIANCE), np.uint16), 2e-5),
+        ("a.tif", codes(srgb_encode(RADIANCE)), 5e-3),
+        ("b.tif", codes(srgb_encode(RADIANCE), np.uint16), 2e-5),
+        ("c.tif", RADIANCE, 0),
+        ("a.exr", RADIANCE, 0),
+        ("b.exr", RADIANCE.astype(np.float16), 5e-4),
+        ("a.hdr", RADIANCE, 5e-3),
+    ],
+)
+def test_every_kind_of_file_gives_the_same_radiance(tmp_path, file, pixels, tolerance):
+    photo = read_photo(save(tmp_path / file, pixels))
+    assert photo.radiance.dtype == np.float32
+    assert np.abs(photo.radiance - RADIANCE).max() <= tolerance
+    assert not photo.clipped.any() and photo.finite.all() and (photo.width, photo.height) == (18, 12)
+    assert photo.encoding == ("linear" if pixels.dtype.kind == "f" else "srgb")
+
+
+@pytest.mark.parametrize("encoding, encode", [("srgb", srgb_encode), ("gamma2.2", gamma_encode), ("linear", np.asarray)])
+def test_a_given_encoding_goes_before_what_the_file_implies(tmp_path, encoding, encode):
+    for file, pixels in (("a.png", codes(encode(RADIANCE), np.uint16)), ("a.exr", encode(RADIANCE))):
+        photo = read_photo(save(tmp_path / file, pixels), encoding)
+        assert photo.radiance == pytest.approx(RADIANCE, abs=5e-5) and photo.encoding == encoding
+
+
+def test_jpeg_is_read_as_srgb(tmp_path):
+    smooth = np.broadcast_to(np.linspace(0.1, 0.8, 48)[None, :, None], (32, 48, 3))
+    photo = read_photo(save(tmp_path / "a.jpg", codes(srgb_encode(smooth)), Compression="jpeg:98"))
+    assert photo.radiance == pytest.approx(smooth, abs=0.02)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied(tmp_path, orientation):
+    path = save(tmp_path / "a.tif", codes(srgb_encode(RADIANCE)), Orientation=orientation)
+    expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.UINT8)
+    photo = read_photo(path)
+    np.testing.assert_array_equal(codes(srgb_encode(photo.radiance)), expected)
+    assert (photo.height, photo.width) == expected.shape[:2] == ((18, 12) if orientation >= 5 else (12, 18))
+
+
+def test_a_quarter_turn_by_hand(tmp_path):
+    # orientation 6: the camera stood on its side, the stored left edge is the displayed top, read from below
+    stored = np.zeros((2, 3, 3), dtype=np.uint8)
+    stored[1, 0] = 200  # bottom left as stored
+    photo = read_photo(save(tmp_path / "a.tif", stored, Orientation=6))
+    assert photo.radiance.shape == (3, 2, 3) and photo.radiance[0, 0, 0] > 0.5 and photo.radiance[1:].max() == 0
+
+
+@pytest.mark.parametrize("channels, names", [(1, ["Y"]), (2, ["Y", "A"]), (4, ["R", "G", "B", "A"])])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_grey_becomes_rgb_and_alpha_is_dropped_without_darkening(tmp_path, channels, names, suffix):
+    pixels = np.full((4, 6, channels), 100, dtype=np.uint8)
+    if "A" in names:
+        pixels[..., -1] = 40
+    photo = read_photo(save(tmp_path / f"a{suffix}", pixels, names))
+    assert photo.radiance.shape == (4, 6, 3)
+    assert codes(srgb_encode(photo.radiance)).tolist() == np.full((4, 6, 3), 100).tolist()
+
+
+def test_exr_channels_go_by_name(tmp_path):
+    pixels = np.dstack([np.full((4, 6), k, dtype=np.float32) for k in (9, 1, 2, 3)])
+    photo = read_photo(save(tmp_path / "a.exr", pixels, names=["Z", "B", "R", "G"]))
+    assert photo.radiance[0, 0].tolist() == [2, 3, 1]
+
+
+def test_exr_without_colours_is_refused(tmp_path):
+    path = save(tmp_path / "a.exr", np.zeros((4, 6, 2), dtype=np.float32), names=["normal.x", "normal.y"])
+    with pytest.raises(InputError, match="normal.x, normal.y") as caught:
+        read_photo(path, key="photos[0].image")
+    assert "a.exr" in str(caught.value) and "photos[0].image" in str(caught.value) and caught.value.cure
+
+
+@pytest.mark.parametrize("kind, top, below", [(np.uint8, (254, 255), 253), (np.uint16, (65300, 65535), 65000)])
+def test_top_codes_are_clipped_channel_by_channel(tmp_path, kind, top, below):
+    pixels = np.full((2, 3, 3), below, dtype=kind)
+    pixels[0, 0, 0], pixels[1, 2, 2] = top
+    clipped = read_photo(save(tmp_path / "a.png", pixels)).clipped
+    assert np.argwhere(clipped).tolist() == [[0, 0, 0], [1, 2, 2]]
+
+
+def test_what_is_not_finite_is_no_pixel_and_bright_floats_are_not_clipped(tmp_path):
+    pixels = np.full((2, 3, 3), 50.0, dtype=np.float32)
+    pixels[0, 0, 1], pixels[1, 1, 2] = np.nan, np.inf
+    photo = read_photo(save(tmp_path / "a.exr", pixels))
+    assert np.argwhere(~photo.finite).tolist() == [[0, 0], [1, 1]]
+    assert not photo.clipped.any() and np.isfinite(photo.radiance).all() and photo.radiance[0, 1, 0] == 50
+
+
+@pytest.mark.parametrize("file", ["a.jpg", "a.png", "a.tif", "a.exr", "a.hdr"])
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.97])
+def test_truncated_files_are_refused(tmp_path, file, part):
+    noise = RNG.uniform(0, 1, (64, 64, 3)).astype(np.float32)
+    path = save(tmp_path / file, noise if file.endswith(("exr", "hdr")) else codes(noise))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(InputError) as caught:
+        read_photo(path, key="photos[1].image")
+    assert str(path) in str(caught.value) and "photos[1].image" in str(caught.value) and caught.value.cure
+
+
+def test_what_is_no_image_is_refused(tmp_path):
+    (tmp_path / "a.jpg").write_text("no image at all")
+    with pytest.raises(InputError, match="not readable as an image"):
+        read_photo(tmp_path / "a.jpg")
+
+
+def test_focal_of_35mm_film_is_the_same_for_any_size_and_orientation(tmp_path):
+    for size, orientation in (((40, 60), 1), ((80, 120), 6)):
+        path = save(tmp_path / "a.jpg", np.zeros((*size, 3), dtype=np.uint8), Orientation=orientation, Exif__FocalLengthIn35mmFilm=50)
+        photo = read_photo(path)
+        half = np.hypot(photo.width, photo.height) / 2
+        assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
+
+
+def test_focal_of_the_focal_plane_follows_a_resize():
+    exif = {"Exif:FocalLength": 18.0, "Exif:FocalPlaneXResolution": 10000.0, "Exif:FocalPlaneResolutionUnit": 2}
+    exif |= {"Exif:PixelXDimension": 5472, "Exif:PixelYDimension": 3648}
+    full = focal_px_of_exif(exif, 5472, 3648)
+    assert full == pytest.approx(18 * 10000 / 25.4)
+    assert focal_px_of_exif(exif, 1368, 912) == pytest.approx(full / 4)
+    assert focal_px_of_exif(exif | {"Exif:FocalPlaneResolutionUnit": 3}, 5472, 3648) == pytest.approx(18 * 10000 / 10)
+
+
+@pytest.mark.parametrize(
+    "exif, size",
+    [
+        ({}, (600, 400)),
+        ({"Exif:FocalLength": 18.0}, (600, 400)),  # of a sensor of unknown size
+        ({"Exif:FocalLengthIn35mmFilm": 0}, (600, 400)),  # "unknown" by the standard
+        ({"Exif:FocalLengthIn35mmFilm": 50}, (500, 500)),  # cropped: no camera's proportions
+        ({"Exif:FocalLengthIn35mmFilm": 50, "Exif:PixelXDimension": 6000, "Exif:PixelYDimension": 4000}, (400, 300)),
+    ],
+)
+def test_no_focal_where_exif_cannot_tell(exif, size):
+    assert focal_px_of_exif(exif, *size) is None
