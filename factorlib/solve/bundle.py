@@ -1,0 +1,134 @@
+"""The bundle solver: insert lobes where the residual asks, descend jointly, prune, and stop when held-out pixels do.
+
+    round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
+            descend on everything (descent), prune, fix the gauge
+    stop:   when a round lowers the held-out loss by less than `least_gain`, at `lobes` lobes per light, or after
+            `rounds`; the best round by held-out loss is kept and polished on all observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+
+from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.gauge import in_gauge
+from factorlib.solve.insertion import lobes_inserted, pruned
+from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
+from factorlib.solve.problem import Block
+from factorlib.solve.start import starting_light, starting_materials
+from factorlib.solve.unknowns import Light, Materials
+from factorlib.solve.weights import refitted_weights
+
+
+class Bundle(msgspec.Struct, frozen=True):
+    """How the joint problem is solved; lobes are counted per illumination."""
+
+    lobes: int = 64
+    insert: int = 10
+    rounds: int = 12
+    iterations: int = 8
+    polish: int = 30
+    tolerance: float = 1e-4
+    least_gain: float = 0.01
+    start_roughness: float = 0.4
+    start_specular_share: float = 0.2
+    loss: Loss = Loss()
+    seed: int = 0
+
+
+class Event(msgspec.Struct, frozen=True):
+    """One accepted point: `loss` per fitted channel value, whitened (1 = explained to the noise model)."""
+
+    round: int
+    phase: str
+    iteration: int
+    loss: float
+    held_out: float
+    lobes: int
+
+
+Report = Callable[[Event], None]
+
+
+def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> tuple[Materials, list[Light], list[Event]]:
+    """All materials and one light per block, in the gauge of `solve.gauge`, with the history of the descent."""
+    history: list[Event] = []
+
+    def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
+        held = held_out_loss(blocks, solution.materials, solution.lights, operator, bundle.loss) if iteration < 0 else np.nan
+        fitted = sum(int((~b.held_out).sum()) * 3 for b in blocks)
+        history.append(Event(round_, phase, iteration, solution.loss / fitted, held, sum(map(len, solution.lights))))
+        report(history[-1])
+        return held
+
+    start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
+    current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
+    current = _refitted(blocks, current, operator, bundle.loss, map_)
+    best, best_held = current, np.inf
+    for number in range(bundle.rounds):
+        loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
+        current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
+        current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s))
+        current = _tidied(blocks, current, operator, loss, map_)
+        held = record(number, "round", -1, current)
+        gained = best_held - held
+        if held < best_held:
+            best, best_held = current, held
+        if gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
+            break
+    everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
+    best = evaluated(everything, best.materials, best.lights, operator, loss, map_)
+    best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
+    best = _tidied(everything, best, operator, loss, map_)
+    return best.materials, best.lights, history
+
+
+def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
+    """Mean robust loss per held-out channel value."""
+    total, count = 0.0, 0
+    for block, light in zip(blocks, lights, strict=True):
+        held = _only(block, block.held_out)
+        total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
+        count += 3 * len(held)
+    return total / max(count, 1)
+
+
+def _only(block: Block, rows: np.ndarray) -> Block:
+    fields = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
+    return msgspec.structs.replace(block, **{f: getattr(block, f)[rows] for f in fields})
+
+
+def _descent(bundle: Bundle, iterations: int) -> Descent:
+    return Descent(iterations, bundle.tolerance)
+
+
+def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
+    """Three robust standard deviations of the current residual, never below one σ of the noise model."""
+    absolute = [np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator))) for b, light in zip(blocks, solution.lights, strict=True)]
+    return max(3 * 1.4826 * float(np.median(np.concatenate(absolute))), 1.0)
+
+
+def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
+    lights = []
+    for i, (block, light) in enumerate(zip(blocks, current.lights, strict=True)):
+        count = min(bundle.insert, bundle.lobes - len(light))
+        lights.append(lobes_inserted(block, light, current.materials, operator, count, bundle.seed + 1000 * number + i) if count > 0 else light)
+    return _refitted(blocks, evaluated(blocks, current.materials, lights, operator, loss, map_), operator, loss, map_)
+
+
+def _tidied(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
+    """Pruned and in gauge."""
+    materials, lights = in_gauge(current.materials, [pruned(light) for light in current.lights], blocks)
+    return evaluated(blocks, materials, lights, operator, loss, map_)
+
+
+def _refitted(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
+    lights = []
+    for block, light, equations in zip(blocks, current.lights, current.systems, strict=True):
+        refitted = refitted_weights(light, equations)
+        better = fit_loss(block, refitted, current.materials, operator, loss) <= equations.loss
+        lights.append(refitted if better else light)
+    return evaluated(blocks, current.materials, lights, operator, loss, map_)

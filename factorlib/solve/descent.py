@@ -1,0 +1,71 @@
+"""Levenberg–Marquardt over all materials and lights: damped steps, taken when they lower the loss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import msgspec
+
+from factorlib.solve.normal_equations import Loss, System, system
+from factorlib.solve.problem import Block
+from factorlib.solve.step import damped_step
+from factorlib.solve.unknowns import Light, Materials
+
+
+class Solution(msgspec.Struct, frozen=True):
+    """A point of the joint problem, with its normal equations."""
+
+    materials: Materials
+    lights: list[Light]
+    systems: list[System]
+
+    @property
+    def loss(self) -> float:
+        return sum(s.loss for s in self.systems)
+
+
+class Descent(msgspec.Struct, frozen=True):
+    """Stops after `iterations`, or when two steps in a row lower the loss by less than `tolerance` of itself."""
+
+    iterations: int = 10
+    tolerance: float = 1e-4
+    damping: float = 1e-3
+
+
+def evaluated(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, map_: Callable) -> Solution:
+    """The solution with its systems; `map_` spreads the illuminations, whose order fixes every sum."""
+    systems = map_(partial(_system, materials=materials, operator=operator, loss=loss), list(zip(blocks, lights, strict=True)))
+    return Solution(materials, list(lights), list(systems))
+
+
+def _system(pair: tuple[Block, Light], materials: Materials, operator, loss: Loss) -> System:
+    return system(*pair, materials, operator, loss)
+
+
+def descend(
+    blocks: Sequence[Block],
+    start: Solution,
+    operator,
+    loss: Loss,
+    descent: Descent,
+    map_: Callable,
+    report: Callable[[int, Solution], None] = lambda iteration, solution: None,
+) -> Solution:
+    """Lower the loss from `start`; every accepted point is reported."""
+    current, damping, idle = start, descent.damping, 0
+    for iteration in range(descent.iterations):
+        step = damped_step(current.systems, current.materials, current.lights, damping)
+        materials = Materials.of_vector(current.materials.vector() + step.materials)
+        lights = [light.moved(by) for light, by in zip(current.lights, step.lights, strict=True)]
+        trial = evaluated(blocks, materials, lights, operator, loss, map_)
+        if trial.loss < current.loss:
+            idle = idle + 1 if current.loss - trial.loss < descent.tolerance * current.loss else 0
+            current, damping = trial, max(damping / 5, 1e-9)
+            report(iteration, current)
+        else:
+            damping *= 6
+            idle += damping > 1e6
+        if idle >= 2:
+            break
+    return current

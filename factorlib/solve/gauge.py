@@ -1,0 +1,46 @@
+"""Fixing what the data cannot: one factor per channel and connected component, between reflectances and lights.
+
+Tint   The paper's prior settles it: lights as near to grey as they can be.  With a_ic the summed lobe weights of
+       light i over their mean of channels, the factors s_c minimise Σ_i Σ_c (s_c a_ic − 1)², so s_c = Σ_i a_ic / Σ_i a_ic².
+Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
+       the light, which is what photographs of objects show, and Mitsuba needs it below one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorlib.solve.problem import Block, connected_components
+from factorlib.solve.unknowns import Light, Materials
+
+BRIGHTEST = 0.9
+RULE = (
+    "per connected component: channel factors make the lights' summed lobe weights nearest to grey (the prior of Wang et al.); "
+    f"the largest diffuse + specular reflectance is {BRIGHTEST}"
+)
+
+
+def in_gauge(materials: Materials, lights: Sequence[Light], blocks: Sequence[Block]) -> tuple[Materials, list[Light]]:
+    """The same predicted radiance in the gauge stated above."""
+    diffuse, specular, lights = materials.diffuse.copy(), materials.specular.copy(), list(lights)
+    names = [block.name for block in blocks]
+    for members, illuminations in connected_components(blocks, len(materials)):
+        own = [names.index(name) for name in illuminations]
+        if not own:
+            continue
+        rows = list(members)
+        factor = 1 / _greying([lights[i] for i in own])  # multiplies reflectances
+        factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
+        diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
+        for i in own:
+            light = lights[i]
+            lights[i] = Light(light.axis, light.log_sharpness, light.weight / factor, light.log_exposure)
+    return Materials(diffuse, specular, materials.roughness), lights
+
+
+def _greying(lights: Sequence[Light]) -> np.ndarray:
+    sums = np.array([light.weight.sum(0) for light in lights])
+    share = sums / np.maximum(sums.mean(1, keepdims=True), 1e-30)
+    return np.clip(share.sum(0) / np.maximum((share**2).sum(0), 1e-30), 1e-3, 1e3)

@@ -1,0 +1,160 @@
+"""Residuals of one illumination and their normal equations.
+
+    predicted  y_ic = e_i Σ_p w_pc B_ipc,          B_ipc = k_d,c D_ip + k_s,c S_ip
+    residual   r_ic = (y_ic − radiance_ic) / σ_ic, and min(r_ic, 0) where the channel is clipped: a clipped pixel says
+                                                   "at least this much"
+    loss       Σ 2k² (√(1 + r²/k²) − 1)            pseudo-Huber: wrong normals and mask borders pull with bounded force
+             + n π Σ_c (W_c/W̄ − 1)² / 3            the paper's prior: variance over channels of the summed weights
+
+D (diffuse) and S (specular) are the responses of a unit lobe, from the reflection operator with their derivatives.
+Channels share the geometry unknowns (axis, sharpness) and have their own weights, so the Gram matrix is assembled
+from one [n, 4p] block per channel rather than from a sparse [3n, 6p] Jacobian.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from factorlib.solve.problem import Block
+from factorlib.solve.unknowns import Light, Materials
+
+CHUNK = 4096  # observations whose responses are held at once
+
+
+class Loss(msgspec.Struct, frozen=True):
+    """robust_scale: k of the pseudo-Huber loss, in σ;  prior: weight π of the paper's tint prior."""
+
+    robust_scale: float = 10.0
+    prior: float = 1e-4
+
+
+class System(msgspec.Struct, frozen=True):
+    """Gauss–Newton system of one illumination: gradient and Hessian blocks of materials (m) and light (l)."""
+
+    loss: float
+    material_gradient: Float[np.ndarray, "7m"]
+    light_gradient: Float[np.ndarray, "l"]
+    material_hessian: Float[np.ndarray, "7m 7m"]
+    cross_hessian: Float[np.ndarray, "7m l"]
+    light_hessian: Float[np.ndarray, "l l"]
+
+
+def lobe_responses(block: Block, rows: slice, light: Light, roughness: float, operator):
+    """Response (see `factorlib.reflection`) of every lobe at the observations `rows`, and cosines' gradients' axes."""
+    normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
+    axis = torch.from_numpy(light.axis)
+    cosines = (normal * view).sum(1), normal @ axis.T, view @ axis.T
+    no, nz, oz = (c.to(operator.dtype) for c in cosines)
+    sharpness = torch.from_numpy(light.sharpness).to(operator.dtype)
+    return operator.response(torch.tensor(roughness, dtype=operator.dtype), sharpness, no, nz, oz)
+
+
+def material_slices(block: Block) -> list[tuple[int, slice]]:
+    """(material, rows) of runs of one material, of at most CHUNK rows."""
+    starts = np.flatnonzero(np.diff(block.material, prepend=-1))
+    ends = np.append(starts[1:], len(block))
+    return [
+        (int(block.material[a]), slice(i, min(i + CHUNK, b)))
+        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
+        for i in range(a, b, CHUNK)
+    ]
+
+
+def predicted_radiance(block: Block, light: Light, materials: Materials, operator) -> Float[np.ndarray, "n 3"]:
+    """Radiance of every observation, in the block's unit."""
+    radiance = np.zeros_like(block.radiance)
+    exposure = np.exp(light.log_exposure)[block.photo]
+    for m, rows in material_slices(block):
+        response = lobe_responses(block, rows, light, materials.roughness[m], operator)
+        diffuse = response.diffuse.double().numpy() @ light.weight
+        specular = response.specular.double().numpy() @ light.weight
+        radiance[rows] = exposure[rows, None] * (materials.diffuse[m] * diffuse + materials.specular[m] * specular)
+    return radiance
+
+
+def residuals(block: Block, predicted: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Whitened residuals, one-sided where clipped."""
+    difference = (predicted - block.radiance) * block.precision
+    return np.where(block.clipped, np.minimum(difference, 0.0), difference)
+
+
+def robust_loss(residual: Float[np.ndarray, "n 3"], scale: float) -> tuple[float, Float[np.ndarray, "n 3"]]:
+    """Pseudo-Huber loss and the weights that make its Gauss–Newton step a least-squares one."""
+    root = np.sqrt(1 + (residual / scale) ** 2)
+    return float(np.sum(2 * scale**2 * (root - 1))), 1 / root
+
+
+def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:
+    """The loss of one illumination over what is not held out, prior included."""
+    residual = residuals(block, predicted_radiance(block, light, materials, operator))[~block.held_out]
+    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0]
+
+
+def system(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> System:
+    """Loss, gradient and Gauss–Newton Hessian of one illumination (all of Σ r², without the factor 2)."""
+    p, f, m = len(light), len(light.log_exposure), len(materials)
+    size = 6 * p + f - 1
+    hessian = np.zeros((7 * m + size, 7 * m + size))
+    gradient = np.zeros(7 * m + size)
+    total = 0.0
+    for index, rows in material_slices(block):
+        response = lobe_responses(block, rows, light, materials.roughness[index], operator)
+        total += _add_rows(hessian, gradient, block, rows, light, materials, index, response, loss)
+    prior, prior_gradient, prior_hessian = _prior(block, light, loss)
+    weights = slice(7 * m + 3 * p, 7 * m + 6 * p)
+    gradient[weights] += prior_gradient
+    hessian[weights, weights] += prior_hessian
+    k = 7 * m
+    return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:])
+
+
+def _add_rows(hessian, gradient, block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> float:
+    """Add the rows of one material; returns their loss."""
+    p, first = len(light), 7 * len(materials)
+    exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
+    normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
+    tangents = [torch.from_numpy(t) for t in light.tangents()]
+    by_tangent = [(normal @ t.T, view @ t.T) for t in tangents]
+    r = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
+    weight = torch.from_numpy(light.weight)
+    fit = torch.from_numpy((~block.held_out[rows]).astype(float))
+    photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure))[:, 1:].double()
+    geometry = slice(first, first + 3 * p)
+    total = 0.0
+    for c in range(3):
+        kd, ks = materials.diffuse[m, c], materials.specular[m, c]
+        basis = kd * r["diffuse"] + ks * r["specular"]
+        by_nz = (kd * r["diffuse_by_nz"] + ks * r["specular_by_nz"]) * weight[:, c]
+        by_oz = ks * r["specular_by_oz"] * weight[:, c]
+        columns = [by_nz * n + by_oz * o for n, o in by_tangent]
+        columns += [(kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]) * weight[:, c], basis]
+        predicted = basis @ weight[:, c]
+        own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]
+        jacobian = torch.cat([*columns, photos * predicted[:, None], torch.stack(own, 1)], 1)
+        precision = torch.from_numpy(block.precision[rows, c])
+        difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
+        residual = torch.where(torch.from_numpy(block.clipped[rows, c]) & (difference > 0), 0.0, difference)
+        root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
+        total += float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
+        pull = fit / root * (residual != 0)
+        scaled = jacobian * (precision * pull.sqrt())[:, None]
+        places = np.r_[geometry, first + (3 + c) * p : first + (4 + c) * p, first + 6 * p : len(gradient), 7 * m + c, 7 * m + 3 + c, 7 * m + 6]
+        hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
+        gradient[places] += (scaled.T @ (residual * pull.sqrt())).numpy()
+    return total
+
+
+def _prior(block: Block, light: Light, loss: Loss):
+    """The tint prior over the lobes' weights [w_R, w_G, w_B] × p, with the mean W̄ held: value, gradient, Hessian."""
+    p = len(light)
+    strength = loss.prior * int((~block.held_out).sum()) / 3
+    sums = light.weight.sum(0)
+    mean = max(float(sums.mean()), 1e-30)
+    centre = (np.eye(3) - 1 / 3) / mean
+    residual = centre @ sums
+    gram = centre.T @ centre * strength
+    gradient = np.repeat(centre.T @ residual * strength, p)
+    return strength * float(residual @ residual), gradient, np.kron(gram, np.ones((p, p)))

@@ -1,0 +1,115 @@
+"""The data of the joint problem, one block per illumination, in that illumination's frame and radiance unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from factorlib.errors import InputError
+from factorlib.urm.observations import Observations
+
+
+class Block(msgspec.Struct, frozen=True):
+    """The n observations under one illumination, sorted by material.
+
+    radiance is divided by `unit` (the block's mean radiance); precision is 1/σ of the noise model times the root of
+    the observation's weight, zero where a channel tells nothing; held_out observations choose the model and do not
+    fit it.
+    """
+
+    name: str
+    photos: tuple[str, ...]
+    unit: float
+    normal: Float[np.ndarray, "n 3"]
+    view: Float[np.ndarray, "n 3"]
+    radiance: Float[np.ndarray, "n 3"]
+    clipped: Bool[np.ndarray, "n 3"]
+    precision: Float[np.ndarray, "n 3"]
+    material: Int[np.ndarray, "n"]
+    photo: Int[np.ndarray, "n"]
+    held_out: Bool[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.material)
+
+
+class Noise(msgspec.Struct, frozen=True):
+    """σ² = absolute² + (relative · radiance)², in units of a block's mean radiance.
+
+    The relative part stands for what a photo's tone curve, rough normals and the lobes' own bias do to bright pixels.
+    """
+
+    absolute: float = 0.05
+    relative: float = 0.05
+    most_weight: float = 8.0  # a merged observation counts as this many independent ones at most
+
+
+def blocks_of_observations(
+    observations: Observations,
+    noise: Noise,
+    *,
+    held_out: float = 0.1,
+    world_from_camera: Mapping[str, Float[np.ndarray, "3 3"]] | None = None,
+    seed: int = 0,
+) -> list[Block]:
+    """One block per illumination, in order of names; observations that are not finite are dropped.
+
+    world_from_camera: rotation of each photo whose illumination is fixed to the world
+    held_out:          share of observations kept for choosing the model
+    Raises InputError where nothing is left.
+    """
+    finite = np.isfinite(observations.radiance).all(1) & np.isfinite(observations.normal).all(1) & np.isfinite(observations.view).all(1)
+    usable = observations.take(finite & (observations.weight > 0))
+    if len(usable) == 0:
+        raise InputError("no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap")
+    rotations = world_from_camera or {}
+    blocks = [
+        _block(usable.take(usable.illumination == i), name, noise, held_out, rotations, seed)
+        for i, name in enumerate(usable.illuminations)
+        if (usable.illumination == i).any()
+    ]
+    return sorted(blocks, key=lambda block: block.name)
+
+
+def _block(seen: Observations, name: str, noise: Noise, held_out: float, rotations: Mapping, seed: int) -> Block:
+    order = np.lexsort((seen.x, seen.y, seen.photo, seen.material))
+    seen = seen.take(order)
+    photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
+    local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
+    normal, view = _in_frame(seen.normal, seen, rotations), _in_frame(seen.view, seen, rotations)
+    radiance = seen.radiance.astype(float)
+    unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
+    scaled = radiance / unit
+    sigma = np.sqrt(noise.absolute**2 + (noise.relative * scaled) ** 2)
+    weight = seen.weight / (1 + seen.weight / noise.most_weight)
+    chosen = np.random.default_rng(seed).random(len(seen)) < held_out
+    return Block(
+        name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), np.sqrt(weight)[:, None] / sigma,
+        seen.material.astype(np.int64), local, chosen,
+    )  # fmt: skip
+
+
+def _in_frame(vectors: np.ndarray, seen: Observations, rotations: Mapping) -> Float[np.ndarray, "n 3"]:
+    turned = vectors.astype(float)
+    for i, photo in enumerate(seen.photos):
+        if rotations.get(photo) is not None:
+            rows = seen.photo == i
+            turned[rows] = turned[rows] @ np.asarray(rotations[photo], dtype=float).T
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def connected_components(blocks: Sequence[Block], materials: int) -> list[tuple[tuple[int, ...], tuple[str, ...]]]:
+    """Components of the material × illumination matrix: (material indices, illumination names) of each, in order.
+
+    Two materials are linked where one light shows both; within a component a factor per channel is undetermined.
+    """
+    groups: list[tuple[set, set]] = [({m}, set()) for m in range(materials)]
+    for block in blocks:
+        seen = set(np.unique(block.material).tolist())
+        touching = [g for g in groups if g[0] & seen]
+        joined = (set().union(*(g[0] for g in touching)), {block.name}.union(*(g[1] for g in touching)))
+        groups = [g for g in groups if g not in touching] + [joined]
+    return sorted((tuple(sorted(m)), tuple(sorted(i))) for m, i in groups)

@@ -1,0 +1,95 @@
+"""One damped Gauss–Newton step of the arrow-shaped system, with bounds.
+
+With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i per illumination), eliminating every light leaves
+
+    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ g_i),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)
+
+with 7 unknowns a material.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on
+the units of an unknown.  An unknown at a bound that the gradient pushes outward is held (its row becomes identity);
+the others are clipped after the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve
+
+from factorlib.solve.normal_equations import System
+from factorlib.solve.unknowns import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Light, Materials
+
+FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
+
+
+class Step(msgspec.Struct, frozen=True):
+    materials: Float[np.ndarray, "7m"]
+    lights: list[Float[np.ndarray, "l"]]
+
+
+def damped_step(systems: Sequence[System], materials: Materials, lights: Sequence[Light], damping: float) -> Step:
+    """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation."""
+    gradient = np.sum([s.material_gradient for s in systems], axis=0)
+    hessian = np.sum([s.material_hessian for s in systems], axis=0)
+    free = ~held_materials(materials, gradient)
+    reduced, right = _damped(hessian, damping), -gradient
+    eliminated = []
+    for s, light in zip(systems, lights, strict=True):
+        loose = ~held_unknowns(light, s.light_gradient)
+        factor = cho_factor(_masked(_damped(s.light_hessian, damping), loose), check_finite=False)
+        cross = s.cross_hessian * loose
+        solved = cho_solve(factor, np.column_stack([cross.T, s.light_gradient * loose]), check_finite=False)
+        reduced -= cross @ solved[:, :-1]
+        right += cross @ solved[:, -1]
+        eliminated.append((solved, loose))
+    by_material = np.linalg.solve(_masked(reduced, free), np.where(free, right, 0.0))
+    by_light = [-(solved[:, -1] + solved[:, :-1] @ by_material) * loose for solved, loose in eliminated]
+    return Step(by_material, by_light)
+
+
+def schur_complement(systems: Sequence[System], materials: Materials, lights: Sequence[Light]) -> Float[np.ndarray, "7m 7m"]:
+    """The information that the data hold about the materials once every light is solved for."""
+    reduced = np.sum([s.material_hessian for s in systems], axis=0)
+    for s, light in zip(systems, lights, strict=True):
+        loose = ~held_unknowns(light, s.light_gradient)
+        factor = cho_factor(_masked(_damped(s.light_hessian, 1e-9), loose), check_finite=False)
+        cross = s.cross_hessian * loose
+        reduced = reduced - cross @ cho_solve(factor, cross.T, check_finite=False)
+    return (reduced + reduced.T) / 2
+
+
+def held_materials(materials: Materials, gradient: Float[np.ndarray, "7m"]) -> Bool[np.ndarray, "7m"]:
+    """Unknowns of the materials at a bound that the loss pushes beyond."""
+    values = materials.vector().reshape(-1, 7)
+    low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
+    high = np.column_stack([np.zeros_like(values[:, :6], bool), values[:, 6] >= ROUGHNESS[1]]).reshape(-1)
+    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0)
+
+
+def held_unknowns(light: Light, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:
+    """Unknowns of a light at a bound that the loss pushes beyond, and those of lobes without weight."""
+    p = len(light)
+    held = np.zeros(len(gradient), bool)
+    low, high = np.log(SHARPNESS)
+    by_sharpness = gradient[2 * p : 3 * p]
+    held[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | ((light.log_sharpness >= high) & (by_sharpness < 0))
+    held[3 * p : 6 * p] = (light.weight.T.reshape(-1) <= 0) & (gradient[3 * p : 6 * p] > 0)
+    dark = light.weight.sum(1) <= 0
+    held[: 3 * p] |= np.tile(dark, 3)
+    return held
+
+
+def _damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
+    diagonal = np.diag(hessian)
+    floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
+    return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
+
+
+def _masked(matrix: Float[np.ndarray, "k k"], kept: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+    """Rows and columns that are not kept become those of the identity (scaled as the rest)."""
+    scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
+    masked = matrix * np.outer(kept, kept)
+    masked[~kept, ~kept] = scale
+    return masked

@@ -1,0 +1,82 @@
+"""What is solved for: materials (shared), and lights with their lobes and exposures (one per illumination)."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+ROUGHNESS = (0.1, 1.0)  # the operators' domain
+SHARPNESS = (0.1, 2000.0)  # from nearly constant to 1.3° wide, about a texel of the exported map
+LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
+
+
+class Materials(msgspec.Struct, frozen=True):
+    """m materials; diffuse and specular reflectance per channel, GGX roughness (α = roughness²)."""
+
+    diffuse: Float[np.ndarray, "m 3"]
+    specular: Float[np.ndarray, "m 3"]
+    roughness: Float[np.ndarray, "m"]
+
+    def __len__(self) -> int:
+        return len(self.roughness)
+
+    def vector(self) -> Float[np.ndarray, "7m"]:
+        """Seven unknowns a material: diffuse RGB, specular RGB, roughness."""
+        return np.column_stack([self.diffuse, self.specular, self.roughness]).reshape(-1)
+
+    @staticmethod
+    def of_vector(vector: Float[np.ndarray, "7m"]) -> Materials:
+        """The nearest materials within bounds."""
+        rows = vector.reshape(-1, 7)
+        reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
+        return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
+
+
+class Light(msgspec.Struct, frozen=True):
+    """p lobes w·exp(λ(ω·z − 1)) of one illumination and the log exposures of its f photos (the first is 0)."""
+
+    axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
+    log_sharpness: Float[np.ndarray, "p"]
+    weight: Float[np.ndarray, "p 3"]  # in the illumination's own radiance unit
+    log_exposure: Float[np.ndarray, "f"]
+
+    def __len__(self) -> int:
+        return len(self.log_sharpness)
+
+    @property
+    def sharpness(self) -> Float[np.ndarray, "p"]:
+        return np.exp(self.log_sharpness)
+
+    def tangents(self) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+        """Two unit vectors that span each axis' tangent plane."""
+        helper = np.where(np.abs(self.axis[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        first = np.cross(self.axis, helper)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return first, np.cross(self.axis, first)
+
+    def moved(self, step: Float[np.ndarray, "6p+f-1"]) -> Light:
+        """Apply a step in the unknowns [tangent 1, tangent 2, log λ, w_R, w_G, w_B] × p, then exposures 1…f−1."""
+        p = len(self)
+        by = step[: 6 * p].reshape(6, p)
+        first, second = self.tangents()
+        turn = np.clip(by[:2], -0.3, 0.3)
+        axis = self.axis + turn[0][:, None] * first + turn[1][:, None] * second
+        return Light(
+            axis / np.linalg.norm(axis, axis=1, keepdims=True),
+            np.clip(self.log_sharpness + np.clip(by[2], -1, 1), *np.log(SHARPNESS)),
+            np.maximum(self.weight + by[3:].T, 0.0),
+            self.log_exposure + np.concatenate([[0.0], np.clip(step[6 * p :], -1, 1)]),
+        )
+
+    def take(self, rows) -> Light:
+        return Light(self.axis[rows], self.log_sharpness[rows], self.weight[rows], self.log_exposure)
+
+    def joined(self, axis, log_sharpness, weight) -> Light:
+        """With further lobes appended."""
+        return Light(
+            np.vstack([self.axis, axis]),
+            np.concatenate([self.log_sharpness, log_sharpness]),
+            np.vstack([self.weight, weight]),
+            self.log_exposure,
+        )
