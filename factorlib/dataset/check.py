@@ -19,7 +19,8 @@ from factorlib.errors import InputError, did_you_mean
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr")
 MASKS = (".png", ".json")
-MESHES = (".obj", ".ply", ".gltf", ".glb")
+ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own name
+MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
 ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1: matrices typed with four digits pass
@@ -143,12 +144,18 @@ def _check_mesh(name: str, mesh: MeshEntry, materials: list[str], refuse: Refusa
         refuse(key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one")
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
-    if mesh.parts and mesh.file.lower().endswith(".ply"):
-        refuse(f"{key}.parts", "a PLY file has no parts", "give one `material:`, or save the mesh as OBJ or glTF")
     if mesh.material is not None:
         _check_known(f"{key}.material", mesh.material, materials, "material", refuse)
     for part, material in (mesh.parts or {}).items():
+        _check_part(f"{key}.parts.{part}", part, mesh, refuse)
         _check_known(f"{key}.parts.{part}", material, materials, "material", refuse)
+
+
+def _check_part(key: str, part: str, mesh: MeshEntry, refuse: Refusal) -> None:
+    """A file of one part has no other; which parts the others have, only reading them shows."""
+    file = Path(mesh.file)
+    if file.suffix.lower() in ONE_PART and part != file.stem:
+        refuse(key, f"{file.name} has no part {part!r}", f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
@@ -185,11 +192,11 @@ def _check_masks(key: str, photo: PhotoEntry, materials: list[str], refuse: Refu
 def _check_object(key: str, thing: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
     _check_name(f"{key}.name", thing.name, refuse)
     _check_known(f"{key}.mesh", thing.mesh, spec.meshes, "mesh", refuse)
-    parts = spec.meshes[thing.mesh].parts
+    mesh = spec.meshes[thing.mesh]
     for part, material in thing.materials.items():
-        if not parts:
-            refuse(f"{key}.materials", f"mesh {thing.mesh!r} has no parts to override", "add a mesh entry of the same file with that material")
-        _check_known(f"{key}.materials.{part}", part, parts, "part", refuse)
+        _check_part(f"{key}.materials.{part}", part, mesh, refuse)
+        if mesh.parts:
+            _check_known(f"{key}.materials.{part}", part, mesh.parts, "part", refuse)
         _check_known(f"{key}.materials.{part}", material, spec.materials, "material", refuse)
     if thing.mask is not None:
         check_path(f"{key}.mask", thing.mask, (".png",), refuse)

@@ -55,13 +55,13 @@ class Coco(msgspec.Struct, frozen=True):
 
 
 def read_coco(
-    path: str | Path, image: str, materials: list[str], size: tuple[int, int]
+    path: str | Path, image: str, materials: list[str], size: tuple[int, int], key: str = "masks"
 ) -> tuple[dict[str, Bool[np.ndarray, "h w"]], tuple[int, int]]:
     """The union of the annotations of each material in the photo named `image`, and the (height, width) they are for.
 
-    size: (height, width) of the photo, for files that do not say it.
+    size: (height, width) of the photo, for files that do not say it; key: where the file is named, for messages.
     """
-    coco = _decode(path)
+    coco = _decode(path, key)
     entry = _entry(coco, image, path)
     shape = (entry.height or size[0], entry.width or size[1])
     names = {category.id: category.name for category in coco.categories}
@@ -115,11 +115,12 @@ def _undifferenced(odd: list[int], even: list[int]) -> list[int]:
     return runs
 
 
-def _decode(path: str | Path) -> Coco:
+def _decode(path: str | Path, key: str) -> Coco:
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=Coco)
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise InputError(f"not readable as COCO ({error})", file=path, cure="it needs images, annotations and categories") from error
+        cure = "it needs images, annotations and categories"
+        raise InputError(f"not readable as COCO ({error})", file=path, key=key, cure=cure) from error
 
 
 def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
@@ -175,7 +176,8 @@ def _filled(polygons: list[list[float]], shape: tuple[int, int], path: str | Pat
             found, cure = f"leaves the image of {_wh(shape)} pixels", "was it drawn at another size? cut it at the image's edge"
             raise InputError(found, file=path, key=f"{key}[{index}]", cure=cure)
         clipped.append(np.clip(corners, 0, [width, height]).ravel().tolist())
-    return pycocomask.decode(pycocomask.merge(pycocomask.frPyObjects(clipped, height, width))).astype(bool)
+    union = pycocomask.merge(pycocomask.frPyObjects(clipped, height, width))
+    return decode_rle(union["counts"].decode("ascii"), height, width)
 
 
 def _wh(shape: tuple[int, int]) -> str:

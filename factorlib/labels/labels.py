@@ -19,7 +19,7 @@ from factorlib.labels.coco import read_coco
 from factorlib.labels.png import read_inside, read_values
 
 LEFT_OUT = 255
-DRAWN_OVERLAP = 0.05  # outlines drawn by hand share some edge pixels: so much of the smaller one is left out, not refused
+DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
 Masks = str | Mapping[str, str]
 log = logging.getLogger("factorlib.labels")
 
@@ -94,39 +94,48 @@ def _of_materials(masks: Mapping[str, str], file: Callable[[str], Path], materia
         inside[material] = read_inside(file(masks[material]), f"{key}.{material}")
         _check_size(inside[material].shape, size, file(masks[material]), f"{key}.{material}")
     where = {material: (file(masks[material]), f"{key}.{material}") for material in inside}
-    return _merged(inside, materials, size, where, shared=0.0)
+    return _merged(inside, materials, size, where, edge=0)
 
 
 def _of_coco(path: Path, materials: list[str], size: tuple[int, int], image: str, key: str) -> Labels:
-    inside, shape = read_coco(path, image, materials, size)
+    inside, shape = read_coco(path, image, materials, size, key)
     _check_size(shape, size, path, key)
-    return _merged(inside, materials, size, {material: (path, key) for material in inside}, shared=DRAWN_OVERLAP)
+    return _merged(inside, materials, size, {material: (path, key) for material in inside}, edge=DRAWN_EDGE)
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray], materials: list[str], size: tuple[int, int], where: Mapping[str, tuple[Path, str]], shared: float
+    inside: Mapping[str, np.ndarray], materials: list[str], size: tuple[int, int], where: Mapping[str, tuple[Path, str]], edge: int
 ) -> Labels:
-    """One map of several masks; what two of them claim is refused above the part `shared` of the smaller, else left out."""
+    """One map of several masks; what two of them claim is refused where it is wider than `edge` pixels, else left out."""
     label, left_out = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=bool)
     for number, material in enumerate(materials, 1):
         if material not in inside:
             continue
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
             both = inside[material] & (label == other)
-            _refuse_overlap(materials[other - 1], material, both, inside, where, shared)
+            _refuse_overlap(materials[other - 1], material, both, where, edge)
             left_out |= both
         label[inside[material]] = number
     label[left_out] = 0
     return Labels(label=label, left_out=left_out)
 
 
-def _refuse_overlap(one: str, other: str, both: np.ndarray, inside: Mapping, where: Mapping, shared: float) -> None:
-    count, smaller = int(both.sum()), int(min(inside[one].sum(), inside[other].sum()))
+def _refuse_overlap(one: str, other: str, both: np.ndarray, where: Mapping[str, tuple[Path, str]], edge: int) -> None:
+    count = int(both.sum())
     (path, key), also = where[other], where[one][0]
     found = f"materials {one!r} and {other!r} share {count} pixels" + (f" with {also.name}" if also != path else "")
-    if count > shared * smaller:
+    if _is_wider(both, edge):
         raise InputError(found, file=path, key=key, cure="a pixel shows one material: erase it from the one behind")
     log.warning("%s: %s: %s along their outlines: these are left out", path, key, found)
+
+
+def _is_wider(region: Bool[np.ndarray, "h w"], width: int) -> bool:
+    """Whether a square of width + 1 pixels fits into it somewhere."""
+    for axis in (0, 1):
+        length = region.shape[axis] - width
+        rows = [np.take(region, range(k, k + length), axis=axis) for k in range(width + 1)]
+        region = np.logical_and.reduce(rows)
+    return bool(region.any())
 
 
 def _check_size(found: tuple[int, ...], size: tuple[int, int], path: Path, key: str) -> None:

@@ -1,0 +1,279 @@
+"""Masks: every way to give one means the same labels, and what is doubtful is refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from pycocotools import mask as pycocomask
+
+from factorlib.errors import InputError
+from factorlib.labels import read_labels, read_objects
+from factorlib.labels.coco import decode_rle, decompress
+from factorlib.labels.png import read_values
+
+MATERIALS = ["red", "white", "wood"]
+H, W = 20, 30
+LABEL = np.zeros((H, W), dtype=np.uint8)
+LABEL[2:9, 3:12] = 1
+LABEL[10:18, 5:25] = 3
+KEY = "photos[kitchen].masks"
+
+
+def save(path, values, mode=None):
+    Image.fromarray(values).save(path) if mode is None else Image.fromarray(values).convert(mode).save(path)
+    return path.name
+
+
+def labels(folder, masks, size=(H, W), image="photos/kitchen.jpg", materials=MATERIALS):
+    return read_labels(masks, lambda name: folder / name, materials, size, image, KEY)
+
+
+def refusal(folder, masks, **options):
+    """The message with which `masks` are refused; it always names file and key, and a cure."""
+    with pytest.raises(InputError) as caught:
+        labels(folder, masks, **options)
+    first = masks if isinstance(masks, str) else next(iter(masks.values()))
+    assert str(folder) in str(caught.value.file) and caught.value.key and caught.value.cure, (caught.value, first)
+    return str(caught.value)
+
+
+def palette(path, values):
+    image = Image.fromarray(values, mode="P")
+    image.putpalette([0, 0, 0, 200, 10, 10, 250, 250, 250, 120, 80, 20] + [7] * 756)
+    image.save(path)
+    return path.name
+
+
+# ---- the same labels from every kind of file -----------------------------------------------------------------
+
+
+def coco(folder, annotations, images=None, categories=MATERIALS):
+    content = {
+        "info": {"year": 2020},
+        "images": images or [{"id": 7, "file_name": "kitchen.jpg", "width": W, "height": H, "license": 1}],
+        "categories": [{"id": 10 + k, "name": name, "supercategory": "material"} for k, name in enumerate(categories)],
+        "annotations": [{"id": k, "image_id": 7, "iscrowd": 0, **annotation} for k, annotation in enumerate(annotations)],
+    }
+    (folder / "coco.json").write_text(json.dumps(content))
+    return "coco.json"
+
+
+def counts_of(inside):
+    """Uncompressed RLE by hand: runs down the columns, starting outside."""
+    runs, value = [], False
+    for pixel in np.concatenate([inside.T.ravel(), [None]]):
+        if not runs or (pixel is not None and bool(pixel) != value):
+            runs.append(0)
+            value = bool(pixel) if runs[:-1] else False
+            if len(runs) == 1 and pixel:
+                runs, value = [0, 0], True
+        if pixel is not None:
+            runs[-1] += 1
+    return runs
+
+
+def box(x0, y0, x1, y1):
+    return [x0, y0, x1, y0, x1, y1, x0, y1]
+
+
+def forms(folder):
+    red, wood = LABEL == 1, LABEL == 3
+    rle = lambda inside: pycocomask.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()  # noqa: E731
+    as_is = LABEL.copy()
+    return {
+        "grey": lambda: save(folder / "grey.png", as_is),
+        "palette": lambda: palette(folder / "palette.png", as_is),
+        "rgb": lambda: save(folder / "rgb.png", np.dstack([as_is] * 3)),
+        "rgba": lambda: save(folder / "rgba.png", np.dstack([as_is] * 3 + [np.full_like(as_is, 255)])),
+        "16 bit": lambda: save(folder / "deep.png", as_is.astype(np.uint16)),
+        "one each, 255": lambda: {"wood": save(folder / "w.png", wood.astype(np.uint8) * 255), "red": save(folder / "r.png", red.astype(np.uint8) * 255)},
+        "one each, 1": lambda: {"red": save(folder / "r.png", red.astype(np.uint8)), "wood": save(folder / "w.png", wood.astype(np.uint8))},
+        "one each, 1 bit": lambda: {"red": save(folder / "r.png", red), "wood": save(folder / "w.png", wood)},
+        "polygons": lambda: coco(
+            folder,
+            [
+                {"category_id": 12, "segmentation": [box(5, 10, 15, 18), box(15, 10, 25, 18)]},
+                {"category_id": 10, "segmentation": [box(3, 2, 12, 9)]},
+            ],
+        ),
+        "RLE": lambda: coco(
+            folder,
+            [
+                {"category_id": 10, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": counts_of(red)}},
+                {"category_id": 12, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": rle(wood)}},
+            ],
+        ),
+    }
+
+
+@pytest.mark.parametrize("form", list(forms(None)))
+def test_every_form_is_the_same_labels(tmp_path, form):
+    found = labels(tmp_path, forms(tmp_path)[form]())
+    np.testing.assert_array_equal(found.label, LABEL)
+    assert not found.left_out.any()
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_grey_of_few_bits_is_not_stretched(tmp_path, bits):
+    values = (LABEL > 0).astype(np.uint8)
+    image = Image.fromarray(values.astype(bool)) if bits == 1 else Image.fromarray(values)
+    image.save(tmp_path / "a.png", **({} if bits == 1 else {"bits": bits}))
+    assert (tmp_path / "a.png").read_bytes()[24] == bits
+    np.testing.assert_array_equal(read_values(tmp_path / "a.png", KEY), values)
+
+
+def test_255_is_left_out_in_a_label_mask_and_inside_in_a_mask_of_one_material(tmp_path):
+    values = LABEL.copy()
+    values[0] = 255
+    found = labels(tmp_path, save(tmp_path / "a.png", values))
+    np.testing.assert_array_equal(found.label, LABEL)
+    assert found.left_out[0].all() and not found.left_out[1:].any()
+    assert not labels(tmp_path, {"red": save(tmp_path / "r.png", np.uint8(255) * (LABEL == 1))}).left_out.any()
+
+
+def test_a_soft_edge_is_cut_at_half(tmp_path):
+    values = np.zeros((H, W), dtype=np.uint8)
+    values[5], values[6], values[7] = 100, 200, 255
+    found = labels(tmp_path, {"white": save(tmp_path / "a.png", values)}).label
+    assert (found[5] == 0).all() and (found[6:8] == 2).all()
+
+
+# ---- RLE -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rle_is_decoded_as_pycocotools_does(seed):
+    rng = np.random.default_rng(seed)
+    inside = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
+    encoded = pycocomask.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()
+    np.testing.assert_array_equal(decode_rle(encoded, *inside.shape), inside)
+    assert decompress(encoded) == counts_of(inside)
+
+
+@pytest.mark.parametrize("counts", [[10, 5], [H * W + 1], [-5, H * W + 5], "~~~", "P", "0P"])
+def test_damaged_rle_is_refused(tmp_path, counts):
+    name = coco(tmp_path, [{"category_id": 10, "segmentation": {"size": [H, W], "counts": counts}}])
+    assert "annotations[0].segmentation" in refusal(tmp_path, name)
+
+
+# ---- refused -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["label", "per material", "coco"])
+@pytest.mark.parametrize("size, hint", [((H + 1, W), "own pixels"), ((W, H), "EXIF orientation")])
+def test_another_size(tmp_path, form, size, hint):
+    name = save(tmp_path / "a.png", LABEL)
+    masks = {"label": name, "per material": {"red": name}, "coco": coco(tmp_path, [])}[form]
+    message = refusal(tmp_path, masks, size=size)
+    assert f"{W} × {H}" in message and f"{size[1]} × {size[0]}" in message and hint in message
+    assert KEY in message and ("coco.json" if form == "coco" else "a.png") in message
+
+
+def test_unknown_label(tmp_path):
+    values = LABEL.copy()
+    values[0, :5] = 4
+    message = refusal(tmp_path, save(tmp_path / "a.png", values))
+    assert "a.png" in message and "unknown label 4 (5 pixels)" in message and "3 wood" in message
+
+
+@pytest.mark.parametrize("masks", ["label", "per material", "coco"])
+def test_empty(tmp_path, masks):
+    name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
+    message = refusal(tmp_path, {"label": name, "per material": {"red": name, "wood": name}, "coco": coco(tmp_path, [])}[masks])
+    assert "the mask is empty" in message and KEY in message
+
+
+def test_only_0_and_255_says_how_a_binary_mask_is_given(tmp_path):
+    message = refusal(tmp_path, save(tmp_path / "a.png", np.uint8(255) * (LABEL > 0)), materials=["gold"])
+    assert "only 0 and 255" in message and "masks: {gold:" in message
+
+
+def test_colours(tmp_path):
+    picture = np.dstack([LABEL * 60, LABEL, LABEL])
+    message = refusal(tmp_path, save(tmp_path / "a.png", picture))
+    assert "colour picture" in message and "one channel" in message
+
+
+def test_transparency(tmp_path):
+    assert "transparent" in refusal(tmp_path, save(tmp_path / "a.png", np.dstack([LABEL] * 3 + [LABEL * 50])))
+
+
+@pytest.mark.parametrize("content", [b"", b"no PNG at all", None])
+def test_unreadable_or_truncated(tmp_path, content):
+    noise = np.random.default_rng(0).integers(0, 4, (64, 64)).astype(np.uint8)
+    save(tmp_path / "a.png", noise)
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2] if content is None else content)
+    assert "a.png" in refusal(tmp_path, "a.png", size=(64, 64))
+
+
+def test_materials_that_overlap(tmp_path):
+    red, wood = LABEL == 1, LABEL > 0
+    masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * wood), "red": save(tmp_path / "r.png", np.uint8(255) * red)}
+    message = refusal(tmp_path, masks)
+    assert f"'red' and 'wood' share {red.sum()} pixels" in message and "w.png" in message and "r.png" in message
+
+
+def test_outlines_that_share_an_edge_lose_it_and_ones_that_share_more_are_refused(tmp_path):
+    side = [{"category_id": 10, "segmentation": [box(0, 0, 20, 20)]}]
+    found = labels(tmp_path, coco(tmp_path, [*side, {"category_id": 11, "segmentation": [box(19, 0, 30, 20)]}]))
+    both = found.left_out
+    assert 0 < both.sum() <= H and (found.label[both] == 0).all() and {1, 2} <= set(found.label.ravel().tolist())
+    message = refusal(tmp_path, coco(tmp_path, [*side, {"category_id": 11, "segmentation": [box(10, 0, 30, 20)]}]))
+    assert "'red' and 'white' share 200 pixels" in message
+
+
+@pytest.mark.parametrize(
+    "annotation, said",
+    [
+        ({"category_id": 13, "segmentation": [box(3, 2, 12, 9)]}, ["'whit'", "did you mean 'white'"]),
+        ({"category_id": 99, "segmentation": [box(3, 2, 12, 9)]}, ["99", "not in categories"]),
+        ({"category_id": 10, "segmentation": []}, ["only a box", "annotations[0].segmentation"]),
+        ({"category_id": 10, "segmentation": [[1, 2, 3, 4]]}, ["no polygon", "segmentation[0]"]),
+        ({"category_id": 10, "segmentation": [box(3, 2, 60, 9)]}, ["leaves the image", "30 × 20"]),
+        ({"category_id": 10, "segmentation": {"size": [W, H], "counts": [H * W]}}, ["20 × 30", "30 × 20"]),
+    ],
+)
+def test_bad_annotations(tmp_path, annotation, said):
+    message = refusal(tmp_path, coco(tmp_path, [annotation], categories=[*MATERIALS, "whit"]))
+    assert all(word in message for word in ["coco.json", *said]), message
+
+
+def test_coco_without_the_photo(tmp_path):
+    name = coco(tmp_path, [], images=[{"id": 7, "file_name": "kitchem.jpg"}])
+    assert "did you mean 'kitchem.jpg'" in refusal(tmp_path, name)
+
+
+def test_coco_goes_by_the_whole_path_first(tmp_path):
+    images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "other"), (7, "photos"))]
+    name = coco(tmp_path, [{"category_id": 10, "segmentation": [box(3, 2, 12, 9)]}], images=images)
+    assert labels(tmp_path, name).label.any()
+    images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "a"), (7, "b"))]
+    assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images))
+
+
+def test_a_coco_file_that_is_none(tmp_path):
+    (tmp_path / "coco.json").write_text('{"images": []}')
+    assert "coco.json" in refusal(tmp_path, "coco.json")
+
+
+# ---- objects -------------------------------------------------------------------------------------------------
+
+
+def objects(folder, masks):
+    return read_objects(masks, lambda name: folder / name, (H, W), "photos[kitchen].objects")
+
+
+def test_objects_are_numbered_in_their_order(tmp_path):
+    one, three = (save(tmp_path / f"{k}.png", np.uint8(255) * (LABEL == k)) for k in (1, 3))
+    found = objects(tmp_path, [("a", None), ("b", three), ("c", one)])
+    np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
+
+
+@pytest.mark.parametrize("second, said", [(LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")])
+def test_bad_object_masks(tmp_path, second, said):
+    masks = [("a", save(tmp_path / "a.png", LABEL == 1)), ("b", save(tmp_path / "b.png", second))]
+    with pytest.raises(InputError, match=said) as caught:
+        objects(tmp_path, masks)
+    assert "b.png" in str(caught.value) and "photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
