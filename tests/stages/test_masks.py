@@ -1,0 +1,185 @@
+"""The stage `masks`: what it writes is what the photo and the masks say, and what is refused leaves nothing behind."""
+
+import json
+import logging
+
+import msgspec
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image
+
+from factorlib.dataset.schema import ObjectMask, PhotoSlice
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr, write_rgb_exr
+from factorlib.images.transfer import srgb_encode
+from factorlib.stage import Inputs
+from stages import masks
+
+H, W = 16, 24
+MATERIALS = ["red", "wood"]
+LABEL = np.zeros((H, W), dtype=np.uint8)
+LABEL[1:8, 2:10] = 1
+LABEL[9:15, 4:20] = 2
+LABEL[0] = 255
+RADIANCE = np.random.default_rng(1).uniform(0, 0.8, (H, W, 3)).astype(np.float32)
+CHANNELS = {"R", "G", "B", "label", "valid", "left_out", "object", "clipped.R", "clipped.G", "clipped.B"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "in").mkdir()
+    write_rgb_exr(tmp_path / "in" / "photo.exr", RADIANCE)
+    Image.fromarray(LABEL).save(tmp_path / "in" / "mask.png")
+    return tmp_path
+
+
+def run(folder, progress=lambda *_: None, **facts):
+    """The channels and the summary the stage writes for a photo `kitchen` with the given facts."""
+    given = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen", "objects": []}
+    photo = PhotoSlice(**given | facts)
+    inputs = Inputs(
+        folders={},
+        facts={"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": MATERIALS},
+        files={path.name: path for path in (folder / "in").iterdir()},
+        photo="kitchen",
+    )
+    out = folder / "out"
+    out.mkdir(exist_ok=True)
+    masks.main(masks.Params(), inputs, out, progress)
+    assert sorted(path.name for path in out.iterdir()) == ["kitchen.exr", "kitchen.json"]
+    return read_exr(out / "kitchen.exr"), json.loads((out / "kitchen.json").read_text())
+
+
+def refusal(folder, **facts):
+    with pytest.raises(InputError) as caught:
+        run(folder, **facts)
+    assert caught.value.file and "photos[kitchen]" in caught.value.key and caught.value.cure
+    assert not list((folder / "out").iterdir()), "something half-written"
+    return str(caught.value)
+
+
+def test_channels_say_what_photo_and_mask_say(folder):
+    channels, summary = run(folder)
+    assert set(channels) == CHANNELS
+    np.testing.assert_array_equal(np.dstack([channels[c] for c in "RGB"]), RADIANCE)
+    np.testing.assert_array_equal(channels["label"], np.where(LABEL == 255, 0, LABEL))
+    np.testing.assert_array_equal(channels["valid"], (LABEL > 0) & (LABEL < 255))
+    np.testing.assert_array_equal(channels["left_out"], LABEL == 255)
+    assert not channels["object"].any() and not channels["clipped.R"].any()
+    assert summary == {
+        "width": W,
+        "height": H,
+        "focal_px": None,
+        "focal_source": None,
+        "encoding": "linear",
+        "illumination": "kitchen",
+        "pixels": {"red": 56, "wood": 96},
+        "clipped_fraction": 0.0,
+    }
+
+
+def test_clipped_channels_are_marked_and_stay_valid(folder):
+    codes = np.rint(255 * srgb_encode(RADIANCE)).astype(np.uint8)
+    codes[2, 3, 0] = codes[15, 0, 2] = 255  # one inside, one in the background
+    Image.fromarray(codes).save(folder / "in" / "photo.png")
+    channels, summary = run(folder, image="photo.png")
+    assert channels["clipped.R"][2, 3] == 1 and channels["valid"][2, 3] == 1 and channels["clipped.G"].sum() == 0
+    assert channels["clipped.B"][15, 0] == 1
+    assert summary["clipped_fraction"] == pytest.approx(1 / 152) and summary["encoding"] == "srgb"
+
+
+def test_nan_pixels_are_not_valid_and_are_told(folder, caplog):
+    radiance = RADIANCE.copy()
+    radiance[2, 3, 1], radiance[3, 3, 0] = np.nan, np.inf
+    write_rgb_exr(folder / "in" / "photo.exr", radiance)
+    with caplog.at_level(logging.WARNING):
+        channels, summary = run(folder)
+    assert channels["valid"][2, 3] == channels["valid"][3, 3] == 0 and summary["pixels"]["red"] == 54
+    assert channels["label"][2, 3] == 1 and all(np.isfinite(channel).all() for channel in channels.values())
+    assert "2 of the 152 pixels" in caplog.text and "photo.exr" in caplog.text
+
+
+def test_nothing_but_nan_in_the_mask_is_refused(folder):
+    radiance = RADIANCE.copy()
+    radiance[(LABEL > 0) & (LABEL < 255)] = np.nan
+    write_rgb_exr(folder / "in" / "photo.exr", radiance)
+    message = refusal(folder)
+    assert "photo.exr" in message and "NaN" in message
+
+
+def test_own_masks_number_the_objects(folder):
+    Image.fromarray(LABEL == 2).save(folder / "in" / "own.png")
+    channels, _ = run(folder, objects=[ObjectMask("a", None), ObjectMask("b", "own.png")])
+    np.testing.assert_array_equal(channels["object"], 2 * (LABEL == 2))
+
+
+@pytest.mark.parametrize("given, source, expected", [(812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))])
+def test_focal_of_the_dataset_goes_before_exif(folder, given, source, expected):
+    spec = oiio.ImageSpec(W, H, 3, oiio.UINT8)
+    spec.attribute("Exif:FocalLengthIn35mmFilm", 50)
+    output = oiio.ImageOutput.create("photo.jpg")
+    assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(np.full((H, W, 3), 90, dtype=np.uint8))
+    output.close()
+    _, summary = run(folder, image="photo.jpg", focal_px=given)
+    assert summary["focal_source"] == source and summary["focal_px"] == pytest.approx(expected)
+
+
+def test_the_same_input_is_the_same_bytes(folder):
+    run(folder)
+    first = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    run(folder)
+    assert first == {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+
+
+def test_progress_ends_where_it_said_it_would(folder):
+    told = []
+    run(folder, progress=lambda done, total, text="": told.append((done, total)))
+    assert told == sorted(told) and told[-1][0] == told[-1][1]
+
+
+def _truncated(folder):
+    path = folder / "in" / "photo.exr"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _no_image(folder):
+    (folder / "in" / "photo.exr").write_text("hello")
+
+
+def _other_size(folder):
+    Image.fromarray(LABEL[:-1]).save(folder / "in" / "mask.png")
+
+
+def _on_its_side(folder):
+    Image.fromarray(np.ascontiguousarray(LABEL.T)).save(folder / "in" / "mask.png")
+
+
+def _unknown_label(folder):
+    Image.fromarray(LABEL * 3).save(folder / "in" / "mask.png")
+
+
+def _empty(folder):
+    Image.fromarray(LABEL * 0).save(folder / "in" / "mask.png")
+
+
+def _broken_mask(folder):
+    (folder / "in" / "mask.png").write_bytes(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (_truncated, ["photo.exr", "photos[kitchen].image", "truncated"]),
+        (_no_image, ["photo.exr", "photos[kitchen].image", "not readable"]),
+        (_other_size, ["mask.png", "photos[kitchen].masks", "24 × 15", "24 × 16"]),
+        (_on_its_side, ["mask.png", "EXIF orientation"]),
+        (_unknown_label, ["mask.png", "unknown label 3 (56 pixels)", "2 wood"]),
+        (_empty, ["mask.png", "the mask is empty"]),
+        (_broken_mask, ["mask.png", "not readable as a PNG"]),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_is_left(folder, spoil, said):
+    spoil(folder)
+    message = refusal(folder)
+    assert all(word in message for word in said), message
