@@ -19,7 +19,6 @@ from factorlib.solve.insertion import lobes_inserted, pruned
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
 from factorlib.solve.problem import Block
 from factorlib.solve.start import starting_light, starting_materials
-from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
 
 
@@ -53,8 +52,15 @@ class Event(msgspec.Struct, frozen=True):
 Report = Callable[[Event], None]
 
 
-def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> tuple[Materials, list[Light], list[Event]]:
-    """All materials and one light per block, in the gauge of `solve.gauge`, with the history of the descent."""
+class Joint(msgspec.Struct, frozen=True):
+    """The answer, in the gauge of `solve.gauge`: materials, one light per block, and how it was reached."""
+
+    solution: Solution
+    history: list[Event]
+
+
+def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
+    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
     history: list[Event] = []
 
     def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
@@ -83,7 +89,7 @@ def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map
     best = evaluated(everything, best.materials, best.lights, operator, loss, map_)
     best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
     best = _tidied(everything, best, operator, loss, map_)
-    return best.materials, best.lights, history
+    return Joint(best, history)
 
 
 def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:

@@ -1,0 +1,146 @@
+"""The joint solve: from all observations, one reflectance per material and one light per illumination.
+
+Writes materials.json, lobes.parquet, exposures.json, convergence.parquet and uncertainty.json.
+"""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from factorlib.dataset.schema import LightSlice
+from factorlib.jsonfile import write_json
+from factorlib.light.lobes import Lobes, write_lobes
+from factorlib.reflection import reflection_operator
+from factorlib.solve.bundle import Bundle, Event, Joint, solve
+from factorlib.solve.gauge import RULE
+from factorlib.solve.normal_equations import Loss
+from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
+from factorlib.solve.uncertainty import GAUGE, standard_errors
+from factorlib.solve.unknowns import Materials
+from factorlib.stage import Inputs, Progress
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import Observations, concatenate, read_observations
+
+log = logging.getLogger("factorlib.solve")
+Meta = msgspec.Meta
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """operator: how a lobe's reflection is computed;  merge_degrees: observations this near are merged before solving.
+
+    lobes: most lobes an illumination may get (held-out pixels may stop earlier);  prior: weight of the paper's tint
+    prior;  noise_…: the noise model, in units of an illumination's mean radiance.
+    """
+
+    operator: Literal["network", "closed_form", "reference"] = "network"
+    merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
+    lobes: Annotated[int, Meta(ge=1, le=1024)] = 64
+    insert: Annotated[int, Meta(ge=1, le=64)] = 10
+    rounds: Annotated[int, Meta(ge=1, le=100)] = 12
+    iterations: Annotated[int, Meta(ge=1, le=1000)] = 15
+    polish: Annotated[int, Meta(ge=0, le=1000)] = 30
+    tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
+    least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
+    held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
+    prior: Annotated[float, Meta(ge=0)] = 1e-4
+    noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
+    noise_relative: Annotated[float, Meta(ge=0)] = 0.05
+    seed: Annotated[int, Meta(ge=0)] = 0
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    materials: list[str] = inputs.facts["dataset.materials"]
+    seen = concatenate([read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))])
+    blocks = blocks_of_observations(
+        merge(seen, params.merge_degrees),
+        Noise(params.noise_absolute, params.noise_relative),
+        held_out=params.held_out,
+        world_from_camera=_rotations(inputs),
+        seed=params.seed,
+    )
+    _warn_of_gaps(materials, blocks, seen)
+    operator = reflection_operator(params.operator, weights=inputs["train"])
+    joint = solve(blocks, len(materials), operator, _bundle(params), inputs.map, _to_progress(progress, params))
+    _write(out, materials, blocks, joint, operator)
+
+
+def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    return {photo: np.array(light.world_from_camera) for photo, light in lights.items() if light.world_from_camera is not None}
+
+
+def _bundle(params: Params) -> Bundle:
+    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "tolerance", "least_gain", "seed")}
+    return Bundle(loss=Loss(prior=params.prior), **same)
+
+
+def _to_progress(progress: Progress, params: Params):
+    def report(event: Event) -> None:
+        of_round = (event.iteration + 1) / params.iterations if event.phase == "descent" else 1.0
+        done = event.round + min(of_round, 1.0) if event.phase != "polish" else params.rounds
+        progress(done, params.rounds + 1, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
+
+    return report
+
+
+def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations) -> None:
+    """Say what the observations cannot tell: unseen materials, unseen photos, sets that are not linked."""
+    observed = {int(m) for block in blocks for m in np.unique(block.material)}
+    for index, name in enumerate(materials):
+        if index not in observed:
+            log.warning("material '%s' is observed in no photo: its reflectance is only a guess", name)
+    for photo in set(seen.photos) - {photo for block in blocks for photo in block.photos}:
+        log.warning("photo '%s' has no valid observation and gets no light", photo)
+    linked = [c for c in connected_components(blocks, len(materials)) if c[1]]
+    if len(linked) > 1:
+        groups = "; ".join(f"{', '.join(lights)} (with {', '.join(materials[m] for m in members)})" for members, lights in linked)
+        log.warning(
+            "the photos fall into %d sets that share no material, so their reflectances cannot be compared: %s. "
+            "A photo that shows a material of each would link them",
+            len(linked), groups,
+        )  # fmt: skip
+
+
+def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator) -> None:
+    errors, deviation = standard_errors(blocks, joint.solution, operator)
+    found, components = joint.solution.materials, connected_components(blocks, len(names))
+    component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
+    model = {
+        "solver": "bundle",
+        "lobes": {block.name: len(light) for block, light in zip(blocks, joint.solution.lights, strict=True)},
+        "lobes_chosen_by": "held-out loss per round, see convergence.parquet",
+        "held_out_loss": [event.held_out for event in joint.history if event.phase == "round"],
+    }
+    gauge = {"rule": RULE, "component": {name: component_of[m] for m, name in enumerate(names)}, "stderr": GAUGE}
+    write_json(out / "materials.json", {"materials": _as_json(names, found, errors), "gauge": gauge, "model": model})
+    write_json(out / "uncertainty.json", {"residual_sigma": deviation, "materials": _as_json(names, errors, None), "gauge": GAUGE})
+    lights = list(zip(blocks, joint.solution.lights, strict=True))
+    write_lobes(out / "lobes.parquet", {b.name: Lobes(light.axis, light.sharpness, light.weight * b.unit) for b, light in lights})
+    exposures = {photo: [float(np.exp(light.log_exposure[k]))] * 3 for b, light in lights for k, photo in enumerate(b.photos)}
+    write_json(out / "exposures.json", exposures)
+    _write_history(out / "convergence.parquet", joint.history)
+
+
+def _as_json(names: list[str], materials: Materials, errors: Materials | None) -> dict:
+    """The fixed form of materials.json; standard errors in the same shape, where given."""
+    table = {}
+    for m, name in enumerate(names):
+        diffuse, specular, roughness = materials.diffuse[m].tolist(), materials.specular[m].tolist(), float(materials.roughness[m])
+        table[name] = {"diffuse": diffuse, "specular": specular, "roughness": roughness}
+        if errors is not None:
+            table[name] |= {"alpha": roughness**2, "stderr": _as_json([name], _one(errors, m), None)[name]}
+    return table
+
+
+def _one(materials: Materials, m: int) -> Materials:
+    return Materials(materials.diffuse[[m]], materials.specular[[m]], materials.roughness[[m]])
+
+
+def _write_history(path: Path, history: list[Event]) -> None:
+    columns = {name: [getattr(event, name) for event in history] for name in Event.__struct_fields__}
+    pq.write_table(pa.table(columns), path, compression="zstd")

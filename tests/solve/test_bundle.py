@@ -1,0 +1,78 @@
+import msgspec
+import numpy as np
+import pytest
+from tests.solve.problems import MATERIALS, block, factor_between, random_light
+
+from factorlib.reflection import reflection_operator
+from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.problem import connected_components
+from factorlib.stage import serial_map
+
+OPERATOR = reflection_operator("closed_form", dtype="float64")
+QUICK = Bundle(lobes=12, insert=6, rounds=4, iterations=10, polish=15)
+
+
+def rooms(count=2, lobes=4, photos=1, seed=3):
+    rng = np.random.default_rng(seed)
+    return [block(f"room{i}", random_light(rng, lobes, photos), MATERIALS, [0, 1, 2], OPERATOR, seed=i) for i in range(count)]
+
+
+def run(blocks, materials=3, bundle=QUICK):
+    joint = solve(blocks, materials, OPERATOR, bundle, serial_map, lambda event: None)
+    return joint.solution.materials, joint.solution.lights, joint.history
+
+
+@pytest.fixture(scope="module")
+def solved():
+    blocks = rooms()
+    return blocks, *run(blocks)
+
+
+def test_recovers_the_materials_it_was_rendered_with(solved):
+    _, materials, _, _ = solved
+    factor = factor_between(materials, MATERIALS)
+    np.testing.assert_allclose(materials.roughness, MATERIALS.roughness, atol=0.05)
+    np.testing.assert_allclose(materials.diffuse * factor, MATERIALS.diffuse, rtol=0.15, atol=0.01)
+
+
+def test_resynthesises_what_it_was_shown(solved):
+    blocks, materials, lights, _ = solved
+    for data, light in zip(blocks, lights, strict=True):
+        error = predicted_radiance(data, light, materials, OPERATOR) - data.radiance
+        assert np.sqrt(np.mean(error**2)) < 0.03 * np.quantile(data.radiance, 0.99)
+
+
+def test_lights_are_not_negative_and_finite(solved):
+    for light in solved[2]:
+        assert (light.weight >= 0).all()
+        assert np.isfinite(light.weight).all() and np.isfinite(light.axis).all()
+
+
+def test_loss_never_rises_within_a_descent(solved):
+    events = [e for e in solved[3] if e.phase == "descent"]
+    for a, b in zip(events, events[1:], strict=False):
+        if a.round == b.round:
+            assert b.loss <= a.loss
+
+
+def test_scaling_a_photo_scales_its_light_alone(solved):
+    blocks, materials, lights, _ = solved
+    brighter = [msgspec.structs.replace(blocks[0], unit=7 * blocks[0].unit), *blocks[1:]]
+    again, same, _ = run(brighter)
+    np.testing.assert_array_equal(again.vector(), materials.vector())
+    np.testing.assert_array_equal(same[0].weight, lights[0].weight)  # in units of the block, which carries the 7
+
+
+def test_exposures_of_photos_that_share_a_light_are_found():
+    rng = np.random.default_rng(5)
+    truth = random_light(rng, 3, photos=3)
+    data = block("room", truth, MATERIALS, [0, 1, 2], OPERATOR, size=16)
+    _, lights, _ = run([data])
+    np.testing.assert_allclose(lights[0].log_exposure, truth.log_exposure, atol=0.01)
+
+
+def test_components_of_unlinked_photos():
+    rng = np.random.default_rng(6)
+    blocks = [block(name, random_light(rng, 1), MATERIALS, shown, OPERATOR, size=8) for name, shown in (("a", [0, 1]), ("b", [2]))]
+    assert connected_components(blocks, 4) == [((0, 1), ("a",)), ((2,), ("b",)), ((3,), ())]
