@@ -1,0 +1,215 @@
+"""Balls of a material in a measured light, by quadrature of its lat-long map: what relighting is judged on.
+
+The ball is seen from the front, orthographically, in the light's frame (x right, y up, z toward the viewer).
+
+The map is first laid on an equal-area octahedral square (Clarberg 2008, "Fast equal-area mapping of the
+(hemi)sphere using SIMD") with a pyramid of averages over it: every texel of a level is the same solid angle, so a
+sample that stands for Ω steradians reads the level whose texels have Ω (filtered importance sampling, Křivánek and
+Colbert 2008).  Here the samples are a fixed lattice: no noise, the same bytes every time.
+
+Diffuse   E(n)/π = (1/π) ∫ L(i) max(n·i, 0) di     sum over the texels of one level
+Glossy    ∫ L(i) D G / (4 n·o) di                  a wide lobe (α > 0.2) as the same sum, a narrow one by its visible normals
+                                                   (Heitz 2018): with separable G = G1(i) G1(o) their density cancels
+                                                   all but G1(i), so it is the mean of L(i) G1(n·i)
+Mirror    L(2(n·o)n − o)                           averaged over the solid angle that a pixel of the ball sees
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from factorlib.conventions import alpha_of_roughness, lat_long_directions, lat_long_solid_angles
+
+SIDE = 128  # texels of the finest octahedral level: 1.6° across
+WIDE_SIDE = 64  # of the level that wide lobes are summed over
+WIDE_ALPHA = 0.2
+SAMPLES = 384  # of a narrow lobe
+GOLDEN = (np.sqrt(5) - 1) / 2
+VIEW = np.array([0.0, 0.0, 1.0])
+
+
+class Material(Protocol):
+    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
+
+    diffuse: Float[np.ndarray, "3"]
+    specular: Float[np.ndarray, "3"]
+    roughness: float
+
+
+class Light(msgspec.Struct, frozen=True):
+    """Radiance averaged over octahedral texels, finest level first: [128, 128, 3], [64, 64, 3], …, [1, 1, 3]."""
+
+    levels: tuple[Float[np.ndarray, "s s 3"], ...]
+
+    @property
+    def mean(self) -> Float[np.ndarray, "3"]:
+        return self.levels[-1][0, 0]
+
+
+def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
+    """The pyramid of a lat-long map (layout of `factorlib.conventions`)."""
+    fine = _subdivided(radiance)
+    height, width = fine.shape[:2]
+    area = np.repeat(lat_long_solid_angles(height, width), width)
+    texel = np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3), SIDE), (SIDE, SIDE))
+    total = np.bincount(texel, area, SIDE * SIDE)
+    sums = [np.bincount(texel, area * channel, SIDE * SIDE) for channel in fine.reshape(-1, 3).T]
+    return Light(_pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32)))
+
+
+def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
+    """The same radiance from everywhere."""
+    return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
+
+
+def radiance_toward(
+    light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Radiance averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
+    finest = 4 * np.pi / SIDE**2
+    level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, len(light.levels) - 1)
+    below = np.minimum(level.astype(int), len(light.levels) - 2)
+    blend = (level - below)[..., None]
+    row, column = _texel(direction, SIDE)
+    offsets = np.cumsum([0] + [len(lv) ** 2 for lv in light.levels])[:-1]
+    flat = np.concatenate([lv.reshape(-1, 3) for lv in light.levels])
+
+    def at(lv: Int[np.ndarray, "*n"]) -> np.ndarray:
+        return flat[offsets[lv] + (row >> lv) * (SIDE >> lv) + (column >> lv)]
+
+    return at(below) * (1 - blend) + at(below + 1) * blend
+
+
+def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
+    """Normals, in the light's frame, of the pixels whose centre is on the ball that fills the picture, and those pixels."""
+    at = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(at, -at)
+    inside = x * x + y * y < 1
+    x, y = x[inside], y[inside]
+    return np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1), inside
+
+
+def diffuse_ball(light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Reflected radiance of a white Lambert surface, E(n)/π."""
+    cosine = np.maximum(normals.astype(np.float32) @ octahedral_directions(WIDE_SIDE).T.astype(np.float32), 0)
+    return _summed(light, cosine / np.float32(np.pi))
+
+
+def glossy_ball(light: Light, normals: Float[np.ndarray, "n 3"], roughness: float) -> Float[np.ndarray, "n 3"]:
+    """Reflected radiance of GGX with k_s = 1, seen from `VIEW`."""
+    alpha = max(float(alpha_of_roughness(roughness)), 1e-3)
+    return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(light, normals, alpha)
+
+
+def _wide_lobe(light: Light, normals: Float[np.ndarray, "n 3"], alpha: float) -> Float[np.ndarray, "n 3"]:
+    directions = octahedral_directions(WIDE_SIDE)
+    half = directions + VIEW
+    half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-9)
+    cos_o = np.maximum(normals @ VIEW, 1e-3).astype(np.float32)[:, None]
+    cos_i, cos_h = (normals.astype(np.float32) @ d.T.astype(np.float32) for d in (directions, half))
+    shadowing = _g1(np.maximum(cos_i, 1e-6), alpha) * _g1(cos_o, alpha)
+    return _summed(light, np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
+
+
+def _narrow_lobe(light: Light, normals: Float[np.ndarray, "n 3"], alpha: float) -> Float[np.ndarray, "n 3"]:
+    cos_o = np.clip(normals @ VIEW, 1e-3, 1.0).astype(np.float32)[:, None]
+    half = _visible_normals(cos_o, alpha)
+    view = np.concatenate([np.sqrt(1 - cos_o**2), np.zeros_like(cos_o), cos_o], axis=-1)[:, None, :]
+    incoming = 2 * np.sum(view * half, axis=-1, keepdims=True) * half - view
+    density = _g1(cos_o, alpha) * _ggx(half[..., 2], alpha) / (4 * cos_o)  # of the incoming direction, per steradian
+    frame = _frames(normals).astype(np.float32)  # rows: tangent toward the viewer, bitangent, normal
+    value = radiance_toward(light, incoming @ frame, 1 / (SAMPLES * density))
+    weight = np.where(incoming[..., 2] > 0, _g1(np.maximum(incoming[..., 2], 1e-6), alpha), 0.0)
+    return np.einsum("nk,nkc->nc", weight, value) / SAMPLES
+
+
+def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:
+    """A perfect mirror: a pixel of a ball `size` pixels across sees 16 / size² steradians wherever it is."""
+    mirrored = 2 * normals[:, 2:] * normals - VIEW
+    return radiance_toward(light, mirrored, np.full(len(normals), 16 / size**2))
+
+
+def ball(light: Light, material: Material, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Reflected radiance of k_d/π + k_s · D G / (4 (n·i)(n·o)) in `light`."""
+    diffuse, specular = np.asarray(material.diffuse, float), np.asarray(material.specular, float)
+    value = diffuse * diffuse_ball(light, normals)
+    return value + specular * glossy_ball(light, normals, material.roughness) if specular.any() else value
+
+
+def _summed(light: Light, response: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n 3"]:
+    """∫ L · response over the texels of the level of `WIDE_SIDE`."""
+    level = next(lv for lv in light.levels if len(lv) == WIDE_SIDE)
+    return response @ level.reshape(-1, 3).astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
+
+
+def _g1(cosine, alpha):
+    return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2))
+
+
+def _ggx(cos_h, alpha):
+    return alpha**2 / (np.pi * (cos_h**2 * (alpha**2 - 1) + 1) ** 2)
+
+
+def _visible_normals(cos_o: Float[np.ndarray, "n 1"], alpha: float) -> Float[np.ndarray, "n k 3"]:
+    """Half vectors distributed as the visible normals (Heitz 2018); the view lies in the local x–z plane."""
+    k = np.arange(SAMPLES)
+    radius, phi = (t.astype(np.float32) for t in (np.sqrt((k + 0.5) / SAMPLES), 2 * np.pi * ((k * GOLDEN) % 1)))
+    stretched = np.stack([alpha * np.sqrt(1 - cos_o**2), cos_o], axis=-1)
+    sin, cos = np.moveaxis(stretched / np.linalg.norm(stretched, axis=-1, keepdims=True), -1, 0)
+    across, along = np.broadcast_arrays(radius * np.cos(phi), cos_o)[0], radius * np.sin(phi)
+    lift = 0.5 * (1 + cos)
+    along = (1 - lift) * np.sqrt(1 - across**2) + lift * along
+    up = np.sqrt(np.maximum(1 - across**2 - along**2, 0))
+    # basis of the stretched view v = (sin, 0, cos): t1 = (0, 1, 0), t2 = v × t1 = (−cos, 0, sin)
+    half = np.stack([alpha * (-cos * along + sin * up), alpha * across, np.maximum(sin * along + cos * up, 1e-9)], axis=-1)
+    return half / np.linalg.norm(half, axis=-1, keepdims=True)
+
+
+def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    tangent = VIEW - normals[:, 2:] * normals
+    facing = np.linalg.norm(tangent, axis=-1, keepdims=True) < 1e-6
+    tangent = np.where(facing, np.array([1.0, 0.0, 0.0]), tangent)
+    tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+    return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
+
+
+def _subdivided(radiance: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "H W 3"]:
+    """Texels repeated until there are at least 1024 columns, so that every octahedral texel receives several."""
+    times = max(1, -(-1024 // radiance.shape[1]), -(-512 // radiance.shape[0]))
+    return np.repeat(np.repeat(np.asarray(radiance, np.float64), times, axis=0), times, axis=1)
+
+
+def _pyramid(finest: Float[np.ndarray, "s s 3"]) -> tuple[np.ndarray, ...]:
+    levels = [finest]
+    while len(levels[-1]) > 1:
+        s = len(levels[-1]) // 2
+        levels.append(levels[-1].reshape(s, 2, s, 2, 3).mean(axis=(1, 3)))
+    return tuple(levels)
+
+
+def _texel(direction: Float[np.ndarray, "*n 3"], side: int) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
+    """Row and column of unit directions on the equal-area octahedral square."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    radius = np.sqrt(np.maximum(1 - np.abs(z), 0))
+    v = radius * np.arctan2(np.abs(y), np.abs(x)) * (2 / np.pi)
+    u = radius - v
+    u, v = np.where(z < 0, 1 - v, u), np.where(z < 0, 1 - u, v)
+    column, row = np.copysign(u, x), np.copysign(v, y)
+    return tuple(np.clip(((t + 1) / 2 * side).astype(int), 0, side - 1) for t in (row, column))
+
+
+def octahedral_directions(side: int) -> Float[np.ndarray, "t 3"]:
+    """Directions of the octahedral texels' centres, row by row: the inverse of `_texel`."""
+    at = (np.arange(side) + 0.5) / side * 2 - 1
+    v, u = (t.reshape(-1) for t in np.meshgrid(at, at, indexing="ij"))
+    inside = 1 - np.abs(u) - np.abs(v)
+    radius = 1 - np.abs(inside)
+    near = np.where(inside >= 0, np.abs(v), 1 - np.abs(u))
+    phi = np.pi / 2 * near / np.maximum(radius, 1e-12)
+    z = np.copysign(1 - radius**2, inside)
+    ring = radius * np.sqrt(np.maximum(2 - radius**2, 0))
+    return np.stack([np.copysign(ring * np.cos(phi), u), np.copysign(ring * np.sin(phi), v), z], axis=-1)

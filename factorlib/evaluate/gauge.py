@@ -1,0 +1,65 @@
+"""What may be scaled before two things are compared.
+
+A factor per colour channel can move between all materials and all lights that are linked by observations, and the
+exposure of a photo is not known: so an error is quoted three times.
+
+none               nothing is scaled
+scalar_per_set     one number scales everything in the set
+channel_per_photo  one number for each channel and each photo (light, relit picture): the most forgiving, where
+                   even a grey ball scores well, so never to be quoted alone
+
+Each factor is the least-squares one: Σ f·e·t / Σ e², every picture weighted by 1 / white², so that a bright photo
+does not drown a dark one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+Samples = Float[np.ndarray, "n 3"]
+GAUGES = ("none", "scalar_per_set", "channel_per_photo")
+
+
+def gauge_factors(
+    estimates: Sequence[Samples], truths: Sequence[Samples], whites: Sequence[float]
+) -> dict[str, Float[np.ndarray, "photos 3"]]:
+    """The factor of each photo and channel on the estimate, for each gauge."""
+    cross = np.array([(e * t).sum(axis=0) / w**2 for e, t, w in zip(estimates, truths, whites)]).reshape(-1, 3)
+    square = np.array([(e * e).sum(axis=0) / w**2 for e, w in zip(estimates, whites)]).reshape(-1, 3)
+    return {
+        "none": np.ones_like(cross),
+        "scalar_per_set": np.full_like(cross, _ratio(cross.sum(), square.sum())),
+        "channel_per_photo": _ratio(cross, square),
+    }
+
+
+def _ratio(cross, square):
+    """cross / square, and 1 where there is nothing to scale."""
+    square = np.asarray(square)
+    return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)
+
+
+def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Number of the component of each material, given the materials seen in each light.
+
+    Materials seen together in a light are linked; components are numbered by their first material's name.
+
+    >>> connected_components({"day": ["red", "white"], "night": ["blue"]})
+    {'blue': 0, 'red': 1, 'white': 1}
+    """
+    leader: dict[str, str] = {}
+
+    def find(name: str) -> str:
+        while leader.setdefault(name, name) != name:
+            name = leader[name]
+        return name
+
+    for together in pairs.values():
+        for name in together:
+            low, high = sorted((find(together[0]), find(name)))
+            leader[high] = low
+    roots = sorted({find(name) for name in leader})
+    return {name: roots.index(find(name)) for name in sorted(leader)}

@@ -1,0 +1,75 @@
+"""Errors of normals and poses against true ones.
+
+Normals  angle between estimated and true normal over the pixels where both are known; null: every normal faces the camera.
+Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the distance of the translations relative to the true
+         distance from the camera.  A random rotation is 126.5° off on average (90° + 114.6° / π): the null.  A shape with
+         a symmetry can be far off in rotation and right in every pixel: normals tell.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.conventions import FRONT
+
+RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
+
+
+class AngleError(msgspec.Struct, frozen=True):
+    """Degrees."""
+
+    median_deg: float
+    p90_deg: float
+
+
+class NormalError(msgspec.Struct, frozen=True):
+    pixels: int
+    estimate: AngleError
+    null: AngleError
+
+
+class PoseError(msgspec.Struct, frozen=True):
+    """rotation in degrees; translation as a fraction of the true distance; null is a random rotation's mean angle."""
+
+    rotation_deg: float
+    translation_relative: float
+    null_rotation_deg: float = RANDOM_ROTATION_DEG
+
+
+def normal_error(estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]):
+    """Errors over the pixels of `mask` where both normals are known (not zero); None where there is none."""
+    known = mask & (np.linalg.norm(estimate, axis=-1) > 0.5) & (np.linalg.norm(truth, axis=-1) > 0.5)
+    if not known.any():
+        return None
+    facing = np.broadcast_to(FRONT, truth[known].shape)
+    return NormalError(int(known.sum()), _summary(estimate[known], truth[known]), _summary(facing, truth[known]))
+
+
+def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Angles between vectors of any length, exact for small ones too.
+
+    >>> angles_deg(np.array([[1.0, 0, 0]]), np.array([[0, 2.0, 0]])).tolist()
+    [90.0]
+    """
+    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (np.asarray(a, float), np.asarray(b, float)))
+    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def rotation_angle_deg(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]) -> float:
+    """Geodesic distance of two rotations, degrees in [0, 180]."""
+    chord = np.linalg.norm(np.asarray(a, float) - np.asarray(b, float))  # 2√2 sin(angle / 2)
+    return float(np.degrees(2 * np.arcsin(min(1.0, chord / (2 * np.sqrt(2))))))
+
+
+def pose_error(estimate, truth) -> PoseError:
+    """Of two cam_from_object, each with `rotation` 3×3 and `translation` 3 (`Pose` of the dataset's schema)."""
+    moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
+    distance = float(np.linalg.norm(truth.translation)) or 1.0
+    return PoseError(rotation_angle_deg(estimate.rotation, truth.rotation), float(moved) / distance)
+
+
+def _summary(a: np.ndarray, b: np.ndarray) -> AngleError:
+    angles = angles_deg(a, b)
+    return AngleError(*(round(float(np.percentile(angles, q)), 6) for q in (50, 90)))

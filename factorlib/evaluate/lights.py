@@ -1,0 +1,164 @@
+"""Errors of recovered light against true light.
+
+Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a matte (Lambert) white sphere, rendered in the estimated and
+               in the true light, as LeGendre et al. 2019 ("DeepLight") and others do.
+Env map        the maps themselves, averaged to texels of equal solid angle about 3° across; all directions, and split
+               into those that an observed pixel mirrors toward the camera (within about 6°) and the rest.
+Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black scores.  rmse_scale_invariant: the same after the best
+               single factor (Grosse et al. 2009).  rgb_angle_deg: mean angle between the RGB vectors, in degrees.
+Null           a constant light of the true map's mean colour, which no method is told: a generous null.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_of_direction
+from factorlib.evaluate.ball import WIDE_SIDE, Light, ball_normals, constant_light, diffuse_ball, glossy_ball, mirror_ball, octahedral_directions
+from factorlib.evaluate.gauge import GAUGES, gauge_factors
+
+GLOSSY_ROUGHNESS = 0.4
+SPHERE_SIZE = 32
+SPHERES = ("mirror", "glossy", "matte")
+MAPS = ("all", "mirrored", "unmirrored")
+COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
+
+Samples = Float[np.ndarray, "n 3"]
+
+
+class LightError(msgspec.Struct, frozen=True):
+    """Fractions of the truth's root mean square, and degrees; 0 is perfect."""
+
+    rmse: float
+    rmse_scale_invariant: float
+    rgb_angle_deg: float
+
+
+class ScoredLight(msgspec.Struct, frozen=True):
+    estimate: LightError
+    null: LightError
+
+
+class LightErrors(msgspec.Struct, frozen=True):
+    """gauge -> view -> errors; the views are mirror, glossy, matte and map_all, map_mirrored, map_unmirrored.
+
+    mean: over lights.  mirrored_fraction: of the sphere, by light; null where no observation is known.
+    """
+
+    lights: dict[str, dict[str, dict[str, ScoredLight]]]
+    mean: dict[str, dict[str, ScoredLight]]
+    mirrored_fraction: dict[str, float | None]
+
+
+def light_error(estimate: Samples, truth: Samples) -> LightError:
+    """Of samples that stand for equal areas.
+
+    >>> light_error(np.full((4, 3), 2.0), np.ones((4, 3)))
+    LightError(rmse=1.0, rmse_scale_invariant=0.0, rgb_angle_deg=0.0)
+    """
+    scale = np.sqrt(np.mean(truth**2)) or 1.0
+    best = float((estimate * truth).sum() / ((estimate**2).sum() or 1.0))
+    rmse = [float(np.sqrt(np.mean((f * estimate - truth) ** 2)) / scale) for f in (1.0, best)]
+    return LightError(*(round(v, 9) for v in rmse), rgb_angle_deg=round(rgb_angle(estimate, truth), 6))
+
+
+def rgb_angle(estimate: Samples, truth: Samples) -> float:
+    """Mean angle between RGB vectors, degrees; samples where either is black are left out, 90 where all are."""
+    lengths = np.linalg.norm(estimate, axis=-1), np.linalg.norm(truth, axis=-1)
+    lit = (lengths[0] > 0) & (lengths[1] > 0)
+    if not lit.any():
+        return 90.0
+    a, b = (v[lit] / n[lit][:, None] for v, n in zip((estimate, truth), lengths))
+    return float(np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))).mean())
+
+
+def compare_lights(
+    estimates: Mapping[str, Light], truths: Mapping[str, Light], mirrored: Mapping[str, Bool[np.ndarray, "h w"]]
+) -> LightErrors | None:
+    """Errors of the lights that have a truth; `mirrored` holds lat-long masks from `mirrored_directions`."""
+    names = [n for n in estimates if n in truths]
+    if not names:
+        return None
+    lights = {n: {gauge: {} for gauge in GAUGES} for n in names}
+    seen = {n: mirrored[n][_at(mirrored[n])] for n in names if n in mirrored}
+    for view, render in _views().items():
+        for name, scored in _scored_view(view, render, estimates, truths, names, seen).items():
+            for gauge, score in scored.items():
+                lights[name][gauge][view] = score
+    mean = {g: _mean([lights[n][g] for n in names]) for g in GAUGES}
+    fraction = {n: float(np.mean(seen[n])) if n in seen else None for n in names}
+    return LightErrors(lights, mean, fraction)
+
+
+def mirrored_directions(
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], frame_from_camera: Float[np.ndarray, "3 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Lat-long mask of the directions that some pixel mirrors into its view, grown by one texel of 5.6°.
+
+    normals, views: camera frame;  frame_from_camera: identity for a light fixed to the camera.
+    """
+    mirror = 2 * np.sum(normals * views, axis=-1, keepdims=True) * normals - views
+    row, column = lat_long_of_direction(mirror @ (YUP_FROM_CAMERA @ frame_from_camera).T)
+    shape = np.array([COVERAGE_ROWS, 2 * COVERAGE_ROWS])
+    hit = np.zeros(shape, bool)
+    hit[tuple(np.minimum((np.stack([row, column]) * shape[:, None]).astype(int), shape[:, None] - 1))] = True
+    wide = np.concatenate([hit[:, -1:], hit, hit[:, :1]], axis=1)  # the map closes around its sides
+    return binary_dilation(wide, np.ones((3, 3)), iterations=COVERAGE_DILATION)[:, 1:-1]
+
+
+def _views() -> dict[str, Callable[[Light], Samples]]:
+    normals, _ = ball_normals(SPHERE_SIZE)
+    return {
+        "mirror": lambda light: mirror_ball(light, normals, SPHERE_SIZE),
+        "glossy": lambda light: glossy_ball(light, normals, GLOSSY_ROUGHNESS),
+        "matte": lambda light: diffuse_ball(light, normals),
+        **{f"map_{part}": _map for part in MAPS},
+    }
+
+
+def _map(light: Light) -> Samples:
+    return next(lv for lv in light.levels if len(lv) == WIDE_SIDE).reshape(-1, 3)
+
+
+def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
+    """Texels of a lat-long mask at the centres of the octahedral texels."""
+    row, column = lat_long_of_direction(octahedral_directions(WIDE_SIDE))
+    return tuple(np.minimum((t * n).astype(int), n - 1) for t, n in zip((row, column), mask.shape))
+
+
+def _scored_view(view, render, estimates, truths, names, seen) -> dict[str, dict[str, ScoredLight]]:
+    kept = {n: _part(view, seen.get(n)) for n in names}
+    names = [n for n in names if kept[n] is not None]
+    true = [render(truths[n])[kept[n]] for n in names]
+    found = [render(estimates[n])[kept[n]] for n in names]
+    constant = [render(constant_light(truths[n].mean))[kept[n]] for n in names]
+    whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
+    factors = [gauge_factors(pictures, true, whites) for pictures in (found, constant)]
+    return {
+        n: {g: ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors))) for g in GAUGES}
+        for i, n in enumerate(names)
+    }
+
+
+def _part(view: str, seen: Bool[np.ndarray, "t"] | None):
+    """The texels of a view: all of a sphere and of the whole map; None where a part of the map is empty or unknown."""
+    if view not in ("map_mirrored", "map_unmirrored"):
+        return slice(None)
+    if seen is None:
+        return None
+    part = seen if view == "map_mirrored" else ~seen
+    return part if part.any() else None
+
+
+def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
+    views = [v for v in _views() if any(v in s for s in scored)]
+    return {v: ScoredLight(*(_mean_error([getattr(s[v], k) for s in scored if v in s]) for k in ("estimate", "null"))) for v in views}
+
+
+def _mean_error(errors: list[LightError]) -> LightError:
+    return LightError(*(round(float(np.mean([getattr(e, f) for e in errors])), 9) for f in LightError.__struct_fields__))

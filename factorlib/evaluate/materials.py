@@ -1,0 +1,124 @@
+"""Errors of recovered materials against true ones.
+
+Roughness     absolute difference.
+Colours       diffuse and specular, relative to the truth, after one factor per channel that all materials of a
+              connected component share, because observations cannot tell it from the light.  The factor is the one
+              that minimises the sum of squared relative errors: f = Σ r / Σ r² over r = estimate / truth, diffuse and
+              specular of the component's materials alike.  A true albedo below 0.01 counts as 0.01.
+Null          a grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+DARKEST = 0.01
+Vec3 = tuple[float, float, float]
+
+
+class Material(msgspec.Struct, frozen=True):
+    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
+
+    diffuse: Vec3
+    specular: Vec3
+    roughness: float
+
+
+GREY = Material(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
+
+
+class MaterialError(msgspec.Struct, frozen=True):
+    """roughness: |estimate − truth|; diffuse, specular: signed relative error of each channel, after the factor."""
+
+    roughness: float
+    diffuse: Vec3
+    specular: Vec3
+
+    @property
+    def worst_colour(self) -> float:
+        """The largest relative error of the six."""
+        return max(abs(e) for e in (*self.diffuse, *self.specular))
+
+
+class ComparedMaterial(msgspec.Struct, frozen=True):
+    component: int
+    truth: Material
+    estimate: Material  # as solved, the factor not applied
+    error: MaterialError
+    null: MaterialError
+
+
+class MaterialErrors(msgspec.Struct, frozen=True):
+    """factor: of each component, per channel, on the estimate.  The means are over materials (and channels)."""
+
+    factor: dict[str, Vec3]
+    materials: dict[str, ComparedMaterial]
+    mean_roughness: float
+    mean_diffuse: float
+    mean_specular: float
+    worst_roughness: float
+    worst_diffuse: float
+    worst_specular: float
+    null_mean_roughness: float
+    null_mean_diffuse: float
+    null_mean_specular: float
+
+
+def compare_materials(
+    estimates: Mapping[str, Material], truths: Mapping[str, Material], component: Mapping[str, int]
+) -> MaterialErrors | None:
+    """Errors of the materials that have a truth; None where none has.
+
+    component: number of the component of each material; a material not in it (never seen) is left out.
+    """
+    names = [n for n in estimates if n in truths and n in component]
+    if not names:
+        return None
+    factor, compared = {}, {}
+    for c in sorted({component[n] for n in names}):
+        group = [n for n in names if component[n] == c]
+        true = [truths[n] for n in group]
+        factor[str(c)] = common_factor([estimates[n] for n in group], true)
+        grey = common_factor([GREY] * len(group), true)
+        for n in group:
+            errors = [_error(m, truths[n], f) for m, f in ((estimates[n], factor[str(c)]), (GREY, grey))]
+            compared[n] = ComparedMaterial(c, truths[n], estimates[n], *errors)
+    return MaterialErrors(factor=factor, materials=compared, **_summary(compared))
+
+
+def common_factor(estimates: list[Material], truths: list[Material]) -> Vec3:
+    """The factor per channel that minimises the sum of squared relative errors.
+
+    >>> m = Material((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3)
+    >>> common_factor([m], [Material((0.4, 0.4, 0.1), (0.2, 0.1, 0.1), 0.3)])
+    (2.0, 1.0, 1.0)
+    """
+    ratio = np.array([_albedos(e) / _floored(t) for e, t in zip(estimates, truths)]).reshape(-1, 3)
+    square = (ratio**2).sum(axis=0)
+    return tuple(float(v) for v in np.where(square > 0, ratio.sum(axis=0) / np.where(square > 0, square, 1), 1.0))
+
+
+def _albedos(material: Material) -> Float[np.ndarray, "2 3"]:
+    return np.array([material.diffuse, material.specular], float)
+
+
+def _floored(material: Material) -> Float[np.ndarray, "2 3"]:
+    return np.maximum(_albedos(material), DARKEST)
+
+
+def _error(estimate: Material, truth: Material, factor: Vec3) -> MaterialError:
+    relative = (_albedos(estimate) * factor - _albedos(truth)) / _floored(truth)
+    diffuse, specular = (tuple(float(v) for v in row) for row in relative)
+    return MaterialError(roughness=abs(estimate.roughness - truth.roughness), diffuse=diffuse, specular=specular)
+
+
+def _summary(compared: Mapping[str, ComparedMaterial]) -> dict[str, float]:
+    found = {}
+    for part in ("roughness", "diffuse", "specular"):
+        errors, null = (np.abs([getattr(getattr(m, kind), part) for m in compared.values()]) for kind in ("error", "null"))
+        found |= {f"mean_{part}": float(errors.mean()), f"worst_{part}": float(errors.max()), f"null_mean_{part}": float(null.mean())}
+    return found

@@ -1,0 +1,122 @@
+"""Errors between two pictures of linear radiance, inside a mask.
+
+PSNR   10 log10(peak² / mean squared error), dB.  In linear radiance, where `peak` is the truth's white, and again
+       after the tone map, where the peak is 1.  A perfect match reads 120 dB, so that every number is finite.
+DSSIM  (1 − SSIM) / 2; SSIM after Wang, Bovik, Sheikh and Simoncelli 2004: Gaussian window of 11 × 11 pixels with
+       σ = 1.5, C1 = 0.01², C2 = 0.03².  The window is renormalised to the mask, so that nothing outside leaks in.
+Tone map   clip(exposure · radiance, 0, 1)^(1/2.2) with exposure = 1 / white: linear, and the same for both pictures.
+White      the 99th percentile, over the mask, of the truth's brightest channel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import correlate1d
+
+Picture = Float[np.ndarray, "h w 3"]
+Mask = Bool[np.ndarray, "h w"]
+
+HIGHEST_PSNR = 120.0
+WHITE_PERCENTILE = 99.0
+WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+WINDOW = WINDOW / WINDOW.sum()
+
+
+class PictureError(msgspec.Struct, frozen=True):
+    """psnr_linear_db and psnr_tonemapped_db in dB, higher is better; dssim in [0, 1], 0 is the same picture."""
+
+    psnr_linear_db: float
+    psnr_tonemapped_db: float
+    dssim: float
+
+
+def white_of(truth: Picture, mask: Mask) -> float:
+    """The radiance that the tone map shows as white; 1 for a picture that is black or empty."""
+    if not mask.any():
+        return 1.0
+    white = float(np.percentile(truth[mask].max(axis=-1), WHITE_PERCENTILE))
+    return white if white > 0 else 1.0
+
+
+def tone_mapped(radiance: Float[np.ndarray, "*s 3"], exposure: float) -> Float[np.ndarray, "*s 3"]:
+    """Display values in [0, 1].
+
+    >>> float(tone_mapped(np.array([0.25, 1.0, 9.0]), 2.0)[0].round(3))
+    0.73
+    """
+    return np.clip(radiance * exposure, 0.0, 1.0) ** (1 / 2.2)
+
+
+def psnr(estimate: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"], peak: float) -> float:
+    """dB over all entries, at most 120.
+
+    >>> psnr(np.full((5, 3), 0.9), np.ones((5, 3)), 1.0)
+    20.0
+    """
+    error = float(np.mean((np.asarray(estimate, float) - truth) ** 2)) / peak**2
+    return round(min(HIGHEST_PSNR, -10 * math.log10(max(error, 1e-300))), 6)
+
+
+def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
+    """SSIM of each pixel of the mask, averaged over channels; 0 outside.  `a` and `b` are display values."""
+    inside = mask[..., None].astype(np.float32)
+    total = np.maximum(_blurred(inside), 1e-12)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return _blurred(values * inside) / total
+
+    a, b = a.astype(np.float32), b.astype(np.float32)
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    covariance = mean(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    similar = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return (similar / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(axis=-1) * mask
+
+
+def picture_errors(estimate: Picture, truth: Picture, regions: dict[str, Mask], white: float) -> dict[str, PictureError]:
+    """The errors of each region; the SSIM window sees the union of the regions.  Empty regions are left out."""
+    regions = {name: region for name, region in regions.items() if region.any()}
+    if not regions:
+        return {}
+    union = np.logical_or.reduce(list(regions.values()))
+    box = _box(union)
+    estimate, truth, union = estimate[box], truth[box], union[box]
+    shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
+    ssim = ssim_map(*shown, union)
+    return {name: _error_in(region[box], estimate, truth, shown, ssim, white) for name, region in regions.items()}
+
+
+def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError | None:
+    """The errors inside one mask; None where it is empty."""
+    return picture_errors(estimate, truth, {"": mask}, white).get("")
+
+
+def mean_error(errors: list[PictureError]) -> PictureError | None:
+    """The mean of each number (of dB, for PSNR); None of none."""
+    if not errors:
+        return None
+    return PictureError(*(round(float(np.mean([getattr(e, f) for e in errors])), 6) for f in PictureError.__struct_fields__))
+
+
+def _error_in(region, estimate, truth, shown, ssim, white) -> PictureError:
+    return PictureError(
+        psnr_linear_db=psnr(estimate[region], truth[region], white),
+        psnr_tonemapped_db=psnr(shown[0][region], shown[1][region], 1.0),
+        dssim=round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9),
+    )
+
+
+def _blurred(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    for axis in (0, 1):
+        values = correlate1d(values, WINDOW, axis=axis, mode="constant")
+    return values
+
+
+def _box(mask: Mask) -> tuple[slice, slice]:
+    rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

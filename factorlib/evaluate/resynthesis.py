@@ -1,0 +1,136 @@
+"""How well the solved materials in the solved light give back the photos; this needs no truth.
+
+A pixel counts where mask and mesh name the same material and the surface faces the camera (`factorlib.urm`), and no
+channel of the photo is clipped.  What is left out is counted: `clipped`, `invalid` (left out by the mask or not
+finite), `uncovered` (in the mask, but without the mesh).  Of the clipped pixels, `clipped_satisfied` is the fraction
+whose re-synthesis is at least what was clipped, up to 2 %.
+
+Null: each material in each photo is one flat colour, its own mean over the counted pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.evaluate.picture import PictureError, mean_error, picture_errors, white_of
+from factorlib.urm.extract import observed_pixels
+
+Picture = Float[np.ndarray, "h w 3"]
+Channels = Mapping[str, Float[np.ndarray, "h w"]]
+
+
+class ScoredPicture(msgspec.Struct, frozen=True):
+    estimate: PictureError
+    null: PictureError
+
+
+class Shot(msgspec.Struct, frozen=True):
+    """One photo beside its re-synthesis: `pixels` are those that count, `label` 1..m, `white` as the tone map's."""
+
+    photo: Picture
+    resynthesis: Picture
+    label: Float[np.ndarray, "h w"]
+    pixels: Bool[np.ndarray, "h w"]
+    white: float
+    counts: dict[str, int]
+    clipped_satisfied: float | None
+
+
+class PhotoErrors(msgspec.Struct, frozen=True):
+    """pixels, clipped, invalid, uncovered: numbers of pixels.  exposure = 1 / white of the photo.
+
+    gauges: gauge -> scores over all counted pixels; null where none counts.  materials: material -> gauge -> scores.
+    """
+
+    exposure: float
+    pixels: int
+    clipped: int
+    invalid: int
+    uncovered: int
+    clipped_satisfied: float | None
+    factor: dict[str, tuple[float, float, float]]
+    gauges: dict[str, ScoredPicture] | None
+    materials: dict[str, dict[str, ScoredPicture]]
+
+
+class Resynthesis(msgspec.Struct, frozen=True):
+    """mean: over photos; worst_*: the lowest PSNR of any photo in the gauge `none`; null where no pixel counts at all."""
+
+    photos: dict[str, PhotoErrors]
+    mean: dict[str, ScoredPicture] | None
+    worst_psnr_linear_db: float | None
+    worst_psnr_tonemapped_db: float | None
+
+
+def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
+    """From the channels of the stages `masks` and `align` and the re-synthesis of the same size."""
+    label, clipped = np.rint(photo["label"]), np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
+    rgb = np.nan_to_num(np.stack([photo[c] for c in "RGB"], axis=-1), posinf=0.0, neginf=0.0)
+    valid, observed = photo["valid"] > 0.5, observed_pixels(photo, geometry)
+    pixels, bounds = observed & ~clipped, observed & clipped
+    left_out = photo["left_out"] > 0.5 if "left_out" in photo else np.zeros(valid.shape, bool)
+    counts = {
+        "pixels": pixels, "clipped": bounds, "uncovered": valid & ~observed, "invalid": left_out | ((label > 0.5) & ~valid)
+    }  # fmt: skip
+    held = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
+    return Shot(
+        rgb, resynthesis, label, pixels, white_of(rgb, pixels), {k: int(v.sum()) for k, v in counts.items()},
+        float(held.mean()) if bounds.any() else None,
+    )  # fmt: skip
+
+
+def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[str], Shot]) -> Resynthesis:
+    """Errors of all photos; `shot` reads one by name, and only one is held at a time but for its counted pixels."""
+    factors = _factors(list(names), shot)
+    photos = {name: _photo_errors(shot(name), materials, factor) for name, factor in factors.items()}
+    scored = [p.gauges for p in photos.values() if p.gauges]
+    if not scored:
+        return Resynthesis(photos, None, None, None)
+    mean = {g: ScoredPicture(*(mean_error([getattr(s[g], k) for s in scored]) for k in ("estimate", "null"))) for g in GAUGES}
+    worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
+    return Resynthesis(photos, mean, *worst)
+
+
+def flat_materials(shot: Shot) -> Picture:
+    """The null: every material of the photo in its mean colour."""
+    flat = np.zeros_like(shot.photo)
+    for label in np.unique(shot.label[shot.pixels]):
+        of_material = shot.pixels & (shot.label == label)
+        flat[of_material] = shot.photo[of_material].mean(axis=0)
+    return flat
+
+
+def _factors(names: list[str], shot: Callable[[str], Shot]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
+    estimates, truths, whites = [], [], []
+    for name in names:
+        s = shot(name)
+        estimates.append(s.resynthesis[s.pixels]), truths.append(s.photo[s.pixels]), whites.append(s.white)
+    factors = gauge_factors(estimates, truths, whites)
+    return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
+
+
+def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
+    regions = {m: shot.pixels & (shot.label == k) for k, m in enumerate(materials, start=1)}
+    null = _scored(flat_materials(shot), shot, regions)
+    found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
+
+    def scores(region: str) -> dict[str, ScoredPicture]:
+        return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
+
+    return PhotoErrors(
+        exposure=1 / shot.white,
+        **shot.counts,
+        clipped_satisfied=shot.clipped_satisfied,
+        factor={g: tuple(float(v) for v in f) for g, f in factor.items()},
+        gauges=scores("") if shot.pixels.any() else None,
+        materials={m: scores(m) for m in materials if regions[m].any()},
+    )
+
+
+def _scored(estimate: Picture, shot: Shot, regions: dict) -> dict[str, PictureError]:
+    return picture_errors(np.nan_to_num(estimate, posinf=0.0, neginf=0.0), shot.photo, {"": shot.pixels, **regions}, shot.white)

@@ -1,0 +1,99 @@
+"""Metrics against bounds, as a table a person can read when a regression test fails.
+
+python -m factorlib.evaluate.table build/synthetic/evaluate/metrics.json
+"""
+
+from __future__ import annotations
+
+import operator
+import sys
+from collections.abc import Iterable
+
+import msgspec
+
+from factorlib.jsonfile import read_json
+
+COMPARISONS = {"≤": operator.le, "≥": operator.ge}
+
+
+class Bound(msgspec.Struct, frozen=True):
+    """A dotted path into metrics.json, "≤" or "≥", the limit, a unit, and a word on what it is."""
+
+    path: str
+    sense: str
+    limit: float
+    unit: str
+    meaning: str
+
+
+class Row(msgspec.Struct, frozen=True):
+    """A bound and what was found: None where the path leads nowhere, which is not ok."""
+
+    bound: Bound
+    value: float | None
+
+    @property
+    def ok(self) -> bool:
+        return self.value is not None and COMPARISONS[self.bound.sense](self.value, self.bound.limit)
+
+
+SYNTHETIC = (
+    Bound("materials.worst_roughness", "≤", 0.05, "", "roughness, worst material"),
+    Bound("materials.worst_diffuse", "≤", 0.10, "", "diffuse, worst material and channel, relative"),
+    Bound("materials.worst_specular", "≤", 0.10, "", "specular, worst material and channel, relative"),
+    Bound("resynthesis.worst_psnr_linear_db", "≥", 35.0, "dB", "re-synthesis, worst photo, no gauge, linear"),
+    Bound("resynthesis.worst_psnr_tonemapped_db", "≥", 35.0, "dB", "re-synthesis, worst photo, no gauge, tone-mapped"),
+    Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 35.0, "dB", "relit balls, one scalar per set"),
+    Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.9, "", "mirror sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.3, "", "glossy sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.1, "", "matte sphere, of the truth's RMS"),
+)
+
+
+def value_at(metrics: object, path: str) -> float | None:
+    """What stands at a dotted path; None where there is nothing.
+
+    >>> value_at({"a": {"b": [1.5]}}, "a.b.0"), value_at({"a": None}, "a.b")
+    (1.5, None)
+    """
+    for key in path.split("."):
+        if isinstance(metrics, dict) and key in metrics:
+            metrics = metrics[key]
+        elif isinstance(metrics, list) and key.isdigit() and int(key) < len(metrics):
+            metrics = metrics[int(key)]
+        else:
+            return None
+    return metrics
+
+
+def rows_of(metrics: object, bounds: Iterable[Bound]) -> list[Row]:
+    return [Row(bound, value_at(metrics, bound.path)) for bound in bounds]
+
+
+def table_text(rows: list[Row]) -> str:
+    """metric, value, bound, ok: one line each, in columns.
+
+    >>> print(table_text([Row(Bound("a", "≤", 0.05, "", "roughness"), 0.0123)]))
+    metric     value   bound   ok   path
+    roughness  0.0123  ≤ 0.05  yes  a
+    """
+    cells = [("metric", "value", "bound", "ok", "path"), *(_cells(row) for row in rows)]
+    widths = [max(len(c[k]) for c in cells) for k in range(4)]
+    return "\n".join("  ".join([c.ljust(w) for c, w in zip(line, widths, strict=False)] + [line[4]]) for line in cells)
+
+
+def _cells(row: Row) -> tuple[str, str, str, str, str]:
+    unit = f" {row.bound.unit}" if row.bound.unit else ""
+    value = "missing" if row.value is None else f"{row.value:.4g}{unit}"
+    return row.bound.meaning, value, f"{row.bound.sense} {row.bound.limit:g}{unit}", "yes" if row.ok else "NO", row.bound.path
+
+
+def main(path: str) -> int:
+    """Print the table of the bounds of data/synthetic; 1 if any is broken."""
+    rows = rows_of(read_json(path), SYNTHETIC)
+    print(table_text(rows))
+    return 0 if all(row.ok for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,132 @@
+"""How good the result is: re-synthesis against the photos, everything else against the truth where there is one.
+
+Writes metrics.json; its keys are documented in `factorlib.evaluate.metrics`.  Only this stage reads the truth.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from factorlib.dataset.schema import LightSlice, Pose, TruthFile
+from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.gauge import connected_components
+from factorlib.evaluate.geometry import NormalError, normal_error, pose_error
+from factorlib.evaluate.lights import compare_lights, mirrored_directions
+from factorlib.evaluate.materials import Material, compare_materials
+from factorlib.evaluate.metrics import Counts, Metrics, reasons_of
+from factorlib.evaluate.relighting import compare_relighting
+from factorlib.evaluate.resynthesis import Resynthesis, Shot, compare_photos, shot_of
+from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.jsonfile import read_json, write_json
+from factorlib.stage import Inputs, Progress
+from factorlib.urm.extract import observed_pixels
+
+log = logging.getLogger("factorlib.evaluate")
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Nothing to choose: a metric that can be tuned is none."""
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
+    progress(0, 3, "re-synthesis")
+    resynthesis = compare_photos(lights, inputs.facts["dataset.materials"], lambda name: _shot(inputs, name))
+    seen = _seen(resynthesis, lights)
+    component = connected_components({light: names for light, names in seen.items() if names})
+    progress(1, 3, "materials, light and relighting")
+    sections = _against_truth(inputs, truth, lights, seen, component) if truth else dict.fromkeys(
+        ("materials", "relighting", "light", "normals", "poses")
+    )  # fmt: skip
+    metrics = Metrics(
+        set=Counts(len(lights), len(inputs.facts["dataset.materials"]), len(seen), len(set(component.values()))),
+        resynthesis=resynthesis,
+        **sections,
+        reasons=reasons_of(sections, truth is not None),
+    )
+    write_json(out / "metrics.json", metrics)
+    progress(3, 3)
+
+
+def _against_truth(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
+    materials = {n: Material(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
+    estimates = _estimated_materials(inputs)
+    true_lights = {n: _light(inputs.file(path)) for n, path in truth.illumination.items()}
+    paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
+    found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
+    return {
+        "materials": compare_materials(estimates, materials, component),
+        "relighting": compare_relighting(estimates, materials, found_lights, true_lights, seen),
+        "light": compare_lights(found_lights, true_lights, _mirrored(inputs, lights)),
+        "normals": _normals(inputs, truth, lights),
+        "poses": _poses(inputs, truth),
+    }
+
+
+def _shot(inputs: Inputs, name: str) -> Shot:
+    photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
+    return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+
+
+def _light(path: Path) -> Light:
+    return light_of_lat_long(read_rgb_exr(path))
+
+
+def _seen(resynthesis: Resynthesis, lights: dict[str, LightSlice]) -> dict[str, list[str]]:
+    """The materials that were seen in each light."""
+    seen: dict[str, list[str]] = {slice.illumination: [] for slice in lights.values()}
+    for name, photo in resynthesis.photos.items():
+        row = seen[lights[name].illumination]
+        row.extend(m for m in photo.materials if m not in row)
+    return seen
+
+
+def _estimated_materials(inputs: Inputs) -> dict[str, Material]:
+    """In the gauge of the exported lights."""
+    entries = read_json(inputs["export"] / "materials.json")["materials"]
+    return {n: Material(tuple(m["diffuse"]), tuple(m["specular"]), m["roughness"]) for n, m in entries.items()}
+
+
+def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals and views [h w 3] of a photo and its observed pixels."""
+    geometry = read_exr(inputs["align"] / f"{name}.exr")
+    normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
+    return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
+
+
+def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.ndarray]:
+    """The directions of each light that an observed pixel mirrors."""
+    found: dict[str, np.ndarray] = {}
+    for name, slice in lights.items():
+        normal, view, pixels = _geometry(inputs, name)
+        frame = np.eye(3) if slice.world_from_camera is None else np.array(slice.world_from_camera)
+        hit = mirrored_directions(normal[pixels], view[pixels], frame)
+        found[slice.illumination] = found.get(slice.illumination, False) | hit
+    return found
+
+
+def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) -> dict[str, NormalError] | None:
+    found = {}
+    for name in lights:
+        if name in truth.normals:
+            channels = read_exr(inputs.file(truth.normals[name]))
+            keys = [f"normal.{a}" for a in "xyz"] if "normal.x" in channels else list("RGB")
+            normal, _, pixels = _geometry(inputs, name)
+            found[name] = normal_error(normal, np.stack([channels[k] for k in keys], axis=-1), pixels)
+    return {name: error for name, error in found.items() if error} or None
+
+
+def _poses(inputs: Inputs, truth: TruthFile) -> dict | None:
+    estimated = read_json(inputs["align"] / "poses.json")
+    found: dict = {}
+    for photo, objects in truth.poses.items():
+        for name, pose in objects.items():
+            entry = estimated.get(photo, {}).get("objects", {}).get(name)
+            if entry is not None:
+                found.setdefault(photo, {})[name] = pose_error(Pose(entry["rotation"], entry["translation"]), pose)
+    return found or None

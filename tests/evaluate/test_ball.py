@@ -1,0 +1,102 @@
+"""The ball renderer against closed forms and against plain quadrature over every texel of the map."""
+
+import numpy as np
+import pytest
+
+from factorlib.conventions import lat_long_directions, lat_long_solid_angles
+from factorlib.evaluate.ball import (
+    VIEW,
+    ball_normals,
+    constant_light,
+    diffuse_ball,
+    glossy_ball,
+    light_of_lat_long,
+    mirror_ball,
+    octahedral_directions,
+    radiance_toward,
+)
+
+NORMALS, INSIDE = ball_normals(16)
+
+
+def lobe_map(sharpness, height=128):
+    axis = np.array([0.3, 0.8, 0.5]) / np.linalg.norm([0.3, 0.8, 0.5])
+    value = np.exp(sharpness * (lat_long_directions(height, 2 * height) @ axis - 1))
+    return value[..., None] * [1.0, 2.0, 3.0] + 0.1
+
+
+def plain_quadrature(radiance, normals, roughness):
+    """Σ over texels of L · D G / (4 n·o) · Ω."""
+    height, width = radiance.shape[:2]
+    incoming = lat_long_directions(height, width).reshape(-1, 3)
+    area = np.repeat(lat_long_solid_angles(height, width), width)
+    alpha2, found = roughness**4, []
+
+    def g1(c):
+        return 2 * c / (c + np.sqrt(alpha2 + (1 - alpha2) * c * c))
+
+    half = (incoming + VIEW) / np.linalg.norm(incoming + VIEW, axis=-1, keepdims=True)
+    for n in normals:
+        ci, co, ch = np.maximum(incoming @ n, 0), n[2], half @ n
+        d = alpha2 / (np.pi * (ch**2 * (alpha2 - 1) + 1) ** 2)
+        found.append((d * g1(ci + 1e-12) * g1(co) / (4 * co) * (ci > 0) * area) @ radiance.reshape(-1, 3))
+    return np.array(found)
+
+
+def test_a_constant_light_is_reflected_whole_by_matte_and_mirror():
+    light = constant_light(np.array([1.0, 2.0, 3.0]))
+    assert diffuse_ball(light, NORMALS) == pytest.approx(np.tile([1.0, 2, 3], (len(NORMALS), 1)), rel=2e-3)
+    assert mirror_ball(light, NORMALS, 16) == pytest.approx(np.tile([1.0, 2, 3], (len(NORMALS), 1)))
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.44, 0.46, 0.7, 1.0])
+def test_a_glossy_ball_loses_energy_but_never_makes_any(roughness):
+    shown = glossy_ball(constant_light(np.ones(3)), NORMALS, roughness)
+    assert shown.max() <= 1.001 and shown[NORMALS[:, 2] > 0.5].min() > 0.25
+
+
+@pytest.mark.parametrize("sharpness", [5, 60])
+@pytest.mark.parametrize("roughness", [0.25, 0.4, 0.5, 0.9])
+def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):
+    radiance = lobe_map(sharpness)
+    some = NORMALS[::9]
+    expected = plain_quadrature(radiance, some, roughness)
+    found = glossy_ball(light_of_lat_long(radiance), some, roughness)
+    assert np.median(np.abs(found / expected - 1)) < 0.01
+    assert np.abs(found - expected).max() < 0.03 * expected.max()
+
+
+def test_the_matte_ball_is_the_plain_quadrature():
+    radiance = lobe_map(20)
+    incoming = lat_long_directions(128, 256).reshape(-1, 3)
+    weight = np.maximum(NORMALS @ incoming.T, 0) * np.repeat(lat_long_solid_angles(128, 256), 256)
+    assert diffuse_ball(light_of_lat_long(radiance), NORMALS) == pytest.approx(weight @ radiance.reshape(-1, 3) / np.pi, rel=5e-3)
+
+
+def test_the_octahedral_square_keeps_energy_and_directions():
+    radiance = lobe_map(500)
+    light = light_of_lat_long(radiance)
+    mean = (radiance.mean(axis=1) * lat_long_solid_angles(128, 256)[:, None]).sum(0) * 256 / (4 * np.pi)
+    assert light.mean == pytest.approx(mean, rel=2e-3)
+    directions = octahedral_directions(128)
+    assert np.linalg.norm(directions, axis=-1) == pytest.approx(np.ones(128 * 128))
+    assert np.allclose(directions.T @ directions / 128**2, np.eye(3) / 3, atol=1e-4)  # spread evenly
+
+
+@pytest.mark.parametrize("texel", [(0, 5), (40, 0), (64, 128), (64, 64), (100, 200), (127, 17)])
+def test_one_bright_texel_comes_back_from_its_direction(texel):
+    radiance = np.zeros((128, 256, 3))
+    radiance[texel] = 1.0
+    light = light_of_lat_long(radiance)
+    direction = lat_long_directions(128, 256)[texel]
+    every = octahedral_directions(128)
+    brightest = every[radiance_toward(light, every, np.full(len(every), 1e-4))[:, 0].argmax()]
+    assert np.degrees(np.arccos(min(1.0, brightest @ direction))) < 2.0
+
+
+def test_the_viewer_sees_light_from_the_right_on_the_right():
+    radiance = np.zeros((16, 32, 3))
+    radiance[6:10, 7:9] = 1.0  # +x: a quarter of the width from the left edge
+    picture = np.zeros(INSIDE.shape)
+    picture[INSIDE] = diffuse_ball(light_of_lat_long(radiance), NORMALS)[:, 0]
+    assert picture[:, 8:].sum() > 20 * picture[:, :8].sum()

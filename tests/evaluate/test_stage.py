@@ -1,0 +1,65 @@
+"""The stage on small real artifacts: with truth, without, and with one photo of one material."""
+
+import json
+import math
+
+import msgspec
+import pytest
+
+from factorlib.evaluate.metrics import NO_TRUTH, Metrics, flattened
+from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
+from factorlib.stage import silent
+from stages import evaluate
+from tests.evaluate.made_artifacts import Made, make_artifacts
+
+LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
+
+
+def metrics_of(folder, **made) -> dict:
+    inputs = make_artifacts(Made(folder / "in", **made))
+    out = folder / "out"
+    out.mkdir()
+    evaluate.main(evaluate.Params(), inputs, out, silent)
+    return json.loads((out / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def linked(tmp_path_factory):
+    return metrics_of(tmp_path_factory.mktemp("linked"), seen=LINKED)
+
+
+def test_the_file_is_of_its_type_and_finite(linked):
+    msgspec.convert(linked, Metrics)
+    numbers = list(flattened(linked))
+    assert len(numbers) > 500 and all(math.isfinite(v) for _, v in numbers)
+
+
+def test_every_part_is_scored_beside_its_null(linked):
+    assert linked["reasons"] == {}
+    assert linked["set"] == {"photos": 3, "materials": 3, "illuminations": 3, "components": 1}
+    mean = linked["resynthesis"]["mean"]["none"]
+    assert mean["estimate"]["psnr_tonemapped_db"] > mean["null"]["psnr_tonemapped_db"] + 10
+    assert linked["light"]["mean"]["scalar_per_set"]["mirror"]["estimate"]["rmse"] < 1e-3  # only scaled, by 1.1
+    assert linked["normals"]["day"]["estimate"]["median_deg"] < 0.1 < linked["normals"]["day"]["null"]["median_deg"]
+    assert linked["poses"]["dusk"]["balls"]["rotation_deg"] == pytest.approx(0)
+
+
+def test_a_larger_error_is_reported_larger(linked, tmp_path):
+    worse = metrics_of(tmp_path, seen=LINKED, error=3.0)
+    assert worse["materials"]["worst_roughness"] > linked["materials"]["worst_roughness"]
+    assert worse["resynthesis"]["worst_psnr_linear_db"] < linked["resynthesis"]["worst_psnr_linear_db"]
+
+
+def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
+    found = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
+    assert found["materials"] is found["light"] is found["relighting"] is None
+    assert set(found["reasons"].values()) == {NO_TRUTH}
+    assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
+
+
+def test_the_table_names_what_fails(linked):
+    rows = rows_of(linked, SYNTHETIC)
+    assert all(row.value is not None for row in rows), table_text(rows)
+    broken = rows_of({"materials": {"worst_roughness": 0.2}}, SYNTHETIC)
+    text = table_text(broken)
+    assert not any(row.ok for row in broken) and "0.2" in text and "missing" in text and "NO" in text
