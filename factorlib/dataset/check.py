@@ -212,7 +212,9 @@ def _check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
     a, b, c = rows
     determinant = sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3))
     if determinant < 0:
-        refuse(key, "not a rotation but a reflection (determinant −1)", "one axis is flipped: the camera frame is x right, y down, z forward")
+        refuse(
+            key, "not a rotation but a reflection (determinant −1)", "one axis is flipped: the camera frame is x right, y down, z forward"
+        )
 
 
 def _check_lights(photos: list[PhotoEntry], refuse: Refusal) -> None:

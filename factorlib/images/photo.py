@@ -124,4 +124,6 @@ def _decoded_floats(values: np.ndarray, encoding: str) -> Float[np.ndarray, "h w
 def _warn_of_profile(spec: oiio.ImageSpec, path: str | Path) -> None:
     profile = spec.get_string_attribute("ICCProfile:profile_description")
     if profile and "srgb" not in profile.lower() and "709" not in profile:
-        log.warning("%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours", path, profile)
+        log.warning(
+            "%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours", path, profile
+        )

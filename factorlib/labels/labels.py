@@ -48,7 +48,9 @@ def read_labels(
         labels = _of_values(read_values(file(masks), key), file(masks), materials, size, key)
     if not labels.label.any():
         where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
-        raise InputError("the mask is empty: no pixel has a material", file=where, key=key, cure="paint at least one material, or drop the photo")
+        raise InputError(
+            "the mask is empty: no pixel has a material", file=where, key=key, cure="paint at least one material, or drop the photo"
+        )
     return labels
 
 
@@ -83,7 +85,9 @@ def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[st
     for value, count in zip(found.tolist(), counts.tolist()):
         if value > len(materials) and value != LEFT_OUT:
             known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
-            raise InputError(f"unknown label {value} ({count} pixels)", file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out")
+            raise InputError(
+                f"unknown label {value} ({count} pixels)", file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out"
+            )
     left_out = values == LEFT_OUT
     return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
 

@@ -1,6 +1,7 @@
 """Masks: every way to give one means the same labels, and what is doubtful is refused by name."""
 
 import json
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -61,16 +62,12 @@ def coco(folder, annotations, images=None, categories=MATERIALS):
 
 def counts_of(inside):
     """Uncompressed RLE by hand: runs down the columns, starting outside."""
-    runs, value = [], False
-    for pixel in np.concatenate([inside.T.ravel(), [None]]):
-        if not runs or (pixel is not None and bool(pixel) != value):
-            runs.append(0)
-            value = bool(pixel) if runs[:-1] else False
-            if len(runs) == 1 and pixel:
-                runs, value = [0, 0], True
-        if pixel is not None:
-            runs[-1] += 1
-    return runs
+    runs = [(value, len(list(run))) for value, run in groupby(inside.T.ravel().tolist())]
+    return [0] * bool(runs[0][0]) + [length for _, length in runs]
+
+
+def compressed(inside):
+    return pycocomask.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()
 
 
 def box(x0, y0, x1, y1):
@@ -79,7 +76,6 @@ def box(x0, y0, x1, y1):
 
 def forms(folder):
     red, wood = LABEL == 1, LABEL == 3
-    rle = lambda inside: pycocomask.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()  # noqa: E731
     as_is = LABEL.copy()
     return {
         "grey": lambda: save(folder / "grey.png", as_is),
@@ -87,7 +83,10 @@ def forms(folder):
         "rgb": lambda: save(folder / "rgb.png", np.dstack([as_is] * 3)),
         "rgba": lambda: save(folder / "rgba.png", np.dstack([as_is] * 3 + [np.full_like(as_is, 255)])),
         "16 bit": lambda: save(folder / "deep.png", as_is.astype(np.uint16)),
-        "one each, 255": lambda: {"wood": save(folder / "w.png", wood.astype(np.uint8) * 255), "red": save(folder / "r.png", red.astype(np.uint8) * 255)},
+        "one each, 255": lambda: {
+            "wood": save(folder / "w.png", wood.astype(np.uint8) * 255),
+            "red": save(folder / "r.png", red.astype(np.uint8) * 255),
+        },
         "one each, 1": lambda: {"red": save(folder / "r.png", red.astype(np.uint8)), "wood": save(folder / "w.png", wood.astype(np.uint8))},
         "one each, 1 bit": lambda: {"red": save(folder / "r.png", red), "wood": save(folder / "w.png", wood)},
         "polygons": lambda: coco(
@@ -101,7 +100,7 @@ def forms(folder):
             folder,
             [
                 {"category_id": 10, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": counts_of(red)}},
-                {"category_id": 12, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": rle(wood)}},
+                {"category_id": 12, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": compressed(wood)}},
             ],
         ),
     }
@@ -146,7 +145,7 @@ def test_a_soft_edge_is_cut_at_half(tmp_path):
 def test_rle_is_decoded_as_pycocotools_does(seed):
     rng = np.random.default_rng(seed)
     inside = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
-    encoded = pycocomask.encode(np.asfortranarray(inside.astype(np.uint8)))["counts"].decode()
+    encoded = compressed(inside)
     np.testing.assert_array_equal(decode_rle(encoded, *inside.shape), inside)
     assert decompress(encoded) == counts_of(inside)
 
