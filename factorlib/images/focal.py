@@ -62,7 +62,7 @@ def _is_cropped(exif: Mapping[str, Any], width: int, height: int) -> bool:
     return not any(_same(shape, frame) for frame in FRAMES)
 
 
-def _proportion(a: float, b: float) -> float:
+def _proportion(a: float | int, b: float | int) -> float:
     return max(a, b) / min(a, b)
 
 

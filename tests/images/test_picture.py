@@ -19,8 +19,8 @@ def test_scaling_the_light_changes_no_picture_that_exposes_itself():
 
 def test_the_percentile_goes_to_white():
     radiance = np.linspace(0, 1, 101)[:, None] * np.array([1.0, 0.5, 0.2])
-    assert exposure_of(radiance, percentile=50) == pytest.approx(2.0)
-    assert (picture(radiance, exposure_of(radiance, percentile=50))[50:, 0] == 255).all()
+    assert exposure_of(radiance, percentile=50.0) == pytest.approx(2.0)
+    assert (picture(radiance, exposure_of(radiance, percentile=50.0))[50:, 0] == 255).all()
 
 
 def test_exposure_looks_only_where_it_is_told():
