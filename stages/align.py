@@ -11,7 +11,9 @@ from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
+from factorlib.align.place import Placed, Thing, placed
 from factorlib.align.raster import Caster, Maps, rasterise
+from factorlib.align.search import Found, Search
 from factorlib.dataset import schema
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_exr
@@ -21,49 +23,103 @@ from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
+CURE = "look at its overlay; give the object's pose, or the photo's camera.focal_px, in dataset.yaml"
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
-    least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # below: a warning, or an error if strict
-    strict: bool = False
+    crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG  # sharper edges of a mesh stay sharp
+    least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # below, the pose is taken to be wrong
+    least_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # of material labels, likewise
+    least_lead: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.005  # of the score before a runner-up that looks different
+    strict: bool = False  # stop at a doubtful pose
+    search: Search = Search()
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name = inputs.photo
-    photo = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
+    slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
-    casters = [caster_of(thing, photo, inputs, params) for thing in photo.objects]
-    camera, poses = given(photo, facts, name)
-    maps = rasterise(casters, camera, poses)
-    write_maps(out / f"{name}.exr", maps, confidence(maps, whole_evidence(channels)))
-    radiance = np.stack([channels[c] for c in "RGB"], axis=-1)
-    write_png(out / f"{name}_overlay.png", overlay(radiance, maps, whole_evidence(channels)))
-    objects = {}
-    for number, (thing, caster, pose) in enumerate(zip(photo.objects, casters, poses), start=1):
+    things = things_of(slice_, channels, inputs, params)
+    result = placed(things, camera_of(slice_.camera, facts), facts["focal_px"], facts["focal_source"], name, params.search)
+    maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
+    whole = whole_evidence(channels)
+    write_maps(out / f"{name}.exr", maps, confidence(maps, whole))
+    write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
+    objects = {thing.name: entry(thing, k, result, maps, params) for k, thing in enumerate(things)}
+    for thing_name, facts_of_it in objects.items():
+        complain(name, thing_name, facts_of_it, params.strict)
+    write_json(out / f"{name}.json", {"camera": camera_entry(result), "objects": objects})
+
+
+def things_of(slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params) -> list[Thing]:
+    things = []
+    for number, thing in enumerate(slice_.objects, start=1):
+        mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
+        file = inputs.file(mesh.file)
+        caster = Caster(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
-        seen = np.where(maps.object == number, maps.label, 0)
-        objects[thing.name] = {
-            "rotation": pose.rotation.tolist(),
-            "translation": pose.translation.tolist(),
-            "silhouette_iou": silhouette_iou(evidence, seen),
-            "label_agreement": label_agreement(evidence, seen),
-        }
-    write_json(out / f"{name}.json", {"camera": {"focal_px": camera.focal, "principal_point": [float(c) for c in camera.centre]}, "objects": objects})
+        pose = Pose(np.array(thing.pose.rotation), np.array(thing.pose.translation)) if thing.pose else None
+        things.append(Thing(thing.name, caster, evidence, pose))
+    return things
 
 
-def given(photo: schema.ObjectsSlice, facts: dict, name: str) -> tuple[Camera, list[Pose]]:
-    if any(thing.pose is None for thing in photo.objects) or not facts["focal_px"]:
-        raise InputError("a pose and a focal length are needed", file="dataset.yaml", key=name, cure="give both")
-    centre = photo.camera.principal_point or (facts["width"] / 2, facts["height"] / 2)
-    camera = Camera(facts["width"], facts["height"], facts["focal_px"], tuple(centre))
-    return camera, [Pose(np.array(t.pose.rotation), np.array(t.pose.translation)) for t in photo.objects]
+def camera_of(given: schema.Camera, facts: dict) -> Camera:
+    """The photo's camera, principal point in the middle unless given; its focal length is settled later."""
+    centre = given.principal_point or (facts["width"] / 2, facts["height"] / 2)
+    return Camera(facts["width"], facts["height"], 1.0, tuple(centre))
 
 
-def caster_of(thing: schema.ObjectEntry, photo: schema.ObjectsSlice, inputs: Inputs, params: Params) -> Caster:
-    mesh = photo.meshes[thing.mesh]
-    materials = inputs.facts["dataset.materials"]
-    return Caster(read_mesh(inputs.file(mesh.file), materials, mesh.parts, mesh.material, thing.materials, params.crease_deg))
+def camera_entry(result: Placed) -> dict:
+    camera = result.camera
+    return {
+        "focal_px": float(camera.focal),
+        "focal_source": result.focal_source,
+        "focal_relative_stderr": result.log_focal_sigma,
+        "principal_point": [float(c) for c in camera.centre],
+    }
+
+
+def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> dict:
+    """What poses.json says of one object; `doubts` is empty for a pose to be believed."""
+    seen = np.where(maps.object == k + 1, maps.label, 0)
+    iou, agreement = silhouette_iou(thing.evidence, seen), label_agreement(thing.evidence, seen)
+    found, pose = result.found[k], result.poses[k]
+    return {
+        "rotation": pose.rotation.tolist(),
+        "translation": pose.translation.tolist(),
+        "silhouette_iou": iou,
+        "label_agreement": agreement,
+        "source": "given" if found is None else "found",
+        "score": found.score if found else None,
+        "runner_up": runner_up_entry(found),
+        "doubts": doubts(iou, agreement, found, params),
+    }
+
+
+def runner_up_entry(found: Found | None) -> dict | None:
+    if found is None or found.runner_up is None:
+        return None
+    other = found.runner_up
+    return {"rotation": other.state.rotation.tolist(), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
+
+
+def doubts(iou: float, agreement: float, found: Found | None, params: Params) -> list[str]:
+    reasons = []
+    if iou < params.least_iou:
+        reasons.append(f"mesh and mask overlap by {iou:.2f} only")
+    if agreement < params.least_agreement:
+        reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
+    other = found.runner_up if found else None
+    if other and found.score - other.score < params.least_lead and other.normal_difference_deg > 5:
+        reasons.append(f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})")
+    return reasons
+
+
+def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:
+    for reason in facts["doubts"]:
+        if strict:
+            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=CURE)
+        log.warning("%s: %s: %s; %s", photo, thing, reason, CURE)
 
 
 def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:

@@ -1,0 +1,177 @@
+"""A first guess of the pose: every view of the mesh, at every roll, laid on the mask at every place.
+
+The number of wrong pixels of a template T (one image per material l) laid on the mask at a shift t is linear in T,
+
+    errors(t) = |mask| + Σ_l Σ_p T_l(p − t) E_l(p),     E_l = +1 on background, −1 on material l, 0 elsewhere,
+
+0 also where nothing is known: left out, hidden, outside the frame.  So one correlation by FFT gives it for all shifts.
+Views are spread evenly over the sphere (Fibonacci), rolls are turns of the photo, and the size follows from the areas;
+where frame or occluder cut the mask the areas do not say it, and several sizes are tried.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.fft import irfft2, rfft2
+
+from factorlib.align.camera import Camera, rotation_of_vector
+from factorlib.align.evidence import Evidence
+from factorlib.align.raster import Caster
+from factorlib.align.state import State
+from factorlib.align.target import extent_of
+
+GRID = 80  # pixels of the templates
+WHOLE, CUT = 36, 26  # mask's extent in them
+SIZES_OF_WHOLE = (0.95, 1.05)  # relative to the size that the areas say
+SIZES_OF_CUT = (0.95, 1.15, 1.4, 1.75, 2.2)
+CUT_SHARE = 0.03  # of the contour on the frame or on broad unknown areas: more, and the mask is taken to be cut
+BROAD = 0.03  # of the mask's extent: narrower unknown bands, as along a contour, hide nothing
+
+
+class Candidate(msgspec.Struct, frozen=True):
+    """A guess and its wrong pixels as a share of the mask's."""
+
+    state: State
+    error: float
+
+
+def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Unit directions spread evenly over the sphere.
+
+    >>> float(np.abs(fibonacci_directions(500).mean(axis=0)).max()) < 1e-2
+    True
+    """
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """A rotation cam_from_object that looks along `direction` of the object's frame."""
+    side = np.eye(3)[np.argmin(np.abs(direction))]
+    x = np.cross(side, direction)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(direction, x), direction])
+
+
+def is_cut(evidence: Evidence) -> bool:
+    """Whether the frame, left-out pixels or other objects hide a real part of the mask's contour."""
+    reach = max(int(BROAD * extent_of(evidence)[2] / 2), 1)
+    pad = 2 * reach + 2  # beyond the frame nothing is known
+    unknown = np.pad(~evidence.known, pad, constant_values=True)
+    unknown = ndimage.distance_transform_edt(~(ndimage.distance_transform_edt(unknown) > reach)) <= reach + 1  # opened
+    inside = np.pad(evidence.inside, pad)
+    border = inside & ~ndimage.binary_erosion(inside)
+    return np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border)
+
+
+def candidates(
+    caster: Caster, evidence: Evidence, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float
+) -> list[Candidate]:
+    """The `keep` best guesses that differ by `apart_deg` in rotation, best first."""
+    labels = caster.mesh.labels
+    low, high, extent = extent_of(evidence)
+    cut = is_cut(evidence)
+    pixel = extent / (CUT if cut else WHOLE)
+    middle = (low + high) / 2
+    angles = np.arange(rolls) * 2 * np.pi / rolls
+    costs, area = _cost_images(evidence, labels, middle, pixel, angles)
+    spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
+    found = []
+    distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
+    for direction in fibonacci_directions(views):
+        turn = looking_along(direction)
+        for template, focal in _templates(caster, labels, turn, distance, area, cut):
+            spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
+            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(rolls, -1)
+            best = errors.argmin(axis=1)
+            error = 1 + errors[np.arange(rolls), best] / area
+            shift = np.stack([best % GRID, best // GRID], axis=1)
+            shift = (shift + GRID // 2) % GRID - GRID // 2
+            found += [(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
+    chosen = _apart(found, keep, apart_deg)
+    return [Candidate(_state(c, caster, camera, middle, pixel, distance), float(c[0])) for c in chosen]
+
+
+def _cost_images(evidence: Evidence, labels, middle, pixel: float, angles) -> tuple[np.ndarray, float]:
+    """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
+    step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
+    sums = [_block_means(np.where(evidence.label == 0, 1.0, np.where(evidence.label == label, -1.0, 0.0)), step) for label in labels]
+    offset = np.arange(GRID) + 0.5 - GRID / 2
+    x, y = np.meshgrid(offset * pixel, offset * pixel)
+    images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
+    for k, angle in enumerate(angles):
+        cos, sin = np.cos(angle), np.sin(angle)
+        column, row = middle[0] + cos * x + sin * y, middle[1] - sin * x + cos * y
+        for n, image in enumerate(sums):
+            images[k, n] = ndimage.map_coordinates(image, [row / step - 0.5, column / step - 0.5], order=1, cval=0.0)
+    area = np.count_nonzero(evidence.inside) / pixel**2
+    return images, area
+
+
+def _block_means(image: np.ndarray, step: int) -> np.ndarray:
+    height, width = (-(-n // step) * step for n in image.shape)
+    padded = np.zeros((height, width))
+    padded[: image.shape[0], : image.shape[1]] = image
+    return padded.reshape(height // step, step, width // step, step).mean(axis=(1, 3))
+
+
+def _templates(caster: Caster, labels, turn: np.ndarray, distance: float, area: float, cut: bool):
+    """Label images of the mesh at each size, [labels, GRID, GRID], and the focal length (grid pixels) that gives it."""
+    pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
+    focal = 0.48 * GRID * distance / caster.radius
+    hits = caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose)
+    image = np.where(hits.face >= 0, caster.mesh.face_label[hits.face], 0)
+    own = np.count_nonzero(image)
+    for size in SIZES_OF_CUT if cut else SIZES_OF_WHOLE:
+        zoom = np.sqrt(area / max(own, 1)) * size
+        if zoom < 4:  # else seen edge-on: nothing like the mask
+            sized = _zoomed(image, zoom)
+            yield np.stack([sized == label for label in labels]).astype(np.float32), focal * zoom
+
+
+def _zoomed(image: np.ndarray, zoom: float) -> np.ndarray:
+    """The image scaled about its middle, nearest pixel, in its own frame."""
+    index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
+    there = (index >= 0) & (index < GRID)
+    index = np.clip(index, 0, GRID - 1)
+    return np.where(there[:, None] & there, image[np.ix_(index, index)], 0)
+
+
+def _apart(found: list, keep: int, apart_deg: float) -> list:
+    """The best of `found`, none within `apart_deg` of a better one."""
+    errors = np.array([f[0] for f in found])
+    order = np.argsort(errors, kind="stable")[: 60 * keep]
+    rotations = np.stack([rotation_of_vector(np.array([0, 0, -found[k][2]])) @ found[k][1] for k in order])
+    chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
+    free = np.ones(len(order), bool)
+    while free.any() and len(chosen) < keep:
+        k = int(np.argmax(free))
+        chosen.append(found[order[k]])
+        free &= np.einsum("nij,ij->n", rotations, rotations[k]) < closest
+        free[k] = False
+    return chosen
+
+
+def _state(found, caster: Caster, camera: Camera, middle, pixel: float, distance: float) -> State:
+    """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
+    _, turn, angle, shift, focal = found
+    cos, sin = np.cos(angle), np.sin(angle)
+    place = middle + pixel * np.array([cos * shift[0] + sin * shift[1], -sin * shift[0] + cos * shift[1]])
+    slope = (place - np.array(camera.centre)) / camera.focal
+    depth = camera.focal * distance / (focal * pixel)
+    rotation = toward(slope) @ rotation_of_vector(np.array([0, 0, -angle])) @ turn
+    return State(rotation, float(slope[0]), float(slope[1]), float(np.log(depth)), float(np.log(camera.focal)))
+
+
+def toward(slope: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes the optical axis to the ray (slope, 1)."""
+    ray = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1 + slope @ slope)
+    axis = np.cross([0.0, 0.0, 1.0], ray)
+    sine = np.linalg.norm(axis)
+    return rotation_of_vector(axis / sine * np.arctan2(sine, ray[2])) if sine > 0 else np.eye(3)

@@ -1,0 +1,98 @@
+"""All objects of one photo: given poses are used, the others searched, one camera for all."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.evidence import Evidence, labelled_iou
+from factorlib.align.raster import Caster, rasterise
+from factorlib.align.refine import FocalPrior
+from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, Found, Search, find, focal_prior
+from factorlib.align.target import target_of
+from factorlib.errors import InputError
+
+log = logging.getLogger("factorlib.align")
+
+
+class Thing(msgspec.Struct, frozen=True):
+    """An object to place: its mesh, what the photo says about it, and its pose if the user gave one."""
+
+    name: str
+    caster: Caster
+    evidence: Evidence
+    pose: Pose | None = None
+
+
+class Placed(msgspec.Struct, frozen=True):
+    """The photo's camera with its focal length, where that is from, its standard error (log), and each object's pose."""
+
+    camera: Camera
+    focal_source: str  # dataset | exif | estimated
+    log_focal_sigma: float
+    poses: list[Pose]
+    found: list[Found | None]  # None where the pose was given
+
+
+def placed(things: Sequence[Thing], camera: Camera, focal: float | None, source: str | None, photo: str, search: Search = Search()) -> Placed:
+    """Poses of all things.  The focal length, where not given, is found with the object that shows most, and kept.
+
+    Raises InputError for an object to search whose mask has no pixel.
+    """
+    prior = focal_prior(focal, source, camera.width, camera.height)
+    camera = msgspec.structs.replace(camera, focal=prior.focal)
+    sigma, found = 0.0, {}
+    if prior.sigma > 0 and any(thing.pose is not None for thing in things):
+        camera, source = _focal_of_given(things, camera), "estimated"
+        prior = FocalPrior(camera.focal, 0.0)
+    for k in sorted(range(len(things)), key=lambda k: (-int(things[k].evidence.inside.sum()), k)):
+        thing = things[k]
+        if thing.pose is not None:
+            continue
+        if not thing.evidence.inside.any():
+            raise InputError(
+                f"no pixel of the mask shows object {thing.name!r}", file="dataset.yaml", key=photo,
+                cure="remove the object from this photo, or check its mask and materials",
+            )  # fmt: skip
+        found[k] = find(thing.caster, thing.evidence, camera, prior, search)
+        if prior.sigma > 0:
+            found[k], source = _judged(thing, camera, prior, found[k], source, photo, search)
+            sigma = found[k].log_focal_sigma
+            camera = found[k].state.camera(camera)
+            prior = FocalPrior(camera.focal, 0.0)
+    poses = [thing.pose or found[k].state.pose(thing.caster) for k, thing in enumerate(things)]
+    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))])
+
+
+def _judged(thing: Thing, camera: Camera, prior: FocalPrior, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
+    """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
+    if source != "exif":
+        return found, "estimated"
+    broad = FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
+    free = find(thing.caster, thing.evidence, camera, broad, search)
+    if free.score < found.score + CLEARLY_BETTER:
+        return found, "exif"
+    log.warning(
+        "%s: the EXIF focal length (%.0f px) does not fit the mask, %.0f px does (%.3f against %.3f): is the photo a crop? "
+        "give camera.focal_px to settle it", photo, prior.focal, np.exp(free.state.log_focal), free.score, found.score,
+    )  # fmt: skip
+    return free, "estimated"
+
+
+def _focal_of_given(things: Sequence[Thing], camera: Camera) -> Camera:
+    """The focal length at which given poses fit their masks best."""
+    fixed = [(t.caster, t.pose, target_of(t.evidence, t.caster.mesh.labels, 200)) for t in things if t.pose and t.evidence.inside.any()]
+
+    def misfit(log_focal: float) -> float:
+        trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
+        return -sum(labelled_iou(target.evidence, rasterise(caster, target.camera(trial), pose).label) for caster, pose, target in fixed)
+
+    grid = np.log(camera.focal) + np.linspace(-1.6, 1.6, 33)
+    best = grid[int(np.argmin([misfit(g) for g in grid]))]
+    fit = minimize_scalar(misfit, bounds=(best - 0.1, best + 0.1), method="bounded", options={"xatol": 1e-4})
+    return msgspec.structs.replace(camera, focal=float(np.exp(fit.x)))

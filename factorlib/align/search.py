@@ -1,0 +1,123 @@
+"""The pose of one object in one photo, from its mask alone: unknown rotation, place, distance and, if need be, focal length.
+
+Coarse to fine: every view and roll at thumbnail size (`coarse`), the best of them refined on contours (`refine`) at
+three resolutions, fewer at each.  Whatever survives beside the winner, turned by more than DISTINCT_DEG, is the
+runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.align.camera import Camera, angle_between
+from factorlib.align.coarse import candidates
+from factorlib.align.evidence import Evidence
+from factorlib.align.raster import Caster, rasterise
+from factorlib.align.refine import FocalPrior, Refined, refined
+from factorlib.align.state import State
+from factorlib.align.target import Target, target_of
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+SAME_DEG = 6.0  # refined poses nearer than this are one
+DISTINCT_DEG = 15.0  # a runner-up is turned by more than this
+UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected costs
+UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
+EXIF_SIGMA = 0.05  # whole millimetres, and focus
+CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
+
+
+class Search(msgspec.Struct, frozen=True):
+    """How hard to look."""
+
+    views: Count = 300  # directions, evenly over the sphere
+    rolls: Count = 24
+    apart_deg: float = 14.0  # between guesses
+    keep: tuple[Count, Count, Count] = (32, 8, 3)  # guesses refined at each resolution
+    resolution: tuple[Count, Count, Count] = (90, 200, 450)  # pixels of the mask's longer side
+    steps: tuple[Count, Count, Count] = (10, 12, 10)
+
+
+class RunnerUp(msgspec.Struct, frozen=True):
+    """The best pose turned by more than DISTINCT_DEG from the one found."""
+
+    state: State
+    score: float
+    normal_difference_deg: float  # median over the pixels both cover; small for a symmetric object
+
+
+class Found(msgspec.Struct, frozen=True):
+    """The pose found, its labelled IoU at the finest resolution, the standard error of log focal, and the runner-up."""
+
+    state: State
+    score: float
+    log_focal_sigma: float
+    runner_up: RunnerUp | None
+
+
+def focal_prior(camera_focal: float | None, source: str | None, width: int, height: int) -> FocalPrior:
+    """What is known of the focal length before looking: given is exact, EXIF nearly so, else a broad guess."""
+    if camera_focal is None:
+        return FocalPrior(UNKNOWN_FOCAL.focal * max(width, height), UNKNOWN_FOCAL.sigma)
+    return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
+
+
+def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
+    """The pose whose labelled silhouette agrees best with the evidence.
+
+    camera: the photo's; its focal length is replaced by the prior's.  The evidence must show some pixels of the object.
+    """
+    camera = msgspec.structs.replace(camera, focal=prior.focal)
+    guesses = candidates(caster, evidence, camera, search.views, search.rolls, search.keep[0], search.apart_deg)
+    states = [guess.state for guess in guesses]
+    ranked: list[Refined] = []
+    for level in range(3):
+        target = target_of(evidence, caster.mesh.labels, search.resolution[level])
+        results = [refined(caster, target, camera, s, prior, search.steps[level]) for s in states[: search.keep[level]]]
+        ranked = _distinct(results, prior)
+        states = [result.state for result in ranked]
+        if level == 1:
+            others = ranked
+    best = ranked[0]
+    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked + others))
+
+
+def value(result: Refined, prior: FocalPrior) -> float:
+    """The score, less a little for an unlikely focal length."""
+    if prior.sigma == 0:
+        return result.score
+    return result.score - UNLIKELY_FOCAL * ((result.state.log_focal - np.log(prior.focal)) / prior.sigma) ** 2
+
+
+def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
+    """Best first, without those that ended where a better one did."""
+    kept: list[Refined] = []
+    for result in sorted(results, key=lambda r: -value(r, prior)):
+        if all(angle_between(result.state.rotation, other.state.rotation) > SAME_DEG for other in kept):
+            kept.append(result)
+    return kept
+
+
+def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:
+    for other in others:
+        if angle_between(other.state.rotation, best.state.rotation) > DISTINCT_DEG:
+            return RunnerUp(other.state, other.score, normal_difference(caster, target, camera, best.state, other.state))
+    return None
+
+
+def normal_difference(caster: Caster, target: Target, camera: Camera, first: State, second: State) -> float:
+    """Median angle in degrees between the normals of two states where both see the mesh; 180 if they share no pixel."""
+    normals: list[Float[np.ndarray, "h w 3"]] = []
+    seen = []
+    for state in (first, second):
+        maps = rasterise(caster, target.camera(state.camera(camera)), state.pose(caster))
+        normals.append(maps.normal)
+        seen.append(maps.label > 0)
+    both = seen[0] & seen[1]
+    if not both.any():
+        return 180.0
+    cosine = np.clip(np.sum(normals[0][both] * normals[1][both], axis=1), -1, 1)
+    return float(np.rad2deg(np.median(np.arccos(cosine))))

@@ -1,0 +1,69 @@
+"""A pose and a focal length as the search moves them: seven numbers that hardly depend on each other in an image."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.align.camera import Camera, Pose, rotation_of_vector
+
+
+class State(msgspec.Struct, frozen=True):
+    """Where the middle of a mesh is and how it is turned.
+
+    rotation          cam_from_object
+    a, b              slopes of the ray to the mesh's centre: x/z, y/z
+    log_depth         of the centre, mesh units
+    log_focal         photo pixels
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    a: float
+    b: float
+    log_depth: float
+    log_focal: float
+
+    def middle(self) -> Float[np.ndarray, "3"]:
+        return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
+
+    def pose(self, mesh) -> Pose:
+        """cam_from_object of a mesh (or caster) with this centre."""
+        return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
+
+    def camera(self, like: Camera) -> Camera:
+        return msgspec.structs.replace(like, focal=float(np.exp(self.log_focal)))
+
+    def moved(self, step: Float[np.ndarray, "7"]) -> "State":
+        """By (turn about camera axes 3, a, b, log depth, log focal); the focal length takes the depth along, so that
+        the size and place in the image stay."""
+        zoom = step[6]
+        return State(
+            rotation_of_vector(step[:3]) @ self.rotation,
+            float((self.a + step[3]) * np.exp(-zoom)),
+            float((self.b + step[4]) * np.exp(-zoom)),
+            float(self.log_depth + step[5] + zoom),
+            float(self.log_focal + zoom),
+        )
+
+    def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
+        """Derivative of the image points (photo pixels) of points at `arms` from the centre (camera axes), by `moved`."""
+        depth, focal = np.exp(self.log_depth), np.exp(self.log_focal)
+        point = arms + self.middle()
+        moves = np.zeros((len(arms), 3, 7))
+        for k in range(3):
+            moves[:, :, k] = np.cross(np.eye(3)[k], arms)
+        moves[:, 0, 3] = moves[:, 1, 4] = depth
+        moves[:, :, 5] = depth * np.array([self.a, self.b, 1.0])
+        moves[:, 2, 6] = depth
+        slope = point[:, :2] / point[:, 2:]
+        result = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (focal / point[:, 2])[:, None, None]
+        result[:, :, 6] += focal * slope
+        return result
+
+
+def state_of(pose: Pose, camera: Camera, mesh) -> State:
+    """The state of a pose."""
+    middle = pose.apply(mesh.centre[None])[0]
+    slope = middle[:2] / middle[2]
+    return State(pose.rotation, float(slope[0]), float(slope[1]), float(np.log(middle[2])), float(np.log(camera.focal)))

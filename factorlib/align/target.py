@@ -1,0 +1,107 @@
+"""The evidence of a photo about one object, at a resolution that a pose can be compared with quickly.
+
+For each material, the signed distance to the border of its region says how far, and which way, a contour of the mesh
+is off.  Unknown pixels are a dead zone: a contour may lie there at no cost, so an occluder or the frame of the photo
+is never taken for the object's own contour.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt
+
+from factorlib.align.camera import Camera
+from factorlib.align.evidence import UNKNOWN, Evidence
+
+MARGIN = 0.35  # of the mask's extent, on each side
+
+
+class Region(msgspec.Struct, frozen=True):
+    """One material in the photo, in pixels of the window.
+
+    distance  [h, w] signed distance to the region's border, negative inside, 0 where unknown
+    slope     [h, w, 2] its gradient (x, y)
+    contour   [n, 2] centres (x, y) of the region's pixels that touch known pixels outside it
+    outward   [n, 2] unit directions out of the region there
+    """
+
+    distance: Float[np.ndarray, "h w"]
+    slope: Float[np.ndarray, "h w 2"]
+    contour: Float[np.ndarray, "n 2"]
+    outward: Float[np.ndarray, "n 2"]
+
+
+class Target(msgspec.Struct, frozen=True):
+    """A window about the mask: its place in the photo, its labels, and a region per material of the mesh."""
+
+    left: float
+    top: float
+    pixel: float  # photo pixels per window pixel
+    evidence: Evidence
+    regions: dict[int, Region]
+
+    def camera(self, photo_camera: Camera) -> Camera:
+        height, width = self.evidence.label.shape
+        return photo_camera.window(self.left, self.top, self.pixel, width, height)
+
+    @property
+    def extent(self) -> float:
+        """Longer side of the mask's bounding box, window pixels."""
+        return extent_of(self.evidence)[2]
+
+
+def extent_of(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, float]:
+    """Lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
+    rows, columns = np.nonzero(evidence.inside)
+    low = np.array([columns.min(), rows.min()], float)
+    high = np.array([columns.max(), rows.max()], float) + 1
+    return low, high, float((high - low).max())
+
+
+def target_of(evidence: Evidence, labels: tuple[int, ...], resolution: int) -> Target:
+    """The evidence about its mask, whose longer side becomes `resolution` pixels (fewer if the photo has fewer)."""
+    low, high, extent = extent_of(evidence)
+    pixel = max(extent / resolution, 1.0)
+    height, width = evidence.label.shape
+    low = np.maximum(np.floor(low - MARGIN * extent), 0)
+    high = np.minimum(np.ceil(high + MARGIN * extent), (width, height))
+    columns, rows = (np.arange(int(np.ceil((high[k] - low[k]) / pixel))) for k in (0, 1))
+    x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
+    y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
+    window = Evidence(evidence.label[np.ix_(y, x)])
+    at_frame = (low[1] == 0, high[1] == height, low[0] == 0, high[0] == width)
+    regions = {label: region_of(window.label, label, at_frame) for label in labels}
+    return Target(float(low[0]), float(low[1]), pixel, window, regions)
+
+
+def region_of(labels: Int[np.ndarray, "h w"], label: int, at_frame: tuple[bool, bool, bool, bool]) -> Region:
+    """The region of one label; beyond the photo's frame (where the window touches it) nothing is known."""
+    (top, bottom, left, right), padded = at_frame, np.pad(labels, 1, mode="edge")
+    for touches, edge in ((top, np.s_[0, :]), (bottom, np.s_[-1, :]), (left, np.s_[:, 0]), (right, np.s_[:, -1])):
+        if touches:
+            padded[edge] = UNKNOWN
+    inside, known = padded == label, padded != UNKNOWN
+    distance = np.where(inside, 0.5 - _distance_to(~inside), _distance_to(inside | ~known) - 0.5)
+    distance[~known] = 0.0
+    slope = np.stack(np.gradient(distance)[::-1], axis=-1)
+    touches_outside = np.zeros(padded.shape, bool)
+    touches_outside[1:-1, 1:-1] = _has_neighbour(known & ~inside)
+    rows, columns = np.nonzero(inside & touches_outside)
+    normal = slope[rows, columns]
+    length = np.linalg.norm(normal, axis=1)
+    good = length > 0.2
+    contour = np.stack([columns - 0.5, rows - 0.5], axis=1)[good]
+    return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour, normal[good] / length[good, None])
+
+
+def _distance_to(where: np.ndarray) -> np.ndarray:
+    if not where.any():
+        return np.full(where.shape, float(sum(where.shape)))
+    return distance_transform_edt(~where)
+
+
+def _has_neighbour(where: np.ndarray) -> np.ndarray:
+    """[h−2, w−2]: whether one of the four neighbours is in `where`."""
+    return where[:-2, 1:-1] | where[2:, 1:-1] | where[1:-1, :-2] | where[1:-1, 2:]
