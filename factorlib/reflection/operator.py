@@ -1,0 +1,108 @@
+"""The interface of every reflection operator, and the choice among them by name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from factorlib.errors import InputError, did_you_mean
+
+Name = Literal["reference", "closed_form", "network"]
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+MODULES = {
+    "reference": ("reference", "Reference"),
+    "closed_form": ("closed_form", "ClosedForm"),
+    "network": ("network", "Network"),
+}
+CHUNK = 1 << 18  # evaluations whose intermediate results are held at once
+
+
+class Response(msgspec.Struct, frozen=True):
+    """Reflection of unit lobes at unit reflectances, and its derivatives; every field [n, p]."""
+
+    diffuse: Tensor
+    diffuse_by_log_sharpness: Tensor
+    diffuse_by_nz: Tensor
+    specular: Tensor
+    specular_by_roughness: Tensor
+    specular_by_log_sharpness: Tensor
+    specular_by_nz: Tensor
+    specular_by_oz: Tensor
+
+
+class Operator:
+    """R(lobe | material) for lobes exp(λ(ω·z − 1)).
+
+    A subclass gives `diffuse` and `specular`, elementwise functions that torch can differentiate; a faster
+    `response` where there is one.
+    """
+
+    def __init__(self, dtype: torch.dtype = torch.float32):
+        self.dtype = dtype
+
+    def diffuse(self, sharpness: Float[Tensor, "p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
+        raise NotImplementedError
+
+    def specular(
+        self, roughness: Tensor, sharpness: Float[Tensor, "p"], no: Float[Tensor, "n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+    ) -> Float[Tensor, "n p"]:
+        """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²."""
+        raise NotImplementedError
+
+    def response(
+        self, roughness: Tensor, sharpness: Float[Tensor, "p"], no: Float[Tensor, "n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+    ) -> Response:
+        """Values and derivatives together; nothing is left on torch's graph."""
+        rows = max(1, CHUNK // max(nz.shape[1], 1))
+        parts = [self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows]) for i in range(0, len(nz), rows)]
+        if len(parts) == 1:
+            return parts[0]
+        return Response(*(torch.cat([getattr(part, field) for part in parts]) for field in Response.__struct_fields__))
+
+    def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
+        with torch.enable_grad():
+            r, log_sharpness = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (roughness, sharpness.log()))
+            nz, oz = (t.detach().clone().requires_grad_() for t in (nz, oz))
+            diffuse = self.diffuse(log_sharpness.exp(), nz)
+            specular = self.specular(r, log_sharpness.exp(), no, nz, oz)
+            by_diffuse = torch.autograd.grad(diffuse.sum(), [log_sharpness, nz])
+            by_specular = torch.autograd.grad(specular.sum(), [r, log_sharpness, nz, oz])
+        return Response(diffuse.detach(), *by_diffuse, specular.detach(), *by_specular)
+
+    def __call__(self, lobes, material, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Radiance toward the viewer, in the units of the lobes' weights; differentiable in everything.
+
+        lobes:     .axis [p, 3] unit, .sharpness [p], .weight [p, 3]
+        material:  .diffuse [3], .specular [3], .roughness []
+        normals, views: unit, any common frame; surfaces that face away reflect nothing
+        """
+        axis, sharpness, weight = (torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight))
+        kd, ks, roughness = (torch.as_tensor(t).to(self.dtype) for t in (material.diffuse, material.specular, material.roughness))
+        normals, views = (torch.as_tensor(t).to(self.dtype) for t in (normals, views))
+        no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
+        radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (self.specular(roughness, sharpness, no, nz, oz) @ weight)
+        return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
+
+
+def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype: str | None = None) -> Operator:
+    """The operator `name`.
+
+    weights: folder with diffuse.safetensors and specular.safetensors, for the networks; None takes the shipped ones
+    dtype:   float32 or float64; None takes the operator's own (float64 for the reference, float32 for the others)
+    """
+    if name not in MODULES:
+        raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, MODULES))
+    if dtype is not None and dtype not in DTYPES:
+        raise InputError(f"no dtype '{dtype}'", cure=did_you_mean(dtype, DTYPES))
+    module, kind = MODULES[name]
+    options = {"dtype": DTYPES[dtype]} if dtype else {}
+    if name == "network" and weights is not None:
+        options["weights"] = weights
+    return getattr(import_module(f"factorlib.reflection.{module}"), kind)(**options)
