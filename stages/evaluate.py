@@ -1,6 +1,7 @@
 """How good the result is: re-synthesis against the photos, everything else against the truth where there is one.
 
-Writes metrics.json; its keys are documented in `factorlib.evaluate.metrics`.  Only this stage reads the truth.
+Writes metrics.json; its keys are documented in `factorlib.evaluate.metrics`.  Only this stage reads the truth: so that
+the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from factorlib.dataset.schema import LightSlice, Pose, TruthFile
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import NormalError, normal_error, pose_error
-from factorlib.evaluate.lights import compare_lights, mirrored_directions
+from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.materials import Material, compare_materials
 from factorlib.evaluate.metrics import Counts, Metrics, reasons_of
 from factorlib.evaluate.relighting import compare_relighting
 from factorlib.evaluate.resynthesis import Resynthesis, Shot, compare_photos, shot_of
-from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
@@ -40,7 +41,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     seen = _seen(resynthesis, lights)
     component = connected_components({light: names for light, names in seen.items() if names})
     progress(1, 3, "materials, light and relighting")
-    sections = _against_truth(inputs, truth, lights, seen, component) if truth else dict.fromkeys(
+    sections = _against_truth(inputs, out, truth, lights, seen, component) if truth else dict.fromkeys(
         ("materials", "relighting", "light", "normals", "poses")
     )  # fmt: skip
     metrics = Metrics(
@@ -53,12 +54,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(3, 3)
 
 
-def _against_truth(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
+def _against_truth(inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
     materials = {n: Material(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
     estimates = _estimated_materials(inputs)
     true_lights = {n: _light(inputs.file(path)) for n, path in truth.illumination.items()}
     paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
     found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
+    _write_lights(inputs, out, truth, found_lights, true_lights)
     return {
         "materials": compare_materials(estimates, materials, component),
         "relighting": compare_relighting(estimates, materials, found_lights, true_lights, seen),
@@ -66,6 +68,15 @@ def _against_truth(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlic
         "normals": _normals(inputs, truth, lights),
         "poses": _poses(inputs, truth),
     }
+
+
+def _write_lights(inputs: Inputs, out: Path, truth: TruthFile, found: dict[str, Light], true: dict[str, Light]) -> None:
+    for name in found:
+        for kind in ("illumination", "spheres"):
+            (out / kind).mkdir(exist_ok=True)
+        write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(truth.illumination[name])), LAT_LONG)
+        for which, light in (("truth", true[name]), ("estimate", found[name])):
+            write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
 
 
 def _shot(inputs: Inputs, name: str) -> Shot:

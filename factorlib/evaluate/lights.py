@@ -111,6 +111,15 @@ def mirrored_directions(
     return binary_dilation(wide, np.ones((3, 3)), iterations=COVERAGE_DILATION)[:, 1:-1]
 
 
+def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
+    """The three spheres side by side, black around them."""
+    _, inside = ball_normals(SPHERE_SIZE)
+    row = np.zeros((len(SPHERES), *inside.shape, 3))
+    for picture, name in zip(row, SPHERES, strict=True):
+        picture[inside] = _views()[name](light)
+    return np.concatenate(list(row), axis=1)
+
+
 def _views() -> dict[str, Callable[[Light], Samples]]:
     normals, _ = ball_normals(SPHERE_SIZE)
     return {

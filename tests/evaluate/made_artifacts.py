@@ -11,14 +11,16 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from PIL import Image
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, ball_normals, light_of_lat_long
 from factorlib.evaluate.materials import Material
-from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
+from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.stage import Inputs
+from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.observations import write_observations
 
 SIZE = 24
 TRUE = {
@@ -109,6 +111,10 @@ def _photo(made: Made, folders: dict, photo: str, seen: list[str], materials: li
     label = _row_of_balls(seen, lambda m, n: np.full((len(n), 1), materials.index(m) + 1))[..., 0]
     normal = _row_of_balls(seen, lambda m, n: n @ YUP_FROM_CAMERA)
     _masks_and_align(folders, photo, np.minimum(rgb, made.clip), rgb >= made.clip, label, normal)
+    observations = observations_of_photo(
+        *(read_exr(folders[s] / f"{photo}.exr") for s in ("masks", "align")), name=photo, illumination=photo, materials=materials
+    )
+    write_observations(folders["urm"] / f"{photo}.parquet", observations)
     counts = {m: int((label == materials.index(m) + 1).sum()) for m in seen}
     write_json(folders["masks"] / f"{photo}.json", {
         "width": label.shape[1], "height": SIZE, "focal_px": None, "focal_source": None, "encoding": "srgb",
@@ -129,7 +135,7 @@ def _masks_and_align(folders, photo, rgb, clipped, label, normal) -> None:
         **{f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")}, "view.x": 0 * inside, "view.y": 0 * inside,
         "view.z": -inside, "depth": 4 * inside, "label": label, "object": inside, "confidence": inside,
     })  # fmt: skip
-    Image.fromarray((np.stack([label / max(label.max(), 1)] * 3, -1) * 255).astype("u1")).save(folders["align"] / f"{photo}_overlay.png")
+    write_png(folders["align"] / f"{photo}_overlay.png", (np.stack([label / max(label.max(), 1)] * 3, -1) * 255).astype("u1"))
 
 
 def _export_and_render(made: Made, folders, photo, seen, light, light_values, found) -> None:
@@ -157,12 +163,12 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     entries = {m: msgspec.to_builtins(perturbed(TRUE[m], made.error)) for m in materials}
     for entry in entries.values():
         entry |= {"alpha": entry["roughness"] ** 2, "stderr": {"diffuse": [0.01] * 3, "specular": [0.005] * 3, "roughness": 0.01}}
-    result = {"materials": entries, "gauge": {"rule": "the lights are white on the whole"}, "model": {"operator": "network"}}
+    result = {"materials": entries, "gauge": {"rule": "the lights are white on the whole"}, "model": {"solver": "bundle", "lobes": dict.fromkeys(made.seen, 24)}}
     for stage in ("solve", "export"):
         write_json(folders[stage] / "materials.json", result)
         write_json(folders[stage] / "exposures.json", {p: [1.0, 1.0, 1.0] for p in made.seen})
     write_json(folders["solve"] / "uncertainty.json", {})
     steps = np.arange(30)
-    history = {"iteration": steps, "round": steps // 10, "loss": np.exp(-steps / 5.0) + 0.01, "lobes": 4 * (1 + steps // 10)}
+    history = {"iteration": steps, "round": steps // 10, "loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02, "lobes": 4 * (1 + steps // 10)}
     pq.write_table(pa.table({**history, "phase": ["joint"] * 30}), folders["solve"] / "convergence.parquet")
-    write_json(folders["train"] / "accuracy.json", {"specular": {"median": 0.01, "p95": 0.04}})
+    write_json(folders["train"] / "accuracy.json", {"diffuse": {"median": 0.001, "p95": 0.004}, "specular": {"median": 0.01, "p95": 0.04}})

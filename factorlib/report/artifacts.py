@@ -1,0 +1,101 @@
+"""What the other stages wrote, read when it is asked for, one photo at a time; a file that is not there reads as None."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+from jaxtyping import Float
+
+from factorlib.dataset.schema import SetSlice
+from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.picture import read_png
+from factorlib.jsonfile import read_json
+from factorlib.urm.observations import Observations, read_observations
+
+Channels = dict[str, Float[np.ndarray, "h w"]]
+Picture = Float[np.ndarray, "h w 3"]
+
+
+class Artifacts(msgspec.Struct, frozen=True):
+    """The folders of the stages by name, the set, and the run log."""
+
+    folders: Mapping[str, Path]
+    set: SetSlice
+    log: Path | None = None
+
+    def json(self, stage: str, name: str) -> Any:
+        path = self.folders[stage] / name
+        return read_json(path) if path.exists() else None
+
+    def photo_facts(self) -> dict[str, dict]:
+        return self.json("masks", "photos.json") or {}
+
+    def illumination_of(self, photo: str) -> str:
+        return self.photo_facts().get(photo, {}).get("illumination", photo)
+
+    def illuminations(self) -> dict[str, list[str]]:
+        """Photos of each illumination, in the order of the set."""
+        found: dict[str, list[str]] = {}
+        for photo in self.set.photos:
+            found.setdefault(self.illumination_of(photo), []).append(photo)
+        return found
+
+    def masks(self, photo: str) -> Channels:
+        return read_exr(self.folders["masks"] / f"{photo}.exr")
+
+    def geometry(self, photo: str) -> Channels:
+        return read_exr(self.folders["align"] / f"{photo}.exr")
+
+    def overlay(self, photo: str) -> np.ndarray | None:
+        path = self.folders["align"] / f"{photo}_overlay.png"
+        return read_png(path) if path.exists() else None
+
+    def observations(self, photo: str) -> Observations | None:
+        path = self.folders["urm"] / f"{photo}.parquet"
+        return read_observations(path) if path.exists() else None
+
+    def resynthesis(self, photo: str) -> Picture | None:
+        return self._rgb(self.folders["render"] / "resynthesis" / f"{photo}.exr")
+
+    def ball(self, photo: str, material: str) -> Picture | None:
+        return self._rgb(self.folders["render"] / "materials" / photo / f"{material}.exr")
+
+    def reflectance_map(self, photo: str, material: str) -> Channels | None:
+        path = self.folders["render"] / "reflectance_maps" / photo / f"{material}.exr"
+        return read_exr(path) if path.exists() else None
+
+    def illumination(self, name: str) -> Picture | None:
+        return self._rgb(self.folders["export"] / "illumination" / f"{name}.exr")
+
+    def true_illumination(self, name: str) -> Picture | None:
+        return self._rgb(self.folders["evaluate"] / "illumination" / f"{name}.exr")
+
+    def spheres(self, name: str, which: str) -> Picture | None:
+        """Mirror, glossy and matte sphere side by side; `which` is estimate or truth."""
+        return self._rgb(self.folders["evaluate"] / "spheres" / f"{name}_{which}.exr")
+
+    def convergence(self) -> dict[str, list]:
+        return self._table(self.folders["solve"] / "convergence.parquet")
+
+    def training(self) -> dict[str, list]:
+        return self._table(self.folders["train"] / "training.parquet")
+
+    def events(self) -> list[dict]:
+        """The run log, line by line."""
+        if self.log is None or not self.log.exists():
+            return []
+        return [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines() if line.strip()]
+
+    @staticmethod
+    def _rgb(path: Path) -> Picture | None:
+        return read_rgb_exr(path) if path.exists() else None
+
+    @staticmethod
+    def _table(path: Path) -> dict[str, list]:
+        return pq.read_table(path).to_pydict() if path.exists() else {}

@@ -1,0 +1,110 @@
+"""The few numbers at the top, each with what it means, and the cautions that follow from the artifacts."""
+
+from __future__ import annotations
+
+import msgspec
+
+from factorlib.report.artifacts import Artifacts
+from factorlib.report.text import number, percent
+
+LOW_IOU = 0.85
+MANY_CLIPPED = 0.1
+MANY_UNCOVERED = 0.15
+FEW_PIXELS = 200
+
+
+class Headline(msgspec.Struct, frozen=True):
+    label: str
+    value: str
+    unit: str
+    beside: str
+    meaning: str
+
+
+def headlines(metrics: dict) -> list[Headline]:
+    """Re-synthesis always; materials and relighting where there is a truth."""
+    return [*_resynthesis(metrics["resynthesis"]), *_materials(metrics.get("materials")), *_relighting(metrics.get("relighting"))]
+
+
+def _resynthesis(found: dict) -> list[Headline]:
+    if not found["mean"]:
+        return []
+    mean = found["mean"]["none"]
+    flat = f"flat colours score {number(mean['null']['psnr_tonemapped_db'], 1)} dB"
+    meaning = "How close the recovered materials in the recovered light come to the photos, mean over photos, nothing rescaled. Higher is better."
+    similar = f"flat colours score {number(mean['null']['dssim'], 4)}"
+    return [
+        Headline("Re-synthesis, PSNR", number(mean["estimate"]["psnr_tonemapped_db"], 1), "dB", flat, meaning),
+        Headline("Re-synthesis, DSSIM", number(mean["estimate"]["dssim"], 4), "", similar, "Structural difference, 0 to 1. Lower is better."),
+    ]
+
+
+def _materials(found: dict | None) -> list[Headline]:
+    if not found:
+        return []
+    beside = f"worst {number(found['worst_roughness'], 3)}; grey ball {number(found['null_mean_roughness'], 3)}"
+    colours = f"specular {percent(found['mean_specular'])}; grey ball {percent(found['null_mean_diffuse'])}"
+    return [
+        Headline("Roughness error", number(found["mean_roughness"], 3), "", beside, "Mean absolute difference from the true roughness, which lies in 0 to 1."),
+        Headline("Diffuse colour error", percent(found["mean_diffuse"]), "", colours, "Mean relative error, after the one factor per channel that no photo can settle."),
+    ]  # fmt: skip
+
+
+def _relighting(found: dict | None) -> list[Headline]:
+    if not found:
+        return []
+    kinds = found["mean"]["scalar_per_set"]
+    beside = f"grey ball {number(kinds['null_grey']['psnr_tonemapped_db'], 1)} dB, mean colour {number(kinds['null_mean_colour']['psnr_tonemapped_db'], 1)} dB"
+    meaning = "Balls of the recovered materials in the true lights against true balls, one factor for the whole set."
+    return [Headline("Relighting, PSNR", number(kinds["in_true_light"]["psnr_tonemapped_db"], 1), "dB", beside, meaning)]
+
+
+def cautions(run: Artifacts, metrics: dict) -> list[str]:
+    """Sentences about what should be distrusted."""
+    return [*_of_photos(run, metrics), *_of_poses(run), *_of_set(run, metrics)]
+
+
+def _of_photos(run: Artifacts, metrics: dict) -> list[str]:
+    found = []
+    for name in run.set.photos:
+        errors = metrics["resynthesis"]["photos"].get(name)
+        if not errors:
+            continue
+        total = max(1, errors["pixels"] + errors["clipped"] + errors["uncovered"])
+        if errors["gauges"] is None:
+            found.append(f"{name}: mask and mesh agree nowhere, so this photo tells nothing. See its overlay.")
+            continue
+        if errors["clipped"] / total > MANY_CLIPPED:
+            found.append(f"{name}: {percent(errors['clipped'] / total)} of its pixels are clipped; highlights there are only bounds.")
+        if errors["uncovered"] / total > MANY_UNCOVERED:
+            found.append(f"{name}: {percent(errors['uncovered'] / total)} of the masked pixels are not explained by the mesh.")
+        if errors["gauges"]["none"]["estimate"]["psnr_tonemapped_db"] < errors["gauges"]["none"]["null"]["psnr_tonemapped_db"]:
+            found.append(f"{name}: flat colours would fit this photo better than its re-synthesis does.")
+    return found
+
+
+def _of_poses(run: Artifacts) -> list[str]:
+    poses = run.json("align", "poses.json") or {}
+    return [
+        f"{photo}: the mesh of '{name}' and its mask overlap by only {percent(entry['silhouette_iou'])} (intersection over union)."
+        for photo in run.set.photos
+        for name, entry in poses.get(photo, {}).get("objects", {}).items()
+        if entry.get("silhouette_iou") is not None and entry["silhouette_iou"] < LOW_IOU
+    ]
+
+
+def _of_set(run: Artifacts, metrics: dict) -> list[str]:
+    found = []
+    if metrics["set"]["components"] > 1:
+        found.append(
+            f"The photos fall into {metrics['set']['components']} groups that share no material: between groups, colours and "
+            "brightness cannot be compared. A photo that shows a material of each group would link them."
+        )
+    if len(run.illuminations()) == 1:
+        found.append("There is one light only: what belongs to the light and what to the material is told apart by shape alone.")
+    facts = run.photo_facts()
+    for material in run.set.materials:
+        pixels = sum(f.get("pixels", {}).get(material, 0) for f in facts.values())
+        if pixels < FEW_PIXELS:
+            found.append(f"Material '{material}' is seen in {pixels} pixels only; its values are hardly more than a guess.")
+    return found

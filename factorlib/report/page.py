@@ -1,0 +1,94 @@
+"""Everything on the page, gathered and set into the template."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from itertools import groupby
+from typing import Any
+
+import jinja2
+
+from factorlib.report import text
+from factorlib.report.appearance import balls, exposures, light_row, reflectance_maps
+from factorlib.report.artifacts import Artifacts
+from factorlib.report.cost import cost_of
+from factorlib.report.errors import error_tables
+from factorlib.report.headlines import cautions, headlines
+from factorlib.report.materials import material_rows
+from factorlib.report.photos import AMPLIFICATION, PhotoRow, colour_of
+from factorlib.report.plot import Series, line_plot
+from factorlib.report.poses import pose_rows
+from factorlib.report.training import training_of
+
+STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
+CONTENTS = {
+    "summary": "Summary", "photos": "Photos", "materials": "Materials", "appearance": "Materials × lights", "reflectance": "Reflectance maps",
+    "lights": "Environment maps", "errors": "Errors", "solve": "Solve", "poses": "Poses", "training": "Networks", "cost": "Cost",
+}  # fmt: skip
+
+
+def page(run: Artifacts, rows: list[PhotoRow]) -> str:
+    """The page as HTML, from the artifacts and the photos' rows."""
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    environment.filters |= {name: getattr(text, name) for name in ("number", "significant", "percent", "duration")}
+    folder = files("factorlib.report") / "templates"
+    environment.loader = jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
+    environment.globals["grouped"] = _grouped
+    return environment.get_template("index.html").render(_context(run, rows))
+
+
+def _grouped(head: list[str]) -> list[tuple[str, int]]:
+    """The second line of a table's head, "what|group": groups and their widths, in order."""
+    groups = [title.partition("|")[2] for title in head]
+    return [(name, len(list(run))) for name, run in groupby(groups)]
+
+
+def _context(run: Artifacts, rows: list[PhotoRow]) -> dict[str, Any]:
+    metrics = run.json("evaluate", "metrics.json")
+    exposure, seen = exposures(run), {p: [m for m, n in f["pixels"].items() if n > 0] for p, f in run.photo_facts().items()}
+    cells = balls(run, seen, exposure)
+    errors_of_light = (metrics["light"] or {}).get("lights", {})
+    solved = run.json("solve", "materials.json") or {}
+    return {
+        "contents": list(CONTENTS.items()),
+        "set": run.set,
+        "metrics": metrics,
+        "headlines": headlines(metrics),
+        "cautions": cautions(run, metrics),
+        "rows": rows,
+        "amplification": AMPLIFICATION,
+        "tags": {m: colour_of(k) for k, m in enumerate(run.set.materials)},
+        "materials": material_rows(run, cells),
+        "cells": cells,
+        "maps": [(p, reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
+        "lights": [r for n, p in run.illuminations().items() if (r := light_row(run, n, p, errors_of_light.get(n)))],
+        "errors": error_tables(metrics, run.set.photos, run.set.materials),
+        "gauge": solved.get("gauge", {}),
+        "model": solved.get("model", {}),
+        "exposures": _shared_exposures(run),
+        "plots": _plots(run.convergence()),
+        "poses": pose_rows(run),
+        "training": training_of(run),
+        "cost": cost_of(run.events(), STAGES),
+    }
+
+
+def _shared_exposures(run: Artifacts) -> dict[str, list[float]]:
+    """Factors of photos on the light they share; those that are 1 say nothing."""
+    found = run.json("solve", "exposures.json") or {}
+    return {photo: factor for photo, factor in found.items() if any(abs(f - 1) > 1e-9 for f in factor)}
+
+
+def _plots(history: dict[str, list]) -> list[tuple[str, list[str]]]:
+    """(SVG, names of its lines) of the solve's history."""
+    if not history:
+        return []
+    steps = list(range(len(history["loss"])))
+    rounds = [k for k in steps[1:] if history["round"][k] != history["round"][k - 1]]
+    losses = [Series("loss", steps, history["loss"])]
+    if "held_out" in history:
+        losses.append(Series("held out", steps, history["held_out"]))
+    return [
+        (line_plot(losses, "accepted step", "loss", log_y=True, steps=rounds), [s.name for s in losses]),
+        (line_plot([Series("lobes", steps, history["lobes"])], "accepted step", "light lobes, all lights", steps=rounds), ["lobes"]),
+    ]

@@ -1,0 +1,109 @@
+"""The rows of the page that set each photo beside its re-synthesis."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from factorlib.images.picture import picture
+from factorlib.images.transfer import srgb_encode
+from factorlib.report.artifacts import Artifacts, Channels
+from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
+from factorlib.urm.extract import observed_pixels
+
+AMPLIFICATION = 4
+PALETTE = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#44bb99", "#bbcc33", "#999933")
+UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
+DISAGREES = np.array([0.93, 0.2, 0.55])
+
+
+class Panel(msgspec.Struct, frozen=True):
+    title: str
+    uri: str
+    pixels: UInt8[np.ndarray, "h w c"]
+
+
+class PhotoRow(msgspec.Struct, frozen=True):
+    """One photo: four panels of the same crop, its facts and its errors (as in metrics.json, or None)."""
+
+    name: str
+    illumination: str
+    panels: list[Panel]
+    facts: dict
+    errors: dict | None
+
+
+def colour_of(index: int) -> str:
+    """The colour that stands for the index-th material in masks."""
+    return PALETTE[index % len(PALETTE)]
+
+
+def longest_side(photos: int) -> int:
+    """Pixels of a panel's longer side: smaller where there are many photos, so that the page stays light."""
+    return 440 if photos <= 12 else 300
+
+
+def photo_row(run: Artifacts, name: str, errors: dict | None) -> PhotoRow:
+    masks, geometry, resynthesis = run.masks(name), run.geometry(name), run.resynthesis(name)
+    shown = np.rint(masks["label"]) > 0
+    box, longest = box_of(shown), longest_side(len(run.set.photos))
+    cut = [{k: v[box] for k, v in channels.items()} for channels in (masks, geometry)]
+    exposure = errors["exposure"] if errors else 1.0
+    photo = np.nan_to_num(np.stack([cut[0][c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
+    panels = [_panel("photo", _display(photo, exposure), longest), _panel("materials", _labels(*cut, photo, exposure), longest)]
+    if resynthesis is not None:
+        found = np.nan_to_num(resynthesis[box], posinf=0, neginf=0)
+        panels.append(_panel("re-synthesis", _cut_out(_display(found, exposure), cut[0]), longest))
+        panels.append(_panel("difference", _difference(photo, found, exposure, *cut), longest))
+    return PhotoRow(name, run.illumination_of(name), panels, run.photo_facts().get(name, {}), errors)
+
+
+def _display(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> Float[np.ndarray, "h w 3"]:
+    return picture(radiance, exposure).astype(np.float32) / 255
+
+
+def _panel(title: str, display: Float[np.ndarray, "h w c"], longest: int) -> Panel:
+    pixels = np.rint(255 * np.clip(reduced(display, longest), 0, 1)).astype(np.uint8)
+    return Panel(title, data_uri(pixels), pixels)
+
+
+def _cut_out(display: Float[np.ndarray, "h w 3"], masks: Channels) -> Float[np.ndarray, "h w 4"]:
+    """Transparent outside the mask."""
+    return np.concatenate([display, (masks["label"] > 0.5)[..., None]], axis=-1)
+
+
+def _labels(masks: Channels, geometry: Channels, photo: np.ndarray, exposure: float) -> Float[np.ndarray, "h w 3"]:
+    """Materials tinted on a grey photo; where mesh and mask name different materials, pink."""
+    grey = srgb_encode(np.clip(photo.mean(axis=-1) * exposure, 0, 1))[..., None] * np.ones(3)
+    label = np.rint(masks["label"]).astype(int)
+    colours = np.array([[0.0, 0, 0], *([int(colour_of(k)[i : i + 2], 16) / 255 for i in (1, 3, 5)] for k in range(label.max()))])
+    shown = np.where((label > 0)[..., None], 0.45 * grey + 0.55 * colours[label], 0.3 + 0.5 * grey)
+    shown[(np.rint(geometry["label"]) != label) & (masks.get("left_out", 0 * label) < 0.5)] = DISAGREES
+    return shown
+
+
+def _difference(photo, found, exposure: float, masks: Channels, geometry: Channels) -> Float[np.ndarray, "h w 4"]:
+    """Grey where equal, brighter where the re-synthesis is too bright, in display values; uncounted pixels violet."""
+    shown = 0.5 + AMPLIFICATION * (_display(found, exposure) - _display(photo, exposure))
+    clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
+    shown[~observed_pixels(masks, geometry) | clipped] = UNCOUNTED
+    return _cut_out(np.clip(shown, 0, 1), masks)
+
+
+def ringed(display: Float[np.ndarray, "h w 3"], mask: np.ndarray) -> Float[np.ndarray, "h w 3"]:
+    """The outline of a mask drawn into a picture, white on dark and black on bright."""
+    line = outline(mask)
+    found = display.copy()
+    found[line] = np.where(display[line].mean(axis=-1, keepdims=True) > 0.5, 0.0, 1.0)
+    return found
+
+
+def strip(row: PhotoRow) -> bytes:
+    """A row's panels side by side on white, as a PNG."""
+    return png_bytes(np.concatenate([_on_white(panel.pixels) for panel in row.panels], axis=1))
+
+
+def _on_white(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    alpha = pixels[..., 3:].astype(np.float32) / 255 if pixels.shape[2] == 4 else 1.0
+    return np.rint(pixels[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
