@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.camera import Camera, angle_between
-from factorlib.align.coarse import candidates
+from factorlib.align.coarse import candidates, is_cut
 from factorlib.align.evidence import Evidence
 from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior, Refined, refined
@@ -37,8 +37,10 @@ class Search(msgspec.Struct, frozen=True):
     rolls: Count = 24
     apart_deg: float = 14.0  # between guesses
     keep: tuple[Count, Count, Count] = (32, 8, 3)  # guesses refined at each resolution
-    resolution: tuple[Count, Count, Count] = (90, 200, 450)  # pixels of the mask's longer side
-    steps: tuple[Count, Count, Count] = (10, 12, 10)
+    resolution: tuple[Count, Count, Count] = (90, 200, 400)  # pixels of the mask's longer side
+    margin: tuple[float, float, float] = (0.35, 0.2, 0.1)  # of that side, seen around the mask
+    steps: tuple[Count, Count, Count] = (12, 12, 10)
+    cut_effort: Count = 2  # times the views and guesses where frame or occluder cut the mask: it says less
 
 
 class RunnerUp(msgspec.Struct, frozen=True):
@@ -71,12 +73,13 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
     camera: the photo's; its focal length is replaced by the prior's.  The evidence must show some pixels of the object.
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
-    guesses = candidates(caster, evidence, camera, search.views, search.rolls, search.keep[0], search.apart_deg)
+    effort = search.cut_effort if is_cut(evidence) else 1
+    guesses = candidates(caster, evidence, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
     states = [guess.state for guess in guesses]
     ranked: list[Refined] = []
     for level in range(3):
-        target = target_of(evidence, caster.mesh.labels, search.resolution[level])
-        results = [refined(caster, target, camera, s, prior, search.steps[level]) for s in states[: search.keep[level]]]
+        target = target_of(evidence, caster.mesh.labels, search.resolution[level], search.margin[level])
+        results = [refined(caster, target, camera, s, prior, search.steps[level]) for s in states[: effort * search.keep[level]]]
         ranked = _distinct(results, prior)
         states = [result.state for result in ranked]
         if level == 1:

@@ -15,8 +15,6 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.align.camera import Camera
 from factorlib.align.evidence import UNKNOWN, Evidence
 
-MARGIN = 0.35  # of the mask's extent, on each side
-
 
 class Region(msgspec.Struct, frozen=True):
     """One material in the photo, in pixels of the window.
@@ -60,13 +58,16 @@ def extent_of(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, float]:
     return low, high, float((high - low).max())
 
 
-def target_of(evidence: Evidence, labels: tuple[int, ...], resolution: int) -> Target:
-    """The evidence about its mask, whose longer side becomes `resolution` pixels (fewer if the photo has fewer)."""
+def target_of(evidence: Evidence, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
+    """The evidence about its mask and `margin` of its extent around it.
+
+    resolution: pixels of the mask's longer side in the window, fewer if the photo has fewer
+    """
     low, high, extent = extent_of(evidence)
     pixel = max(extent / resolution, 1.0)
     height, width = evidence.label.shape
-    low = np.maximum(np.floor(low - MARGIN * extent), 0)
-    high = np.minimum(np.ceil(high + MARGIN * extent), (width, height))
+    low = np.maximum(np.floor(low - margin * extent), 0)
+    high = np.minimum(np.ceil(high + margin * extent), (width, height))
     columns, rows = (np.arange(int(np.ceil((high[k] - low[k]) / pixel))) for k in (0, 1))
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)

@@ -1,0 +1,160 @@
+"""Mesh files: what is kept, what is dropped, what is refused."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+
+from factorlib.errors import InputError
+from factorlib.meshes import read_mesh, write_ply
+from factorlib.meshes.mesh import area_vectors
+from factorlib.meshes.ply import submesh
+
+MATERIALS = ["red", "oak"]
+QUADS = """
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 1
+v 1 0 1
+v 1 1 1
+v 0 1 1
+g shell
+usemtl plastic
+f 4 3 2 1
+f 5 6 7 8
+f 1 2 6 5
+g legs
+usemtl wood
+f 2 3 7 6
+f 3 4 8 7
+f -8 -4 -1 -5
+"""
+
+
+def obj(tmp_path, text, name="mesh.obj"):
+    (tmp_path / name).write_text(text)
+    return tmp_path / name
+
+
+def area_of(mesh, label):
+    return np.linalg.norm(area_vectors(mesh.vertices, mesh.faces[mesh.face_label == label]), axis=1).sum()
+
+
+@pytest.mark.parametrize("parts", [{"shell": "red", "legs": "oak"}, {"plastic": "red", "wood": "oak"}, {"shell": "red", "wood": "oak"}])
+def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts):
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, parts)
+    assert len(mesh.faces) == 12  # quads and negative indices
+    assert area_of(mesh, 1) == pytest.approx(3) and area_of(mesh, 2) == pytest.approx(3)
+    assert not mesh.open
+
+
+def test_object_name_is_a_part_too(tmp_path):
+    mesh = read_mesh(obj(tmp_path, "o seat\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), MATERIALS, {"seat": "oak"})
+    assert mesh.labels == (2,) and mesh.open
+
+
+def test_an_objects_own_materials_go_before_the_meshs(tmp_path):
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"}, overrides={"shell": "oak"})
+    assert mesh.labels == (2,)
+
+
+def test_part_without_material_is_named(tmp_path):
+    with pytest.raises(InputError, match="legs.*no material") as caught:
+        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red"})
+    assert "mesh.obj" in str(caught.value) and caught.value.cure
+
+
+def test_part_that_the_mesh_lacks_is_named_with_the_nearest(tmp_path):
+    with pytest.raises(InputError, match="no part 'shel'") as caught:
+        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shel": "red", "legs": "oak"})
+    assert caught.value.cure == "did you mean 'shell'?"
+
+
+def test_part_with_two_materials_is_refused(tmp_path):
+    with pytest.raises(InputError, match="several materials"):
+        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "plastic": "oak", "legs": "oak"})
+
+
+def test_unknown_material_is_named(tmp_path):
+    with pytest.raises(InputError, match="unknown material 'ok'"):
+        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "ok"})
+
+
+@pytest.mark.parametrize(
+    "text, match",
+    [
+        ("v 0 0 0\nv 1 0 0\nv nan 1 0\nf 1 2 3\n", "not finite"),
+        ("v 0 0 0\nv 1 0 0\n", "without faces"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "uses vertex 4 of 3"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4"),
+        ("v 0 0 zero\n", "line 1"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
+    ],
+)
+def test_unusable_meshes_are_refused(tmp_path, text, match):
+    with pytest.raises(InputError, match=match):
+        read_mesh(obj(tmp_path, text), MATERIALS, material="red")
+
+
+def test_missing_file_and_unknown_format(tmp_path):
+    for name, match in (("no.obj", "not found"), ("mesh.xyz", "unknown mesh format")):
+        with pytest.raises(InputError, match=match):
+            read_mesh(tmp_path / name, MATERIALS, material="red")
+
+
+def test_truncated_binary_is_refused(tmp_path):
+    path = tmp_path / "ball.ply"
+    path.write_bytes(trimesh.creation.icosphere(subdivisions=2).export(file_type="ply")[:900])
+    with pytest.raises(InputError):
+        read_mesh(path, MATERIALS, material="red")
+
+
+def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):
+    with caplog.at_level(logging.INFO, "factorlib.meshes"):
+        mesh = read_mesh(obj(tmp_path, QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, {"shell": "red", "legs": "oak"})
+    assert len(mesh.faces) == 12  # 4 3 2 is half of the first quad, in either winding
+    assert "1 zero-area" in caplog.text and "2 duplicate" in caplog.text
+
+
+def test_glb_nodes_are_placed_and_parts_named(tmp_path):
+    scene = trimesh.Scene()
+    for name, material, shift in (("seat", "plastic", 0.0), ("leg", "wood", 3.0)):
+        box = trimesh.creation.box((1, 1, 1))
+        box.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name=material))
+        scene.add_geometry(box, geom_name=name, transform=trimesh.transformations.translation_matrix((shift, 0, 0)))
+    scene.export(tmp_path / "chair.glb")
+    for parts in ({"seat": "red", "leg": "oak"}, {"plastic": "red", "wood": "oak"}):
+        mesh = read_mesh(tmp_path / "chair.glb", MATERIALS, parts)
+        oak = mesh.vertices[np.unique(mesh.faces[mesh.face_label == 2])]
+        assert np.allclose(oak.mean(axis=0), (3, 0, 0)) and mesh.labels == (1, 2)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "off"])
+def test_plain_formats_hold_one_part(tmp_path, suffix):
+    trimesh.creation.icosphere(subdivisions=2).export(tmp_path / f"ball.{suffix}")
+    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, material="oak")
+    assert len(mesh.faces) == 320 and mesh.labels == (2,) and not mesh.open
+    assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.999  # STL has no shared vertices: welded
+
+
+def test_written_ply_is_read_again_and_is_the_same_bytes(tmp_path):
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"})
+    for name in ("a.ply", "b.ply"):
+        write_ply(tmp_path / name, mesh)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    again = read_mesh(tmp_path / "a.ply", MATERIALS, material="red")
+    assert len(again.faces) == 12
+    corners = [sorted(map(tuple, np.round(m.vertices[m.faces].reshape(-1, 9), 6))) for m in (mesh, again)]
+    assert corners[0] == corners[1]
+
+
+def test_submesh_holds_one_material(tmp_path):
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"})
+    parts = [submesh(mesh, label) for label in mesh.labels]
+    assert sum(len(p.faces) for p in parts) == 12 and all(p.faces.max() == len(p.vertices) - 1 for p in parts)
