@@ -347,7 +347,7 @@ photos:
         ("mesh: vase}", "mehs: vase}", ["mehs", "did you mean 'mesh'"]),
         ("masks:", "mask:", ["mask", "did you mean 'masks'"]),
         ("  masks: kitchen.png\n", "", ["masks"]),
-        ("  image: kitchen.jpg\n", "  image: kitchen.jpg\n  image: garden.exr\n", ["image", "twice"]),
+        ("  image: kitchen.jpg\n", "  image: kitchen.jpg\n  image: garden.exr\n", ["image"]),
         ("materials: [red]", "materials: red", ["materials"]),
         ("photos:", "photos: [", ["dataset.yaml"]),
         ("format: 1", "format: one", ["format"]),
