@@ -4,10 +4,11 @@ Diffuse   n·i over the lobe has mean m = t̄ c and variance τ² = v⊥ s² + v
           mean of i·z, v∥ its variance, v⊥ = (1 − E[t²])/2).  Were it normal, E[max(n·i, 0)] = m Φ(m/τ) + τ φ(m/τ): exact
           as λ → ∞, 8 % low for the constant light, whose remainder a small Chebyshev series in (t̄, c) removes.
 
-Specular  NDF filtering (after Tokuyoshi et al. 2024, in slopes): the lobe has variance v⊥ about z, which is v⊥/4 along
-          and v⊥/(4 (o·h)²) across the plane of o and z about the half vector, and J v Jᵀ in slopes h_t/h_n.  GGX of slopes
-          has scale α² where a normal one has twice its variance, so the filtered distribution is GGX of the 2 × 2 matrix
-          A = α² 1 + 2 J v Jᵀ, and the lobe's integral times D_A G / (4 n·o) approximates the reflection.
+Specular  NDF filtering (after Tokuyoshi et al. 2024): the lobe has variance v⊥ about z, which is v⊥/4 along
+          and v⊥/(4 (o·h)²) across the plane of o and z, of the half vector.  GGX has scale α² where a normal distribution
+          has twice its variance, so the filtered one is GGX of the 2 × 2 matrix A = α² 1 + 2 Σ:
+          D_A = 1 / (π √det A (h_n² + h_tᵀ A⁻¹ h_t)²), and the lobe's integral times D_A G / (4 n·o) approximates the
+          reflection.
 """
 
 from __future__ import annotations
@@ -63,24 +64,15 @@ def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, 
     # o + z has length √(2 + 2 o·z): half vector's cosines with n and with o
     length = torch.sqrt((2 + 2 * oz).clamp_min(1e-6))
     nh, oh = (no + nz) / length, (length / 2).clamp_min(1e-3)
-    nh_soft = torch.sqrt(nh.clamp_min(0) ** 2 + 1e-4)
-    # the plane of o and z, in the tangent plane at h: e along (z − o)/|z − o|; n·e says how it lies to the slope direction
+    # e, in the plane of o and z and across h, is along z − o; d points from h to n in the tangent plane at h
     ne = (nz - no) / torch.sqrt((2 - 2 * oz).clamp_min(1e-6))
-    slope2 = (1 - nh**2).clamp_min(0.0)  # |n − (n·h) h|²
-    along, perp = across / 4, across / (4 * oh**2)
-    # variance of h along the slope direction d and across it, and their covariance (d at angle ψ to e, cos²ψ = ne²/slope2)
-    cos2 = (ne**2 / slope2.clamp_min(1e-6)).clamp(0, 1)
-    cos2 = torch.where(slope2 > 1e-6, cos2, torch.full_like(cos2, 0.5))
-    var_d = along * cos2 + perp * (1 - cos2)
-    var_x = along * (1 - cos2) + perp * cos2
-    covariance2 = (along - perp) ** 2 * cos2 * (1 - cos2)
-    # to slopes: 1/(n·h)² along d, 1/(n·h) across
-    a_dd = alpha**2 + 2 * var_d / nh_soft**4
-    a_xx = alpha**2 + 2 * var_x / nh_soft**2
-    determinant = (a_dd * a_xx - 4 * covariance2 / nh_soft**6).clamp_min(1e-12)
-    tan2 = slope2 / nh_soft**2
-    quadratic = tan2 * a_xx / determinant
-    density = 1 / (math.pi * torch.sqrt(determinant) * (1 + quadratic) ** 2 * nh_soft**4)
+    off2 = (1 - nh**2).clamp_min(0.0)  # |n − (n·h) h|²
+    cos2 = torch.where(off2 > 1e-6, (ne**2 / off2.clamp_min(1e-6)).clamp(0, 1), torch.full_like(nh, 0.5))
+    along, perp = across / 4, across / (4 * (oh**2 + across))  # the last term keeps it finite for z = −o
+    a_dd = alpha**2 + 2 * (along * cos2 + perp * (1 - cos2))
+    a_xx = alpha**2 + 2 * (along * (1 - cos2) + perp * cos2)
+    determinant = (a_dd * a_xx - 4 * (along - perp) ** 2 * cos2 * (1 - cos2)).clamp_min(1e-12)
+    density = 1 / (math.pi * torch.sqrt(determinant) * (nh.clamp_min(0) ** 2 + off2 * a_xx / determinant) ** 2)
     # light below the horizon reflects in part: the shadowing term sees the mean of the clamped cosine
     lit = mean_cosine(sharpness, nz).clamp(1e-6, 1)
     return lobe_integral(sharpness) * density * smith(alpha, lit) * smith(alpha, no) / (4 * no)

@@ -1,10 +1,17 @@
-"""The operator by quadrature in float64: slow, obvious, and what the others are tested against and trained on.
+"""The reflection of one lobe by quadrature in float64: slow, obvious, and what the others are held to.
 
-Diffuse   One integral: about z, the mean of max(n·i, 0) over azimuth has a closed form (`ring_mean`).  Polar angles are
-          Gauss–Legendre nodes of the lobe's own distribution function, split where the ring meets the horizon.
-Specular  Two double quadratures, each sampling one factor by its distribution function (Gauss–Legendre) and the azimuth
-          uniformly (trapezoid, which is spectral for periodic functions): `about_lobe` draws i from the lobe and sums
-          D G / (4 n·o); `about_normal` draws h from GGX and sums lobe · G (o·h) / (n·o n·h).  The sharper factor leads.
+The specular part ∫_{n·i>0} SG(i) D(h) G1(n·i) di · G1(n·o) / (4 n·o) has two sharp factors, each symmetric about its own
+axis, and one quadrature in polar coordinates about each:
+
+    about z   i at (θ, φ) from the lobe's axis: SG is a function of θ alone;             di = sin θ dθ dφ
+    about n   h at (θ, φ) from the normal: D is a function of θ alone, i = 2(o·h)h − o;  di = 4(o·h) sin θ dθ dφ
+
+The one about the sharper factor sees the other as broad.  Both cross the horizon n·i = 0 alike: below the angle a whole
+circles are lit, above b none, and between them the arc |φ| < φ_max(θ).  Each piece is smooth, so that Gauss–Legendre and
+trapezoidal rules converge geometrically; φ_max ~ √(θ − a) is made smooth by θ = a + (b − a) sin²(ψ/2).  The number of
+nodes is raised, element by element, until two rules agree.
+
+The diffuse part is one integral over i·z, its azimuthal integral being elementary.
 """
 
 from __future__ import annotations
@@ -17,114 +24,180 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.reflection.brdf import LEAST_COSINE, lobe_integral, smith, specular_times_cosine
+from factorlib.reflection.brdf import LEAST_COSINE, ggx, lobe_integral, smith
 from factorlib.reflection.operator import Operator
 
-BATCH = 1 << 21  # integrand values held at once
+LEVELS = (12, 18, 27, 40, 60, 90, 135, 202, 303, 455)  # nodes in each direction, raised until two levels agree
+FLOOR = 1e-5  # errors are relative to S + FLOOR × the lobe's integral
+REACH = 7.6  # a lobe is cut at e^(−REACH²/2) of its peak
+NODES_AT_ONCE = 1 << 17
 
 
 class Reference(Operator):
-    """Quadrature with `polar` × `azimuth` nodes; gradients by autograd through the nodes."""
+    """tolerance: relative difference of two levels of nodes at which the finer one is taken."""
 
-    def __init__(self, dtype: torch.dtype = torch.float64, polar: int = 128, azimuth: int = 256):
+    def __init__(self, dtype: torch.dtype = torch.float64, tolerance: float = 1e-7):
         super().__init__(dtype)
-        self.polar, self.azimuth = polar, azimuth
+        self.tolerance = tolerance
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        return diffuse_by_quadrature(sharpness.expand(nz.shape), nz)
+        return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
-        flat = [t.expand(nz.shape).reshape(-1) for t in (roughness, sharpness, no[:, None], nz, oz)]
-        size = max(1, BATCH // (self.polar * self.azimuth))
-        parts = [specular_by_quadrature(*(t[i : i + size] for t in flat), self.polar, self.azimuth) for i in range(0, nz.numel(), size)]
-        return torch.cat(parts).reshape(nz.shape)
+        scalars = torch.broadcast_tensors(roughness**2, sharpness, no[:, None], nz, oz)
+        return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
 
-@lru_cache
-def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
-    """Nodes and weights on [0, 1]."""
-    x, w = np.polynomial.legendre.leggauss(count)
-    return torch.from_numpy((x + 1) / 2), torch.from_numpy(w / 2)
+def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, *, tolerance: float) -> Float[Tensor, "b"]:
+    """The specular part of every element at the first level that agrees with the one before it."""
+    scalars = alpha, sharpness, no, nz, oz
+    value, level = torch.zeros_like(alpha), torch.zeros(alpha.shape, dtype=torch.long)
+    with torch.no_grad():
+        floor = FLOOR * lobe_integral(sharpness)
+        todo = torch.arange(len(alpha))
+        for k, nodes in enumerate(LEVELS):
+            if not len(todo):
+                break
+            previous = value[todo]
+            value[todo] = finer = in_chunks(nodes, *(t[todo] for t in scalars))
+            level[todo] = k
+            agrees = (finer - previous).abs() <= tolerance * (finer + floor[todo])
+            todo = todo[~agrees] if k else todo
+    if not any(t.requires_grad for t in scalars):
+        return value
+    pieces = [(torch.nonzero(level == k)[:, 0], LEVELS[k]) for k in range(len(LEVELS))]
+    for where, nodes in pieces:
+        if len(where):
+            value = value.index_put((where,), in_chunks(nodes, *(t[where] for t in scalars)))
+    return value
 
 
-def lobe_quantile(sharpness: Tensor, u: Tensor) -> Tensor:
-    """1 − i·z below which a share `u` of the lobe's integral lies; exact for small and large λ."""
-    small = sharpness < 1e-6
-    safe = torch.where(small, torch.ones_like(sharpness), sharpness)
-    return torch.where(small, 2 * u, -torch.log1p(u * torch.expm1(-2 * safe)) / safe).clamp(0, 2)
+def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, "b"]:
+    rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
+    return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in range(0, len(scalars[0]), rows)])
 
 
-def ring_mean(cosine: Tensor, t: Tensor) -> Tensor:
-    """Mean of max(n·i, 0) over the ring i·z = t of an axis with n·z = `cosine`."""
-    across = torch.sqrt(((1 - cosine**2) * (1 - t**2)).clamp_min(1e-300))
-    level = cosine * t
-    reach = torch.arccos((-level / across).clamp(-1, 1))  # half the arc above the horizon
-    return ((level * reach + across * torch.sin(reach)) / math.pi).clamp_min(0)
+def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+    """∫ SG D G / (4 n·o) di with `nodes` nodes in each direction of each piece, about the sharper factor."""
+    no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
+    about_normal = sharper_is_the_normal(alpha, sharpness, no, nz, oz)
+    value = torch.zeros_like(alpha)
+    for rule, chosen in ((about_half_vector, about_normal), (about_lobe, ~about_normal)):
+        where = torch.nonzero(chosen)[:, 0]
+        if len(where):
+            value = value.index_put((where,), rule(nodes, *(t[where] for t in (alpha, sharpness, no, nz, oz))))
+    return value * smith(alpha, no) / (4 * no)
 
 
-def diffuse_by_quadrature(sharpness: Float[Tensor, "*n"], nz: Float[Tensor, "*n"], nodes: int = 96) -> Float[Tensor, "*n"]:
-    """(1/π) ∫ lobe max(n·i, 0) di, split at the two polar angles where the ring touches the horizon."""
+def sharper_is_the_normal(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
+    """D is narrower than the lobe, whose axis is not so far from the mirror direction that it does not see D's peak."""
+    deviation = 1 / torch.sqrt(sharpness)
+    return (2 * alpha * torch.sqrt(no) < deviation) & (mirror_angle(no, nz, oz) < (REACH + 0.5) * deviation)
+
+
+def mirror_angle(no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
+    """Angle between the lobe's axis and the mirror direction 2(n·o)n − o."""
+    return torch.arccos((2 * no * nz - oz).clamp(-1, 1))
+
+
+def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+    """∫ SG(i) D(h) G1(n·i) di in polar coordinates about z, azimuth from the plane of z and n."""
+    alpha, sharpness, no, nz, oz = (t[:, None, None] for t in (alpha, sharpness, no, nz, oz))
+    sz = root(1 - nz**2)
+    ox = (no - nz * oz) / sz  # o along the direction from z to n
+    oy = root(1 - oz**2 - ox**2)
+    tilt = torch.atan2(sz, nz)
+    a, b = (math.pi / 2 - tilt).abs(), math.pi - (math.pi / 2 - tilt).abs()
+    reach = (REACH / torch.sqrt(sharpness)).clamp(max=math.pi)
+    above, zero = nz > 0, torch.zeros_like(a)
+    full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
+
+    def integrand(theta: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        cos, sin = torch.cos(theta), torch.sin(theta)
+        ni, oi = nz * cos + sz * sin * cos_phi, oz * cos + sin * (ox * cos_phi + oy * sin_phi)
+        nh = (no + ni) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
+        return torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2) * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
+
+    def cos_arc(theta: Tensor) -> Tensor:
+        return -nz * torch.cos(theta) / (sz * torch.sin(theta))
+
+    return over_circles(nodes, *full, integrand) + over_arcs(nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc)
+
+
+def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+    """∫ SG(i) D(h) G1(n·i) 4(o·h) dh in polar coordinates about n, azimuth from the plane of n and o.
+
+    θ = α sinh y spreads the nodes over the peak of D and over its tail alike.
+    """
+    alpha, sharpness, no, nz, oz = (t[:, None, None] for t in (alpha, sharpness, no, nz, oz))
+    so = root(1 - no**2)
+    zx = (oz - no * nz) / so  # z along the direction from n to o
+    zy = root(1 - nz**2 - zx**2)
+    tilt = torch.atan2(so, no)
+    least = (mirror_angle(no, nz, oz) - REACH / torch.sqrt(sharpness)).clamp_min(0) / 2
+    y_least, y_a, y_b = (torch.asinh(t / alpha) for t in (least, (math.pi / 2 - tilt) / 2, (math.pi / 2 + tilt) / 2))
+
+    def integrand(y: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        theta = alpha * torch.sinh(y)
+        cos, sin = torch.cos(theta), torch.sin(theta)
+        oh, zh = no * cos + so * sin * cos_phi, nz * cos + sin * (zx * cos_phi + zy * sin_phi)
+        lobe = torch.exp(-sharpness * (1 + oz - 2 * oh * zh))
+        return lobe * ggx(alpha, cos) * smith(alpha, 2 * oh * cos - no) * 4 * oh * sin * alpha * torch.cosh(y)
+
+    def cos_arc(y: Tensor) -> Tensor:
+        return -no / (so * torch.tan(2 * alpha * torch.sinh(y)))
+
+    return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
+
+
+def over_circles(nodes: int, low: Tensor, high: Tensor, integrand) -> Float[Tensor, "b"]:
+    """∫ over whole circles at radii [low, high]; limits [b, 1, 1]."""
+    x, w = gauss(nodes, low.dtype)
+    phi = 2 * math.pi * (torch.arange(2 * nodes, dtype=low.dtype) + 0.5) / (2 * nodes)
+    radius = low + (high - low) * x[None, :, None]
+    inner = integrand(radius, torch.cos(phi), torch.sin(phi)).sum(2) * (math.pi / nodes)
+    return (inner * w * (high - low)[:, :, 0]).sum(1)
+
+
+def over_arcs(nodes: int, low: Tensor, high: Tensor, integrand, cos_arc) -> Float[Tensor, "b"]:
+    """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], whose length goes like a root at both ends."""
+    x, w = gauss(nodes, low.dtype)
+    radius = low + (high - low) * (torch.sin(math.pi / 2 * x) ** 2)[None, :, None]
+    stretch = (high - low)[:, :, 0] * math.pi / 2 * torch.sin(math.pi * x)
+    arc = torch.arccos(cos_arc(radius).clamp(-1 + 1e-12, 1 - 1e-12))
+    t, v = gauss(2 * nodes, low.dtype)
+    phi = arc * (2 * t - 1)
+    inner = (integrand(radius, torch.cos(phi), torch.sin(phi)) * v).sum(2) * 2 * arc[:, :, 0]
+    return (inner * w * stretch).sum(1)
+
+
+def diffuse_quadrature(sharpness: Tensor, nz: Tensor, nodes: int = 48) -> Tensor:
+    """(1/π) ∫ exp(−λ(1 − cos θ)) sin θ g(θ) dθ, with g = ∫ max(n·i, 0) dφ = 2 (c φ_max cos θ + s sin θ sin φ_max)."""
     lam, c = sharpness[..., None], nz.clamp(-1, 1)[..., None]
-    touch = torch.sqrt((1 - c**2).clamp_min(0))  # |i·z| there
-    norm = -torch.expm1(-2 * lam.clamp_min(1e-12))
-    share = [(-torch.expm1(-lam.clamp_min(1e-12) * (1 - edge)) / norm).clamp(0, 1) for edge in (touch, -touch)]
-    edges = [torch.zeros_like(c), *share, torch.ones_like(c)]
-    x, w = gauss_legendre(nodes)
-    total = torch.zeros_like(c[..., 0])
-    for low, high in zip(edges, edges[1:], strict=False):
-        t = 1 - lobe_quantile(lam, low + (high - low) * x)
-        total = total + (ring_mean(c, t) * w).sum(-1) * (high - low)[..., 0]
-    return lobe_integral(sharpness) / math.pi * total
+    s = root(1 - c**2)
+    a = (math.pi / 2 - torch.atan2(s, c)).abs()
+    reach = (REACH / torch.sqrt(lam)).clamp(max=math.pi)
+    low = torch.zeros_like(a)
+    x, w = gauss(nodes, c.dtype)
+    total = 0
+    for first, last in ((low, a), (a, math.pi - a), (math.pi - a, low + math.pi)):
+        first, last = first.minimum(reach), last.minimum(reach)
+        theta = first + (last - first) * torch.sin(math.pi / 2 * x) ** 2
+        weight = w * (last - first) * math.pi / 2 * torch.sin(math.pi * x)
+        cos, sin = torch.cos(theta), torch.sin(theta)
+        arc = torch.arccos((-c * cos / (s * sin).clamp_min(1e-30)).clamp(-1 + 1e-14, 1 - 1e-14))
+        lit = 2 * (c * cos * arc + s * sin * torch.sin(arc))
+        total = total + (weight * torch.exp(-2 * lam * torch.sin(theta / 2) ** 2) * sin * lit).sum(-1)
+    return total.clamp_min(0) / math.pi
 
 
-def specular_by_quadrature(roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, polar: int, azimuth: int) -> Tensor:
-    """∫ lobe D G / (4 n·o) di for n cases at once, all inputs [n]."""
-    alpha = roughness**2
-    # the variance of i under the lobe is 2/λ; under GGX about the mirror direction some 4 α² per axis, tails beyond
-    by_lobe = sharpness * alpha**2 > 0.5
-    result = torch.zeros_like(nz)
-    for chosen, integrate in ((by_lobe, about_lobe), (~by_lobe, about_normal)):
-        if chosen.any():
-            result = result.index_put((chosen.nonzero()[:, 0],), integrate(*(t[chosen] for t in (alpha, sharpness, no, nz, oz)), polar, azimuth))
-    return result
+def root(square: Tensor) -> Tensor:
+    """√ of what is not negative but for rounding; its derivative stays finite."""
+    return torch.sqrt(square.clamp_min(1e-14))
 
 
-def about_lobe(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, polar: int, azimuth: int) -> Float[Tensor, "n"]:
-    """Draw i from the lobe."""
-    alpha, no, lam = (t[:, None, None] for t in (alpha, no.clamp_min(LEAST_COSINE), sharpness))
-    n, o = _frame_about(nz, oz, no[:, 0, 0])  # in a frame whose third axis is z
-    x, w = gauss_legendre(polar)
-    drop = lobe_quantile(lam, x[None, :, None])
-    t, s = 1 - drop, torch.sqrt((drop * (2 - drop)).clamp_min(0))
-    phi = (torch.arange(azimuth) + 0.5) / azimuth * 2 * math.pi
-    i = (s * torch.cos(phi), s * torch.sin(phi), t.expand(-1, -1, azimuth))
-    ni, oi = (sum(v[:, k, None, None] * i[k] for k in range(3)) for v in (n, o))
-    nh = (ni + no) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
-    value = specular_times_cosine(alpha, ni, no, nh.clamp(0, 1))
-    return lobe_integral(sharpness) * (value * w[None, :, None]).sum((1, 2)) / azimuth
-
-
-def about_normal(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, polar: int, azimuth: int) -> Float[Tensor, "n"]:
-    """Draw h from GGX: with tan² θ_h = α² u / (1 − u) the density of h is D n·h."""
-    alpha, no, lam = (t[:, None, None] for t in (alpha, no.clamp_min(LEAST_COSINE), sharpness))
-    o, z = _frame_about(no[:, 0, 0], nz, oz)  # in a frame whose third axis is n: o and z
-    x, w = gauss_legendre(polar)
-    u, weight = x**2 * (3 - 2 * x), w * 6 * x * (1 - x)  # smooth the ends, where tan θ grows without bound
-    nh = torch.sqrt((1 - u) / (1 - u + alpha[:, 0] ** 2 * u))[:, :, None]
-    sin = torch.sqrt((1 - nh**2).clamp_min(0))
-    phi = (torch.arange(azimuth) + 0.5) / azimuth * 2 * math.pi
-    h = (sin * torch.cos(phi), sin * torch.sin(phi), nh.expand(-1, -1, azimuth))
-    oh, zh = (sum(v[:, k, None, None] * h[k] for k in range(3)) for v in (o, z))
-    ni, zi = 2 * oh * h[2] - no, 2 * oh * zh - oz[:, None, None]
-    shadow = smith(alpha, ni) * smith(alpha, no)
-    value = torch.exp(lam * (zi - 1).clamp_max(0)) * shadow * oh.clamp_min(0) / (no * h[2].clamp_min(1e-9))
-    return (value * weight[None, :, None]).sum((1, 2)) / azimuth
-
-
-def _frame_about(first: Tensor, second: Tensor, between: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Two unit vectors with third components `first`, `second` and the given cosine `between` them."""
-    sin_first = torch.sqrt((1 - first**2).clamp_min(1e-14))
-    x = (between - first * second) / sin_first
-    y = torch.sqrt((1 - second**2 - x**2).clamp_min(0))
-    zero = torch.zeros_like(first)
-    return torch.stack([sin_first, zero, first], -1), torch.stack([x, y, second], -1)
+@lru_cache(maxsize=64)
+def gauss(nodes: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Gauss–Legendre nodes and weights on [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    return torch.tensor((x + 1) / 2, dtype=dtype), torch.tensor(w / 2, dtype=dtype)

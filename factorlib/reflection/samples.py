@@ -1,0 +1,72 @@
+"""Samples of the reflection operator's inputs, for training and for measuring: what a solve meets, evenly.
+
+α log-uniform in [.01, 1], sharpness log-uniform in [.3, 5000], n·o uniform in [.02, 1]; the lobe's axis about the mirror
+direction with a spread of 2√(α²/2 + 1/λ) for two thirds, uniform on the sphere for one third.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.stats import qmc
+from torch import Tensor
+
+from factorlib.reflection.brdf import lobe_integral
+from factorlib.reflection.reference import converged
+
+
+class Samples(msgspec.Struct, frozen=True):
+    """The five scalars of the specular part and its value, float64."""
+
+    alpha: Float[Tensor, "n"]
+    sharpness: Float[Tensor, "n"]
+    no: Float[Tensor, "n"]
+    nz: Float[Tensor, "n"]
+    oz: Float[Tensor, "n"]
+    value: Float[Tensor, "n"]
+
+    def inputs(self) -> tuple[Tensor, ...]:
+        return self.alpha, self.sharpness, self.no, self.nz, self.oz
+
+    def scale(self) -> Float[Tensor, "n"]:
+        """S + E/100, E the lobe's integral: what errors are measured in."""
+        return self.value + lobe_integral(self.sharpness) / 100
+
+    def __len__(self) -> int:
+        return len(self.alpha)
+
+
+def specular_inputs(count: int, seed: int, *, alpha=(0.01, 1.0), sharpness=(0.3, 5000.0), least_no: float = 0.02) -> tuple[Tensor, ...]:
+    """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence."""
+    u = qmc.Sobol(6, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count]
+    a = alpha[0] * (alpha[1] / alpha[0]) ** u[:, 0]
+    lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 1]
+    no = least_no + (1 - least_no) * u[:, 2]
+    view = np.stack([np.sqrt(1 - no**2), 0 * no, no], 1)
+    spread = 2 * np.sqrt(a**2 / 2 + 1 / lam)
+    near = _turned(view * [-1, 1, 1], spread * _rayleigh(u[:, 3]), 2 * np.pi * u[:, 4])
+    far = _turned(np.tile([0.0, 0.0, 1.0], (count, 1)), np.arccos(1 - 2 * u[:, 3]), 2 * np.pi * u[:, 4])
+    z = np.where(u[:, 5:] < 2 / 3, near, far)
+    return tuple(torch.from_numpy(t.copy()) for t in (a, lam, no, z[:, 2], (z * view).sum(1)))
+
+
+def specular_samples(count: int, seed: int, *, tolerance: float, **ranges) -> Samples:
+    """Samples with their reference values, converged to `tolerance`."""
+    inputs = specular_inputs(count, seed, **ranges)
+    return Samples(*inputs, converged(*inputs, tolerance=tolerance))
+
+
+def _rayleigh(u: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Length of a two-dimensional normal vector of unit deviation."""
+    return np.sqrt(-2 * np.log1p(-u))
+
+
+def _turned(axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, "n"], azimuth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+    """`axis` (in the plane y = 0) turned away from itself by `angle` in the direction `azimuth`."""
+    across = np.stack([axis[:, 2], 0 * angle, -axis[:, 0]], 1)
+    sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]
+    return cos * axis + sin * (np.cos(azimuth)[:, None] * across + np.sin(azimuth)[:, None] * np.array([0.0, 1.0, 0.0]))
