@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 from jaxtyping import Float
 
-from factorlib.dataset.schema import SetSlice
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
@@ -22,11 +21,19 @@ Channels = dict[str, Float[np.ndarray, "h w"]]
 Picture = Float[np.ndarray, "h w 3"]
 
 
+class PhotoSet(Protocol):
+    """The set as a whole (`SetSlice` of the dataset's schema), in the order of dataset.yaml."""
+
+    name: str
+    materials: list[str]
+    photos: list[str]
+
+
 class Artifacts(msgspec.Struct, frozen=True):
     """The folders of the stages by name, the set, and the run log."""
 
     folders: Mapping[str, Path]
-    set: SetSlice
+    set: PhotoSet
     log: Path | None = None
 
     def json(self, stage: str, name: str) -> Any:

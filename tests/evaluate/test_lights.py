@@ -61,7 +61,8 @@ def test_a_black_estimate_is_scored_and_finite():
 def test_a_facing_normal_mirrors_the_viewer():
     front = np.array([[0.0, 0.0, -1.0]])
     mask = mirrored_directions(front, front, np.eye(3))
-    assert mask[lat_long_directions(32, 64) @ [0, 0, 1] > 0.998].all()
+    beside = lat_long_directions(32, 64) @ [0, 0, 1] > 0.997
+    assert beside.sum() == 4 and mask[beside].all()
     assert 0 < mask.mean() < 0.01
 
 
@@ -69,4 +70,4 @@ def test_a_light_fixed_to_the_world_is_seen_through_the_cameras_rotation():
     quarter = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # takes the camera's −z (the viewer) to the world's +x
     front = np.array([[0.0, 0.0, -1.0]])
     mask = mirrored_directions(front, front, quarter)
-    assert mask[lat_long_directions(32, 64) @ [1, 0, 0] > 0.998].all() and mask.mean() < 0.01
+    assert mask[lat_long_directions(32, 64) @ [1, 0, 0] > 0.997].all() and mask.mean() < 0.01

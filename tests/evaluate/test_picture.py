@@ -41,6 +41,12 @@ def test_ssim_is_its_definition_where_the_window_is_whole(pictures):
     assert found == pytest.approx(expected, rel=1e-4)
 
 
+def test_dssim_is_half_of_what_ssim_lacks():
+    # black against white: both variances are 0, so SSIM = C1 / (1 + C1) = 1e-4 / 1.0001, and DSSIM is 0.49995
+    black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
+    assert picture_error(black, white, np.ones((12, 12), bool), 1.0).dssim == pytest.approx(0.49995, abs=1e-5)
+
+
 def test_nothing_outside_the_mask_counts(pictures):
     truth, estimate = pictures
     mask = np.zeros(truth.shape[:2], bool)
