@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Called as often as a stage likes: `done` of `total` pieces of work, and what is being done."""
 
