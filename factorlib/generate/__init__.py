@@ -1,0 +1,1 @@
+"""The data sets the project carries, made by Mitsuba from shapes, materials and lights of the project's own."""

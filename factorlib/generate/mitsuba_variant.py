@@ -1,0 +1,71 @@
+"""Which variant of Mitsuba runs on this machine: `llvm_ad_rgb` where LLVM works, else `scalar_rgb`.
+
+Mitsuba's LLVM variants abort the whole process with LLVM 14 or 15, so a variant is first tried in a process of its
+own, with each LLVM library found here; what aborts there is passed over.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+LIBRARY = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit, Mitsuba's compiler, looks for LLVM
+FOLDERS = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/llvm-*/lib")
+PROBE_SECONDS = 60
+PROBE = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3}, "light": {"type": "constant"},
+                      "ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "material": "none"}},
+                      "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
+import numpy as np
+assert np.array(mi.render(scene, spp=1)).sum() > 0
+"""
+log = logging.getLogger("factorlib.generate")
+
+
+@cache
+def mitsuba(variant: str | None = None) -> ModuleType:
+    """The `mitsuba` module with a variant set: the one named, or the fastest that runs here."""
+    variant = variant or os.environ.get("FACTORLIB_MITSUBA") or _fastest()
+    import mitsuba as module
+
+    module.set_variant(variant)
+    module.set_log_level(module.LogLevel.Warn)
+    return module
+
+
+def _fastest() -> str:
+    for library in [os.environ.get(LIBRARY), *llvm_libraries()]:
+        if library and _runs(library):
+            os.environ[LIBRARY] = library
+            return "llvm_ad_rgb"
+    log.warning("no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19): rendering with scalar_rgb, about 3 times slower")
+    return "scalar_rgb"
+
+
+def llvm_libraries() -> list[str]:
+    """LLVM's shared libraries on this machine, newest first."""
+    found = {path.resolve() for folder in FOLDERS for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")}
+    return [str(path) for path in sorted(found, key=_version, reverse=True) if _version(path) >= 16]
+
+
+def _version(library: Path) -> int:
+    """The major version in names such as libLLVM.so.19.1 and libLLVM-14.0.6.so.1; 0 where there is none."""
+    digits = library.name.removeprefix("libLLVM").replace("-", ".").replace("so", "").strip(".").split(".")
+    return int(digits[0]) if digits[0].isdigit() else 0
+
+
+def _runs(library: str) -> bool:
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE], env={**os.environ, LIBRARY: library}, capture_output=True, timeout=PROBE_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
