@@ -21,7 +21,7 @@ PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3}, "light": {"type": "constant"},
-                      "ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "material": "none"}},
+                      "ball": {"type": "sphere", "center": [0, 0, 5], "bsdf": {"type": "roughconductor", "material": "none"}},
                       "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
 import numpy as np
 assert np.array(mi.render(scene, spp=1)).sum() > 0
