@@ -1,0 +1,1 @@
+"""Light at infinity: as spherical Gaussian lobes, and as lat-long maps."""

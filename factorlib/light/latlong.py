@@ -1,0 +1,95 @@
+"""Lat-long maps of lobes, and what is done with such maps: sampling, turning, summing.
+
+Texel averages   A texel holds the mean of the light over its area, so a sharp lobe loses no energy.  With polar angle θ
+                 from +y and azimuth φ, 1 − ω·z = 2 sin²((θ−θ_z)/2) + 2 sin θ sin θ_z sin²((φ−φ_z)/2) (the haversine
+                 formula): exact at any sharpness, and an outer product over rows and columns.  Every texel is
+                 integrated by Gauss–Legendre nodes, as many as the lobe needs, only where the lobe is not nil.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_of_direction, lat_long_solid_angles
+from factorlib.light.lobes import Lobes
+
+LARGEST_EXPONENT = 40.0  # e⁻⁴⁰: beyond, a lobe is nil
+LEAST_NODES, NODES_PER_WIDTH = 3, 1.5  # Gauss nodes along a texel's side, and how many more per lobe width 1/√λ in it
+
+Map = Float[np.ndarray, "h w 3"]
+
+
+def lat_long_of_lobes(lobes: Lobes, height: int, width: int) -> Map:
+    """Texel area averages of the light, in the frame of the exported maps: the y-up turn of the lobes' own frame."""
+    result = np.zeros((height, width, 3))
+    lobes = lobes.turned(YUP_FROM_CAMERA)
+    row, column = lat_long_of_direction(lobes.axis)
+    for theta, phi, sharpness, weight in zip(np.pi * row, 2 * np.pi * column, lobes.sharpness, lobes.weight, strict=True):
+        if weight.any():
+            rows, columns, mean = _texel_means(theta, phi, sharpness, height, width)
+            result[rows[:, None], columns] += mean[..., None] * weight
+    return result
+
+
+def _texel_means(theta_z: float, phi_z: float, sharpness: float, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [r], columns [c] that a unit lobe reaches, and its means there [r, c]; φ counts from the left edge."""
+    tall, wide = np.pi / height, 2 * np.pi / width
+    node, share = gauss_nodes(LEAST_NODES + int(NODES_PER_WIDTH * max(tall, wide) * np.sqrt(sharpness)))
+    theta = (np.arange(height)[:, None] + node) * tall  # [h, g]
+    polar = 2 * np.sin((theta - theta_z) / 2) ** 2
+    rows = np.flatnonzero(sharpness * polar.min(axis=1) < LARGEST_EXPONENT)
+    theta, polar = theta[rows], polar[rows]
+    scale = 2 * np.sin(theta) * np.sin(theta_z)
+    azimuthal = np.sin(((np.arange(width)[:, None] + node) * wide - phi_z) / 2) ** 2  # [w, g]
+    columns = np.flatnonzero(sharpness * scale.min(initial=0) * azimuthal.min(axis=1) < LARGEST_EXPONENT)
+    across = np.stack([np.exp(-sharpness * s[:, None, None] * azimuthal[columns]) @ share for s in scale])  # [r, g, c]
+    area = share * np.sin(theta)
+    down = area / area.sum(axis=1, keepdims=True) * np.exp(-sharpness * polar)
+    return rows, columns, np.einsum("rg,rgc->rc", down, across)
+
+
+@cache
+def gauss_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of Gauss–Legendre quadrature over [0, 1]."""
+    node, share = np.polynomial.legendre.leggauss(count)
+    return (node + 1) / 2, share / 2
+
+
+def map_energy(lat_long: Map) -> Float[np.ndarray, "3"]:
+    """∫ of a map over the sphere, radiance × steradian."""
+    return np.einsum("h,hwc->c", lat_long_solid_angles(*lat_long.shape[:2]), lat_long)
+
+
+def sampled(lat_long: Map, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Bilinear interpolation between texel centres, in unit directions of the map's frame; continuous over the poles."""
+    height, width = lat_long.shape[:2]
+    row, column = lat_long_of_direction(directions)
+    i, j = row * height - 0.5, column * width - 0.5
+    i0, j0 = np.floor(i).astype(int), np.floor(j).astype(int)
+    a, b = (i - i0)[..., None], (j - j0)[..., None]
+    pick = [[_texel(lat_long, i0 + di, j0 + dj) for dj in (0, 1)] for di in (0, 1)]
+    return (1 - a) * ((1 - b) * pick[0][0] + b * pick[0][1]) + a * ((1 - b) * pick[1][0] + b * pick[1][1])
+
+
+def _texel(lat_long: Map, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Texels by row and column; a row beyond a pole is the one before it, half a turn away."""
+    height, width = lat_long.shape[:2]
+    beyond = (i < 0) | (i >= height)
+    i = np.where(i < 0, -1 - i, np.where(i >= height, 2 * height - 1 - i, i))
+    return lat_long[i, (j + np.where(beyond, width // 2, 0)) % width]
+
+
+def turned_map(lat_long: Map, rotation: Float[np.ndarray, "3 3"], finer: int = 4) -> Map:
+    """The map in another frame, `rotation` = new_from_old (both y-up): means over finer × finer samples a texel."""
+    height, width = lat_long.shape[:2]
+    directions = lat_long_directions(finer * height, finer * width)
+    weight = np.repeat(lat_long_solid_angles(finer * height, finer * width)[:, None], finer * width, axis=1)
+    fine = sampled(lat_long, directions @ np.asarray(rotation)) * weight[..., None]
+
+    def cells(values: np.ndarray) -> np.ndarray:
+        return values.reshape(height, finer, width, finer, -1).sum(axis=(1, 3))
+
+    return cells(fine) / cells(weight)

@@ -1,0 +1,51 @@
+"""Lobes: their integral, frames, and table."""
+
+import numpy as np
+import pytest
+from factorlib.errors import InputError
+from factorlib.light.lobes import Lobes, lobe_integral, no_lobes, read_lobes, write_lobes
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+
+
+def some_lobes(count: int = 6, seed: int = 0) -> Lobes:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=(count, 3))
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.geomspace(0.1, 5000, count), rng.uniform(0.1, 2, (count, 3)))
+
+
+@pytest.mark.parametrize("sharpness", [1e-6, 5e-4, 2e-3, 0.1, 3.0, 500.0])
+def test_integral_is_the_quadrature_over_the_cosine(sharpness):
+    expected = 2 * np.pi * quad(lambda t: np.exp(sharpness * (t - 1)), -1, 1)[0]
+    assert lobe_integral(sharpness) == pytest.approx(expected, rel=1e-9)
+
+
+def test_turning_light_and_direction_together_changes_nothing():
+    rotation = Rotation.random(random_state=1).as_matrix()
+    directions = some_lobes(9, 3).axis
+    np.testing.assert_allclose(some_lobes().turned(rotation).radiance(directions @ rotation.T), some_lobes().radiance(directions), rtol=1e-9)
+
+
+def test_radiance_at_the_axis_of_a_very_sharp_lobe_is_its_weight():
+    axis = np.array([[0.6, 0.0, 0.8]])
+    lobe = Lobes(axis, np.array([1e6]), np.array([[1.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(lobe.radiance(axis), [[1, 2, 3]], rtol=1e-12)
+    assert np.isfinite(lobe.energy).all()
+
+
+def test_table_round_trip_is_exact_and_byte_equal(tmp_path):
+    lights = {"b": some_lobes(3, 1), "dark": no_lobes(), "a": some_lobes(4, 2)}
+    write_lobes(tmp_path / "1.parquet", lights)
+    write_lobes(tmp_path / "2.parquet", dict(reversed(lights.items())))
+    assert (tmp_path / "1.parquet").read_bytes() == (tmp_path / "2.parquet").read_bytes()
+    found = read_lobes(tmp_path / "1.parquet")
+    assert set(found) == set(lights)
+    for name, lobes in lights.items():
+        for field in ("axis", "sharpness", "weight"):
+            np.testing.assert_array_equal(getattr(found[name], field), getattr(lobes, field))
+
+
+def test_something_else_is_refused_by_name(tmp_path):
+    (tmp_path / "x.parquet").write_text("no table")
+    with pytest.raises(InputError, match="not a table of lobes"):
+        read_lobes(tmp_path / "x.parquet")
