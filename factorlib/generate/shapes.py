@@ -1,0 +1,96 @@
+"""Shapes of the synthetic set: closed smooth surfaces about the origin, y up, about 1.2 units across.
+
+Each is a grid of rows (from the top pole down) and columns (about the y axis) closed by one vertex at either pole, so
+that one routine makes triangles and smooth normals of them all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+from factorlib.meshes.mesh import Mesh, area_vectors
+
+ROWS, COLUMNS = 60, 96
+
+VASE = ((0.0, 0.78), (0.22, 0.77), (0.33, 0.72), (0.31, 0.62), (0.29, 0.52), (0.38, 0.32), (0.55, 0.08), (0.60, -0.14),
+        (0.55, -0.38), (0.42, -0.62), (0.36, -0.74), (0.28, -0.78), (0.0, -0.79))  # fmt: skip
+BOTTLE = ((0.0, 0.86), (0.12, 0.85), (0.16, 0.80), (0.155, 0.70), (0.16, 0.52), (0.24, 0.36), (0.38, 0.20), (0.43, 0.02),
+          (0.43, -0.30), (0.43, -0.62), (0.41, -0.72), (0.34, -0.77), (0.0, -0.78))  # fmt: skip
+BUMPS = (((0.75, 0.45, 0.35), 0.55, 4.0), ((-0.8, -0.1, 0.5), 0.30, 5.0), ((-0.1, 0.9, -0.4), 0.25, 6.0),
+         ((0.2, -0.9, 0.3), 0.22, 3.0), ((0.3, 0.1, -0.95), 0.18, 4.0))  # direction, height, sharpness  # fmt: skip
+
+
+def sphere(radius: float = 0.6) -> Mesh:
+    """A sphere."""
+    return star(lambda direction: np.full(direction.shape[:-1], radius))
+
+
+def blob() -> Mesh:
+    """A smooth body without any symmetry: a ball with broad bumps of several heights."""
+
+    def radius(direction):
+        size = np.full(direction.shape[:-1], 0.45)
+        for axis, height, sharpness in BUMPS:
+            axis = np.array(axis) / np.linalg.norm(axis)
+            size += 0.45 * height * np.exp(sharpness * (direction @ axis - 1))
+        return size
+
+    return star(radius)
+
+
+def vase() -> Mesh:
+    """A solid of revolution: foot, belly, neck and lip."""
+    return revolved(np.array(VASE))
+
+
+def bottle() -> Mesh:
+    """A solid of revolution: body, shoulder and neck."""
+    return revolved(np.array(BOTTLE))
+
+
+SHAPES = {"sphere": sphere, "vase": vase, "bottle": bottle, "blob": blob}
+
+
+def star(radius) -> Mesh:
+    """The surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
+    theta = np.arange(1, ROWS) / ROWS * np.pi
+    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    sin = np.sin(theta)[:, None]
+    direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
+    poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    return closed_grid(direction * radius(direction)[..., None], *(poles * radius(poles)[:, None]))
+
+
+def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
+    """Surface of revolution about y of a profile of (radius, y), from the top pole to the bottom one."""
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    curve = PchipInterpolator(length, profile)(np.arange(1, ROWS) / ROWS * length[-1])
+    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    radius, y = curve[:, :1], curve[:, 1:]
+    points = np.stack(np.broadcast_arrays(radius * np.sin(phi), y, radius * np.cos(phi)), axis=-1)
+    return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
+
+
+def closed_grid(points: Float[np.ndarray, "r c 3"], top: Float[np.ndarray, "3"], bottom: Float[np.ndarray, "3"]) -> Mesh:
+    """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
+    rows, columns = points.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    right = np.roll(index, -1, axis=1)
+    a, b, c, d = index[:-1], right[:-1], index[1:], right[1:]
+    last = rows * columns
+    cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
+    base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)
+    sides = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]).reshape(-1, 3)
+    vertices = np.concatenate([points.reshape(-1, 3), [top, bottom]])
+    return smooth(vertices, np.concatenate([sides, cap, base]))
+
+
+def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndarray | int = 1) -> Mesh:
+    """A mesh with normals averaged over the faces about each vertex, weighted by area."""
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
