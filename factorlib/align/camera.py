@@ -32,11 +32,14 @@ class Camera(msgspec.Struct, frozen=True):
 
     def rays(self) -> Float[np.ndarray, "h w 3"]:
         """Directions through the pixel centres, z = 1, camera frame."""
-        x = (np.arange(self.width) + 0.5 - self.centre[0]) / self.focal
-        y = (np.arange(self.height) + 0.5 - self.centre[1]) / self.focal
-        grid = np.empty((self.height, self.width, 3))
-        grid[..., 0], grid[..., 1], grid[..., 2] = x[None, :], y[:, None], 1.0
-        return grid
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        return self.rays_through(np.stack([x, y], axis=-1))
+
+    def rays_through(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
+        """Directions, z = 1, through image points (x, y)."""
+        rays = np.ones((*pixels.shape[:-1], 3))
+        rays[..., :2] = (pixels - np.array(self.centre)) / self.focal
+        return rays
 
 
 class Pose(msgspec.Struct, frozen=True):

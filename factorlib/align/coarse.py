@@ -126,7 +126,7 @@ def _templates(caster: Caster, labels, turn: np.ndarray, distance: float, area: 
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     hits = caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose)
-    image = np.where(hits.face >= 0, caster.mesh.face_label[hits.face], 0)
+    image = caster.labels(hits)
     own = np.count_nonzero(image)
     for size in SIZES_OF_CUT if cut else SIZES_OF_WHOLE:
         zoom = np.sqrt(area / max(own, 1)) * size

@@ -47,9 +47,9 @@ class Maps(msgspec.Struct, frozen=True):
 class Hits(msgspec.Struct, frozen=True):
     """First intersections of one mesh: depth (inf for none) and face (−1), barycentric uv of the 2nd and 3rd corner."""
 
-    depth: Float[np.ndarray, "h w"]
-    face: Int[np.ndarray, "h w"]
-    uv: Float[np.ndarray, "h w 2"]
+    depth: Float[np.ndarray, "*n"]
+    face: Int[np.ndarray, "*n"]
+    uv: Float[np.ndarray, "*n 2"]
 
 
 class Caster:
@@ -63,10 +63,13 @@ class Caster:
 
     def cast(self, camera: Camera, pose: Pose) -> Hits:
         """What the rays through the pixel centres of `camera` meet first."""
-        origin = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
-        rays = np.empty((camera.height, camera.width, 6), np.float32)
-        rays[..., :3] = origin
-        rays[..., 3:] = camera.rays() @ (pose.rotation / self.radius)  # z = 1: distance along the ray is depth
+        return self.cast_along(camera.rays(), pose)
+
+    def cast_along(self, directions: Float[np.ndarray, "*n 3"], pose: Pose) -> Hits:
+        """What rays from the camera along `directions` (camera frame, z = 1, so that distance is depth) meet first."""
+        rays = np.empty((*directions.shape[:-1], 6), np.float32)
+        rays[..., :3] = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
+        rays[..., 3:] = directions @ (pose.rotation / self.radius)
         found = self._scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
         face = found["primitive_ids"].numpy()
         return Hits(
@@ -74,6 +77,10 @@ class Caster:
             face=np.where(face == NO_FACE, -1, face.astype(np.int64)),
             uv=found["primitive_uvs"].numpy().astype(float),
         )
+
+    def labels(self, hits: Hits) -> Int[np.ndarray, "*n"]:
+        """Material label of each hit, 0 for none."""
+        return np.where(hits.face >= 0, self.mesh.face_label[hits.face], 0)
 
 
 def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Sequence[Pose]) -> Maps:

@@ -1,11 +1,12 @@
 """Refinement of a pose on contours, by Gauss-Newton.
 
-The contour of the mesh in the image is rendered anew at every step.  To first order the image of an occluding contour
-moves, across itself, as the surface points on it do; so each contour pixel's 3D point carries the derivative.
+The contour of the mesh in the image is rendered anew at every step, to a fraction of a pixel: between a pixel in and
+one out, rays are halved in.  (With whole pixels most residuals are exactly 0 and a robust fit sticks to them.)  To first order the image of an occluding contour
+moves, across itself, as the surface points on it do; so each contour point's 3D point carries the derivative.
 Two kinds of residual, both in window pixels and both per material, so that the border between two parts counts too:
 
-    mesh → mask    the mask's signed distance at each contour pixel of the mesh
-    mask → mesh    how far, along the mask's normal, the nearest contour pixel of the mesh is from each one of the mask
+    mesh → mask    the mask's signed distance at each contour point of the mesh
+    mask → mesh    how far, along the mask's normal, the nearest contour point of the mesh is from each one of the mask
 
 The first alone lets a mesh hide inside its mask, the second alone lets it stick out.  Cauchy weights with a scale
 from the residuals themselves keep parts that one of the two lacks from pulling.
@@ -15,17 +16,19 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from factorlib.align.camera import Camera
 from factorlib.align.evidence import labelled_iou
 from factorlib.align.raster import Caster, Hits
 from factorlib.align.state import State
-from factorlib.align.target import Region, Target, _has_neighbour
+from factorlib.align.target import Region, Target, border_pairs
 
 CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
-LEAST_SCALE = 0.35  # window pixels: the error of a contour pixel's place
+LEAST_SCALE = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
+HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
 MOST_SCALE = 0.05  # of the mask's extent
 
 
@@ -56,9 +59,8 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
     for k in range(steps + 1):
         window = target.camera(state.camera(camera))
         hits = caster.cast(window, state.pose(caster))
-        label = np.where(hits.face >= 0, caster.mesh.face_label[hits.face], 0)
-        score = labelled_iou(target.evidence, label)
-        equations = normal_equations(target, window, hits, label, state, prior)
+        score = labelled_iou(target.evidence, caster.labels(hits))
+        equations = normal_equations(caster, target, window, hits, state, prior)
         if best is None or score > best.score:
             best, failures = Refined(state, score, equations.scale, equations.information), 0
         else:
@@ -86,21 +88,19 @@ class Equations(msgspec.Struct, frozen=True):
         return np.clip(step, -0.3, 0.3)
 
 
-def normal_equations(
-    target: Target, window: Camera, hits: Hits, label: Int[np.ndarray, "h w"], state: State, prior: FocalPrior
-) -> Equations:
+def normal_equations(caster: Caster, target: Target, window: Camera, hits: Hits, state: State, prior: FocalPrior) -> Equations:
     residuals, rows = [np.zeros(0)], [np.zeros((0, 7))]
     for name, region in target.regions.items():
-        pixels, arms = contour_of(label, name, hits, window, state)
-        if len(pixels) == 0:
+        points, arms = contour_of(caster, name, hits, window, state)
+        if len(points) == 0:
             continue
         jacobian = state.jacobian(arms) / target.pixel
-        for residual, row in (_mesh_to_mask(region, pixels, jacobian), _mask_to_mesh(region, pixels, jacobian)):
+        for residual, row in (_mesh_to_mask(region, points, jacobian), _mask_to_mesh(region, points, jacobian)):
             residuals.append(residual)
             rows.append(row)
     residual, row = np.concatenate(residuals), np.concatenate(rows)
     spread = 1.4826 * np.median(np.abs(residual)) if len(residual) else LEAST_SCALE
-    scale = float(np.clip(spread, LEAST_SCALE, MOST_SCALE * target.extent))
+    scale = float(np.clip(spread, LEAST_SCALE, max(MOST_SCALE * target.extent, LEAST_SCALE)))
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
     if prior.sigma > 0:
@@ -110,34 +110,35 @@ def normal_equations(
 
 
 def contour_of(
-    label: Int[np.ndarray, "h w"], name: int, hits: Hits, window: Camera, state: State
+    caster: Caster, name: int, hits: Hits, window: Camera, state: State
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Centres (x, y) of the rendered region's border pixels, and the arms from the mesh's centre to the points that move them.
-
-    Where another part covers the region, the border moves with the nearer surface.
+    """Points (x, y) of the contour of the mesh's part of label `name`, and the arms from the mesh's centre to the surface
+    points that move them: where another part covers it, the contour moves with the nearer surface.
     """
-    inside = label == name
-    border = np.zeros(label.shape, bool)
-    border[1:-1, 1:-1] = inside[1:-1, 1:-1] & _has_neighbour(~inside)
-    rows, columns = np.nonzero(border)
-    depth = hits.depth
-    nearest = np.minimum.reduce([depth[rows, columns], *(depth[rows + i, columns + j] for i, j in ((-1, 0), (1, 0), (0, -1), (0, 1)))])
-    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
-    rays = np.concatenate([(pixels - np.array(window.centre)) / window.focal, np.ones((len(pixels), 1))], axis=1)
-    return pixels, rays * nearest[:, None] - state.middle()
+    inside = caster.labels(hits) == name
+    pixel_in, pixel_out = border_pairs(inside, ~inside)
+    depth = np.minimum(hits.depth[tuple(pixel_in.T)], hits.depth[tuple(pixel_out.T)])
+    near, far, pose = pixel_in[:, ::-1] + 0.5, pixel_out[:, ::-1] + 0.5, state.pose(caster)
+    for _ in range(HALVINGS):
+        middle = (near + far) / 2
+        there = caster.cast_along(window.rays_through(middle), pose)
+        within = caster.labels(there) == name
+        near, far = np.where(within[:, None], middle, near), np.where(within[:, None], far, middle)
+    points = (near + far) / 2
+    return points, window.rays_through(points) * depth[:, None] - state.middle()
 
 
-def _mesh_to_mask(region: Region, pixels: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    column, row = pixels.astype(int).T
-    distance, slope = region.distance[row, column], region.slope[row, column]
-    # a border pixel that agrees lies half a pixel inside; unknown pixels are a dead zone
-    residual = np.where(distance == 0, 0.0, distance + 0.5)
-    return residual, np.einsum("nd,ndk->nk", slope, jacobian)
+def _mesh_to_mask(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    place = points.T[::-1] - 0.5
+    distance, slope_x, slope_y = (
+        map_coordinates(image, place, order=1, mode="nearest") for image in (region.distance, region.slope[..., 0], region.slope[..., 1])
+    )
+    return distance, slope_x[:, None] * jacobian[:, 0] + slope_y[:, None] * jacobian[:, 1]
 
 
-def _mask_to_mesh(region: Region, pixels: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mask_to_mesh(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(region.contour) == 0:
         return np.zeros(0), np.zeros((0, 7))
-    nearest = cKDTree(pixels).query(region.contour)[1]
-    residual = np.einsum("nd,nd->n", region.outward, pixels[nearest] - region.contour)
+    nearest = cKDTree(points).query(region.contour)[1]
+    residual = np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour)
     return residual, np.einsum("nd,ndk->nk", region.outward, jacobian[nearest])

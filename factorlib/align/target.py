@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from factorlib.align.camera import Camera
@@ -21,7 +21,7 @@ class Region(msgspec.Struct, frozen=True):
 
     distance  [h, w] signed distance to the region's border, negative inside, 0 where unknown
     slope     [h, w, 2] its gradient (x, y)
-    contour   [n, 2] centres (x, y) of the region's pixels that touch known pixels outside it
+    contour   [n, 2] points (x, y) between the region's pixels and known pixels outside it
     outward   [n, 2] unit directions out of the region there
     """
 
@@ -87,22 +87,32 @@ def region_of(labels: Int[np.ndarray, "h w"], label: int, at_frame: tuple[bool, 
     distance = np.where(inside, 0.5 - _distance_to(~inside), _distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
     slope = np.stack(np.gradient(distance)[::-1], axis=-1)
-    touches_outside = np.zeros(padded.shape, bool)
-    touches_outside[1:-1, 1:-1] = _has_neighbour(known & ~inside)
-    rows, columns = np.nonzero(inside & touches_outside)
-    normal = slope[rows, columns]
+    contour, outward = _border(inside, known & ~inside, slope)
+    return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour - 1.0, outward)
+
+
+def border_pairs(inside: Bool[np.ndarray, "h w"], outside: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
+    """(row, column) of each pixel in `inside` with a right, left, lower or upper neighbour in `outside`, and of that."""
+    pairs = []
+    for axis in (0, 1):
+        low, high = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        step = np.eye(2, dtype=int)[axis]
+        first = np.argwhere(inside[low] & outside[high])
+        second = np.argwhere(outside[low] & inside[high])
+        pairs += [(first, first + step), (second + step, second)]
+    return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
+
+
+def _border(inside: np.ndarray, outside: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points halfway across the border, and the unit slope of the distance there; without those where it vanishes."""
+    a, b = border_pairs(inside, outside)
+    normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
     length = np.linalg.norm(normal, axis=1)
-    good = length > 0.2
-    contour = np.stack([columns - 0.5, rows - 0.5], axis=1)[good]
-    return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour, normal[good] / length[good, None])
+    good = length > 0.4
+    return ((a + b) / 2 + 0.5)[good][:, ::-1], normal[good] / length[good, None]
 
 
 def _distance_to(where: np.ndarray) -> np.ndarray:
     if not where.any():
         return np.full(where.shape, float(sum(where.shape)))
     return distance_transform_edt(~where)
-
-
-def _has_neighbour(where: np.ndarray) -> np.ndarray:
-    """[h−2, w−2]: whether one of the four neighbours is in `where`."""
-    return where[:-2, 1:-1] | where[2:, 1:-1] | where[1:-1, :-2] | where[1:-1, 2:]
