@@ -1,7 +1,8 @@
 """One self-contained page about the run, and a few figures as PNG.
 
-Writes index.html (no other file and no network is needed to read it) and figures/<photo>.png: photo, materials,
-re-synthesis and difference side by side.  The page is byte-equal from run to run but for its section on cost.
+Writes index.html (no other file and no network is needed to read it), figures/overview.png, and for each photo
+figures/photos/<photo>.png: photo, materials, re-synthesis and difference side by side.  The page is byte-equal from run
+to run but for its section on cost.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import msgspec
 
 from factorlib.dataset.schema import SetSlice
 from factorlib.report.artifacts import Artifacts
+from factorlib.report.overview import overview
 from factorlib.report.page import page
 from factorlib.report.photos import photo_row, strip
 from factorlib.stage import Inputs, Progress
@@ -25,10 +27,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     errors = run.json("evaluate", "metrics.json")["resynthesis"]["photos"]
     rows = []
-    (out / "figures").mkdir()
+    (out / "figures" / "photos").mkdir(parents=True)
     for done, name in enumerate(run.set.photos):
         progress(done, len(run.set.photos) + 1, name)
         rows.append(photo_row(run, name, errors.get(name)))
-        (out / "figures" / f"{name}.png").write_bytes(strip(rows[-1]))
+        (out / "figures" / "photos" / f"{name}.png").write_bytes(strip(rows[-1]))
     progress(len(rows), len(rows) + 1, "page")
+    (out / "figures" / "overview.png").write_bytes(overview(run, rows))
     (out / "index.html").write_text(page(run, rows), encoding="utf-8")

@@ -66,9 +66,7 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
     return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
 
-def radiance_toward(
-    light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n 3"]:
+def radiance_toward(light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
     """Radiance averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
     finest = 4 * np.pi / SIDE**2
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, len(light.levels) - 1)

@@ -19,7 +19,16 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_of_direction
-from factorlib.evaluate.ball import WIDE_SIDE, Light, ball_normals, constant_light, diffuse_ball, glossy_ball, mirror_ball, octahedral_directions
+from factorlib.evaluate.ball import (
+    WIDE_SIDE,
+    Light,
+    ball_normals,
+    constant_light,
+    diffuse_ball,
+    glossy_ball,
+    mirror_ball,
+    octahedral_directions,
+)
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 
 GLOSSY_ROUGHNESS = 0.4

@@ -59,10 +59,10 @@ def balls(run: Artifacts, seen: dict[str, list[str]], exposure: dict[str, float]
 
 def _ball(run: Artifacts, material: str, photo: str, observed: bool, exposure: float) -> Cell:
     radiance = run.ball(photo, material)
-    return Cell(material, photo, observed, None if radiance is None else data_uri(_disc(reduced(radiance, 96), exposure)))
+    return Cell(material, photo, observed, None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure)))
 
 
-def _disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> np.ndarray:
+def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> np.ndarray:
     """Display values, transparent outside the disc that fills the picture."""
     height, width = radiance.shape[:2]
     y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
@@ -82,7 +82,7 @@ def _map(run: Artifacts, photo: str, index: int, material: str, observations: Ob
     measured = data_uri(measured_map(observations.take(rows), exposure)) if rows.any() else None
     if channels is None:
         return Cell(material, photo, bool(rows.any()), None, measured)
-    pixels = _disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
+    pixels = disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
     seen = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
     if seen.mean() > LEAST_OBSERVED:
         inside = pixels[..., 3] > 0
@@ -146,7 +146,7 @@ def _spheres(run: Artifacts, name: str) -> str | None:
     truth, estimate = pair
     rows = [truth, estimate * (truth.mean() / max(float(estimate.mean()), 1e-30))]
     exposure = exposure_of(truth, truth.max(-1) > 0, 97.0)
-    discs = [[_disc(np.repeat(np.repeat(ball, 2, 0), 2, 1), exposure) for ball in np.split(row, 3, axis=1)] for row in rows]
+    discs = [[disc(np.repeat(np.repeat(ball, 2, 0), 2, 1), exposure) for ball in np.split(row, 3, axis=1)] for row in rows]
     gap = np.zeros((discs[0][0].shape[0] + 8, 8, 4), np.uint8)
     padded = [[np.concatenate([np.pad(d, ((4, 4), (0, 0), (0, 0))), gap], axis=1) for d in row] for row in discs]
     return data_uri(np.concatenate([np.concatenate(row, axis=1) for row in padded], axis=0))

@@ -21,6 +21,19 @@ VIEWS = {
     "map_mirrored": "map, where a pixel mirrors it",
     "map_unmirrored": "map, elsewhere",
 }
+CAPTIONS = {
+    "resynthesis": "Over the pixels that count: mask and mesh agree, not clipped. The null paints each material of each photo in its "
+    "own mean colour.",
+    "materials": "Roughness: absolute. Colours: the worst channel's relative error, after the one factor per channel that all linked "
+    "materials share. The null is a grey ball (diffuse 0.5, specular 0.05, roughness 0.5) with its own factor. The mean is over channels.",
+    "relighting": "Balls against balls of the true material in the true light, mean over balls. A factor per channel and picture "
+    "flatters everything, the grey ball too: read a number only against its null.",
+    "unobserved": "The same over the pairs that were never seen together: what the joint solve predicts.",
+    "light": "White spheres lit by the recovered and by the true light. RMSE as a fraction of the truth's root mean square (black "
+    "scores 1). The null is a constant light of the true mean colour. Mirrored: directions that some pixel reflects into the camera.",
+    "normals": "Angle over the observed pixels. The null faces the camera everywhere.",
+    "poses": "A symmetric shape can be far off in rotation and right in every pixel: see the normals. Null: a random rotation, on average.",
+}
 
 
 class Table(msgspec.Struct, frozen=True):
@@ -36,8 +49,15 @@ class Table(msgspec.Struct, frozen=True):
 
 def error_tables(metrics: dict, photos: list[str], materials: list[str]) -> list[Table]:
     """Of what the metrics have, in the set's order of photos and materials; re-synthesis always."""
-    made = [_resynthesis(metrics["resynthesis"], photos), _materials(metrics["materials"], materials), _relighting(metrics["relighting"]),
-            _unobserved(metrics["relighting"]), _light(metrics["light"]), _normals(metrics["normals"], photos), _poses(metrics["poses"], photos)]  # fmt: skip
+    made = [
+        _resynthesis(metrics["resynthesis"], photos),
+        _materials(metrics["materials"], materials),
+        _relighting(metrics["relighting"]),
+        _unobserved(metrics["relighting"]),
+        _light(metrics["light"]),
+        _normals(metrics["normals"], photos),
+        _poses(metrics["poses"], photos),
+    ]
     return [table for table in made if table]
 
 
@@ -63,84 +83,77 @@ def _resynthesis(found: dict, order: list[str]) -> Table | None:
     rows = [(n, {g: s["estimate"] for g, s in by.items()}) for n, by in photos.items()]
     rows.append(("mean", {g: s["estimate"] for g, s in found["mean"].items()}))
     rows.append(("null: flat colours, mean", {g: s["null"] for g, s in found["mean"].items()}))
-    return Table("resynthesis", "Re-synthesis against the photos",
-                 "Over the pixels that count: mask and mesh agree, not clipped. The null paints each material of each photo in its own mean colour.",
-                 PICTURE_HEAD, _by_gauge(rows), [len(rows) - 1])  # fmt: skip
+    return Table("resynthesis", "Re-synthesis against the photos", CAPTIONS["resynthesis"], PICTURE_HEAD, _by_gauge(rows), [len(rows) - 1])
 
 
 def _materials(found: dict | None, order: list[str]) -> Table | None:
     if not found:
         return None
-    rows = []
-    for name, m in _ordered(found["materials"], order):
-        e, z = m["error"], m["null"]
-        rows.append([name, number(m["truth"]["roughness"], 3), number(m["estimate"]["roughness"], 3), number(e["roughness"], 3),
-                     number(z["roughness"], 3), _worst(e["diffuse"]), _worst(z["diffuse"]), _worst(e["specular"]), _worst(z["specular"])])  # fmt: skip
-    rows.append(["mean", "", "", number(found["mean_roughness"], 3), number(found["null_mean_roughness"], 3), percent(found["mean_diffuse"]),
-                 percent(found["null_mean_diffuse"]), percent(found["mean_specular"]), percent(found["null_mean_specular"])])  # fmt: skip
-    head = ["", "true|roughness", "found|roughness", "error|roughness", "null|roughness", "error|diffuse", "null|diffuse", "error|specular", "null|specular"]
-    return Table("materials", "Materials against the truth",
-                 "Roughness: absolute. Colours: the worst channel's relative error, after the one factor per channel that all linked materials "
-                 "share. The null is a grey ball (diffuse 0.5, specular 0.05, roughness 0.5) with its own factor. The mean is over channels.",
-                 head, rows)  # fmt: skip
+    rows = [_material(name, m) for name, m in _ordered(found["materials"], order)]
+    colours = [percent(found[f"{null}mean_{part}"]) for part in ("diffuse", "specular") for null in ("", "null_")]
+    rows.append(["mean", "", "", number(found["mean_roughness"], 3), number(found["null_mean_roughness"], 3), *colours])
+    head = ["", *(f"{what}|roughness" for what in ("true", "found", "error", "null"))]
+    head += [f"{what}|{part}" for part in ("diffuse", "specular") for what in ("error", "null")]
+    return Table("materials", "Materials against the truth", CAPTIONS["materials"], head, rows)
+
+
+def _material(name: str, m: dict) -> list[str]:
+    roughness = [m["truth"]["roughness"], m["estimate"]["roughness"], m["error"]["roughness"], m["null"]["roughness"]]
+    colours = [_worst(m[kind][part]) for part in ("diffuse", "specular") for kind in ("error", "null")]
+    return [name, *(number(r, 3) for r in roughness), *colours]
 
 
 def _worst(errors: list[float]) -> str:
     return percent(max(errors, key=abs))
 
 
-def _kinds(key: str, title: str, caption: str, mean: dict) -> Table:
-    rows = [(title_, {g: mean[g][kind] for g in GAUGES}) for kind, title_ in KINDS.items()]
-    return Table(key, title, caption, PICTURE_HEAD, _by_gauge(rows), [2, 3])
+def _kinds(key: str, title: str, mean: dict) -> Table:
+    rows = [(name, {g: mean[g][kind] for g in GAUGES}) for kind, name in KINDS.items()]
+    return Table(key, title, CAPTIONS[key], PICTURE_HEAD, _by_gauge(rows), [2, 3])
 
 
 def _relighting(found: dict | None) -> Table | None:
-    if not found:
-        return None
-    return _kinds("relighting", "Relighting, all pairs of material and light",
-                  "Balls against balls of the true material in the true light, mean over balls. A factor per channel and picture flatters "
-                  "everything, the grey ball too: read a number only against its null.", found["mean"])  # fmt: skip
+    return _kinds("relighting", "Relighting, all pairs of material and light", found["mean"]) if found else None
 
 
 def _unobserved(found: dict | None) -> Table | None:
     if not found or not found["mean_unobserved"]:
         return None
-    return _kinds("unobserved", "Relighting, only pairs that no photo shows",
-                  "The same over the pairs that were never seen together: what the joint solve predicts.", found["mean_unobserved"])  # fmt: skip
+    return _kinds("unobserved", "Relighting, only pairs that no photo shows", found["mean_unobserved"])
 
 
 def _light(found: dict | None) -> Table | None:
     if not found:
         return None
-    head = ["", *(f"{what}|{title}" for title in GAUGES.values() for what in ("RMSE", "null")), "RMSE|own best factor", "null|own best factor",
-            "angle|RGB", "null|RGB"]  # fmt: skip
-    rows = []
-    for view, title in VIEWS.items():
-        if view in found["mean"]["none"]:
-            scored = {g: found["mean"][g][view] for g in GAUGES}
-            cells = [number(scored[g][k]["rmse"], 3) for g in GAUGES for k in ("estimate", "null")]
-            plain = scored["none"]
-            cells += [number(plain[k]["rmse_scale_invariant"], 3) for k in ("estimate", "null")]
-            rows.append([title, *cells, *(number(plain[k]["rgb_angle_deg"], 1) + "°" for k in ("estimate", "null"))])
-    return Table("light", "Light: three spheres and the map itself",
-                 "White spheres lit by the recovered and by the true light. RMSE as a fraction of the truth's root mean square (black scores 1). "
-                 "The null is a constant light of the true mean colour. Mirrored: directions that some pixel reflects into the camera.",
-                 head, rows)  # fmt: skip
+    head = ["", *(f"{what}|{title}" for title in GAUGES.values() for what in ("RMSE", "null"))]
+    head += ["RMSE|own best factor", "null|own best factor", "angle|RGB", "null|RGB"]
+    rows = [_view(title, {g: found["mean"][g][v] for g in GAUGES}) for v, title in VIEWS.items() if v in found["mean"]["none"]]
+    return Table("light", "Light: three spheres and the map itself", CAPTIONS["light"], head, rows)
+
+
+def _view(title: str, scored: dict) -> list[str]:
+    kinds, plain = ("estimate", "null"), scored["none"]
+    cells = [number(scored[g][k]["rmse"], 3) for g in GAUGES for k in kinds]
+    cells += [number(plain[k]["rmse_scale_invariant"], 3) for k in kinds]
+    return [title, *cells, *(number(plain[k]["rgb_angle_deg"], 1) + "°" for k in kinds)]
 
 
 def _normals(found: dict | None, order: list[str]) -> Table | None:
     if not found:
         return None
-    rows = [[n, *(number(e[k][q], 2) + "°" for q in ("median_deg", "p90_deg") for k in ("estimate", "null"))] for n, e in _ordered(found, order)]
+    rows = [
+        [n, *(number(e[k][q], 2) + "°" for q in ("median_deg", "p90_deg") for k in ("estimate", "null"))] for n, e in _ordered(found, order)
+    ]
     head = ["", "found|median", "null|median", "found|90th percentile", "null|90th percentile"]
-    return Table("normals", "Normals against the truth", "Angle over the observed pixels. The null faces the camera everywhere.", head, rows)
+    return Table("normals", "Normals against the truth", CAPTIONS["normals"], head, rows)
 
 
 def _poses(found: dict | None, order: list[str]) -> Table | None:
     if not found:
         return None
-    rows = [[f"{p} · {o}", number(e["rotation_deg"], 2) + "°", number(e["null_rotation_deg"], 1) + "°", percent(e["translation_relative"], 2)]
-            for p, objects in _ordered(found, order) for o, e in objects.items()]  # fmt: skip
-    return Table("poses", "Poses against the truth",
-                 "A symmetric shape can be far off in rotation and right in every pixel: see the normals. Null: a random rotation, on average.",
-                 ["", "rotation", "null", "translation / distance"], rows)  # fmt: skip
+    every = [(f"{p} · {o}", e) for p, objects in _ordered(found, order) for o, e in objects.items()]
+    rows = [
+        [name, number(e["rotation_deg"], 2) + "°", number(e["null_rotation_deg"], 1) + "°", percent(e["translation_relative"], 2)]
+        for name, e in every
+    ]
+    return Table("poses", "Poses against the truth", CAPTIONS["poses"], ["", "rotation", "null", "translation / distance"], rows)

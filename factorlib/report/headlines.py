@@ -11,6 +11,14 @@ LOW_IOU = 0.85
 MANY_CLIPPED = 0.1
 MANY_UNCOVERED = 0.15
 FEW_PIXELS = 200
+MEANINGS = {
+    "psnr": "How close the recovered materials in the recovered light come to the photos: mean over photos, nothing rescaled, after "
+    "the tone map. Higher is better.",
+    "dssim": "Structural difference, 0 to 1. Lower is better.",
+    "roughness": "Mean absolute difference from the true roughness, which lies in 0 to 1.",
+    "diffuse": "Mean relative error, after the one factor per channel that no photo can settle.",
+    "relighting": "Balls of the recovered materials in the true lights against true balls, one factor for the whole set.",
+}
 
 
 class Headline(msgspec.Struct, frozen=True):
@@ -29,34 +37,31 @@ def headlines(metrics: dict) -> list[Headline]:
 def _resynthesis(found: dict) -> list[Headline]:
     if not found["mean"]:
         return []
-    mean = found["mean"]["none"]
-    flat = f"flat colours score {number(mean['null']['psnr_tonemapped_db'], 1)} dB"
-    meaning = "How close the recovered materials in the recovered light come to the photos, mean over photos, nothing rescaled. Higher is better."
-    similar = f"flat colours score {number(mean['null']['dssim'], 4)}"
+    score, flat = (found["mean"]["none"][kind] for kind in ("estimate", "null"))
+    psnr, dssim = (f"flat colours score {number(flat[k], d)}" for k, d in (("psnr_tonemapped_db", 1), ("dssim", 4)))
     return [
-        Headline("Re-synthesis, PSNR", number(mean["estimate"]["psnr_tonemapped_db"], 1), "dB", flat, meaning),
-        Headline("Re-synthesis, DSSIM", number(mean["estimate"]["dssim"], 4), "", similar, "Structural difference, 0 to 1. Lower is better."),
+        Headline("Re-synthesis, PSNR", number(score["psnr_tonemapped_db"], 1), "dB", psnr + " dB", MEANINGS["psnr"]),
+        Headline("Re-synthesis, DSSIM", number(score["dssim"], 4), "", dssim, MEANINGS["dssim"]),
     ]
 
 
 def _materials(found: dict | None) -> list[Headline]:
     if not found:
         return []
-    beside = f"worst {number(found['worst_roughness'], 3)}; grey ball {number(found['null_mean_roughness'], 3)}"
-    colours = f"specular {percent(found['mean_specular'])}; grey ball {percent(found['null_mean_diffuse'])}"
+    roughness = f"worst {number(found['worst_roughness'], 3)}; grey ball {number(found['null_mean_roughness'], 3)}"
+    diffuse = f"specular {percent(found['mean_specular'])}; grey ball {percent(found['null_mean_diffuse'])}"
     return [
-        Headline("Roughness error", number(found["mean_roughness"], 3), "", beside, "Mean absolute difference from the true roughness, which lies in 0 to 1."),
-        Headline("Diffuse colour error", percent(found["mean_diffuse"]), "", colours, "Mean relative error, after the one factor per channel that no photo can settle."),
-    ]  # fmt: skip
+        Headline("Roughness error", number(found["mean_roughness"], 3), "", roughness, MEANINGS["roughness"]),
+        Headline("Diffuse colour error", percent(found["mean_diffuse"]), "", diffuse, MEANINGS["diffuse"]),
+    ]
 
 
 def _relighting(found: dict | None) -> list[Headline]:
     if not found:
         return []
-    kinds = found["mean"]["scalar_per_set"]
-    beside = f"grey ball {number(kinds['null_grey']['psnr_tonemapped_db'], 1)} dB, mean colour {number(kinds['null_mean_colour']['psnr_tonemapped_db'], 1)} dB"
-    meaning = "Balls of the recovered materials in the true lights against true balls, one factor for the whole set."
-    return [Headline("Relighting, PSNR", number(kinds["in_true_light"]["psnr_tonemapped_db"], 1), "dB", beside, meaning)]
+    score = {kind: number(error["psnr_tonemapped_db"], 1) for kind, error in found["mean"]["scalar_per_set"].items()}
+    beside = f"grey ball {score['null_grey']} dB, mean colour {score['null_mean_colour']} dB"
+    return [Headline("Relighting, PSNR", score["in_true_light"], "dB", beside, MEANINGS["relighting"])]
 
 
 def cautions(run: Artifacts, metrics: dict) -> list[str]:

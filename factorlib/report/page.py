@@ -22,9 +22,18 @@ from factorlib.report.training import training_of
 
 STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
 CONTENTS = {
-    "summary": "Summary", "photos": "Photos", "materials": "Materials", "appearance": "Materials × lights", "reflectance": "Reflectance maps",
-    "lights": "Environment maps", "errors": "Errors", "solve": "Solve", "poses": "Poses", "training": "Networks", "cost": "Cost",
-}  # fmt: skip
+    "summary": "Summary",
+    "photos": "Photos",
+    "materials": "Materials",
+    "appearance": "Materials × lights",
+    "reflectance": "Reflectance maps",
+    "lights": "Environment maps",
+    "errors": "Errors",
+    "solve": "Solve",
+    "poses": "Poses",
+    "training": "Networks",
+    "cost": "Cost",
+}
 
 
 def page(run: Artifacts, rows: list[PhotoRow]) -> str:

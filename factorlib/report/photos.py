@@ -101,9 +101,10 @@ def ringed(display: Float[np.ndarray, "h w 3"], mask: np.ndarray) -> Float[np.nd
 
 def strip(row: PhotoRow) -> bytes:
     """A row's panels side by side on white, as a PNG."""
-    return png_bytes(np.concatenate([_on_white(panel.pixels) for panel in row.panels], axis=1))
+    return png_bytes(np.concatenate([on_white(panel.pixels) for panel in row.panels], axis=1))
 
 
-def _on_white(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+def on_white(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture with or without transparency, laid on white."""
     alpha = pixels[..., 3:].astype(np.float32) / 255 if pixels.shape[2] == 4 else 1.0
     return np.rint(pixels[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)

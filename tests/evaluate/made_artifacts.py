@@ -163,12 +163,14 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     entries = {m: msgspec.to_builtins(perturbed(TRUE[m], made.error)) for m in materials}
     for entry in entries.values():
         entry |= {"alpha": entry["roughness"] ** 2, "stderr": {"diffuse": [0.01] * 3, "specular": [0.005] * 3, "roughness": 0.01}}
-    result = {"materials": entries, "gauge": {"rule": "the lights are white on the whole"}, "model": {"solver": "bundle", "lobes": dict.fromkeys(made.seen, 24)}}
+    model = {"solver": "bundle", "lobes": dict.fromkeys(made.seen, 24)}
+    result = {"materials": entries, "gauge": {"rule": "the lights are white on the whole"}, "model": model}
     for stage in ("solve", "export"):
         write_json(folders[stage] / "materials.json", result)
         write_json(folders[stage] / "exposures.json", {p: [1.0, 1.0, 1.0] for p in made.seen})
     write_json(folders["solve"] / "uncertainty.json", {})
     steps = np.arange(30)
-    history = {"iteration": steps, "round": steps // 10, "loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02, "lobes": 4 * (1 + steps // 10)}
+    history = {"iteration": steps, "round": steps // 10, "lobes": 4 * (1 + steps // 10)}
+    history |= {"loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02}
     pq.write_table(pa.table({**history, "phase": ["joint"] * 30}), folders["solve"] / "convergence.parquet")
     write_json(folders["train"] / "accuracy.json", {"diffuse": {"median": 0.001, "p95": 0.004}, "specular": {"median": 0.01, "p95": 0.04}})
