@@ -10,11 +10,11 @@ from factorlib.report.text import significant
 
 
 class Training(msgspec.Struct, frozen=True):
-    """rows: (what was measured, its numbers by name);  columns: all such names;  curve: an SVG or empty text."""
+    """rows: (what was measured, its numbers by name);  columns: all such names;  curve: an SVG (or empty) and its lines."""
 
     columns: list[str]
     rows: list[tuple[str, dict[str, str]]]
-    curve: str
+    curve: tuple[str, list[str]]
 
 
 def training_of(run: Artifacts) -> Training | None:
@@ -36,7 +36,14 @@ def _leaves(value: dict, path: tuple[str, ...]):
             yield from _leaves(inner, (*path, key))
 
 
-def _curve(table: dict[str, list]) -> str:
-    x = next((table[k] for k in ("step", "iteration", "epoch") if k in table), None)
-    names = [k for k in table if "loss" in k or "error" in k]
-    return "" if x is None else line_plot([Series(n, x, table[n]) for n in names], "training step", "loss", log_y=True)
+def _curve(table: dict[str, list]) -> tuple[str, list[str]]:
+    """Median error of each network, and the 95th percentile, by step; the table has part, step, median and p95."""
+    parts = list(dict.fromkeys(table.get("part", [])))
+    series = [_series(table, part, measure) for part in sorted(parts, reverse=True) for measure in ("median", "p95") if measure in table]
+    return line_plot(series, "training step", "relative error", log_y=True), [s.name for s in series]
+
+
+def _series(table: dict[str, list], part: str, measure: str) -> Series:
+    rows = [k for k, name in enumerate(table["part"]) if name == part]
+    name = f"{part}, {'median' if measure == 'median' else '95th percentile'}"
+    return Series(name, [table["step"][k] for k in rows], [table[measure][k] for k in rows])
