@@ -36,7 +36,7 @@ def mitsuba(variant: str | None = None) -> ModuleType:
     import mitsuba as module
 
     module.set_variant(variant)
-    module.set_log_level(module.LogLevel.Warn)
+    module.set_log_level(module.LogLevel.Error)  # its PLY reader warns of our face labels
     return module
 
 

@@ -1,0 +1,153 @@
+"""Mitsuba scenes of this project: materials, meshes, cameras, environment maps, and the light seen from a point.
+
+Frames   Scenes stand in a world with y up.  A camera is given by world_from_camera, the camera in OpenCV's axes; for
+         the y-up turn of the camera itself that is YUP_FROM_CAMERA, and an `envmap` then needs no turn at all.
+Pixels   a box filter, so that a pixel is the mean over its own square.
+Envmap   Mitsuba puts row i of a map at i/(H−1) of the way down, and column j at (j+½)/W: maps in the layout of
+         `factorlib.conventions` are resampled to a finer lattice of that kind.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.align.camera import Camera
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.generate.mitsuba_variant import mitsuba
+from factorlib.light.latlong import sampled
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import write_ply
+
+ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
+MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
+FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
+
+
+class Material(msgspec.Struct, frozen=True):
+    """Lambert k_d, GGX k_s (linear Rec. 709, k_d + k_s < 1 in the largest channels) and roughness; α = roughness²."""
+
+    diffuse: tuple[float, float, float]
+    specular: tuple[float, float, float]
+    roughness: float
+
+
+def bsdf(material: Material) -> dict[str, Any]:
+    """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
+    diffuse, specular = np.array(material.diffuse), np.array(material.specular)
+    share = specular.max() / (diffuse.max() + specular.max())
+    matte = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
+    if share == 0:
+        return matte
+    gloss = {
+        "type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": material.roughness**2,
+        "specular_reflectance": rgb(specular / share),
+    }  # fmt: skip
+    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": matte, "bsdf_1": gloss}
+
+
+def rgb(value) -> dict[str, Any]:
+    return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(value, 3)]}
+
+
+def transform(matrix: Float[np.ndarray, "4 4"]):
+    return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
+
+
+def rigid(rotation: Float[np.ndarray, "3 3"], translation) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4)):
+    """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.ply"
+        write_ply(path, mesh)
+        return mitsuba().load_dict({"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material})
+
+
+def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int) -> dict[str, Any]:
+    """The pinhole camera; its principal point must be the image's centre."""
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal))),
+        "near_clip": 1e-3,
+        "to_world": transform(world_from_camera @ MITSUBA_FROM_CAMERA),
+        "sampler": {"type": "independent", "sample_count": spp},
+        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+    }
+
+
+def traced(things: dict[str, Any], camera: Camera, world_from_camera, spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
+    """Radiance of a scene; max_depth 2 is direct light alone, −1 all bounces."""
+    mi = mitsuba()
+    integrator = {"type": "path", "max_depth": max_depth}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor(camera, world_from_camera, spp), **things})
+    return np.array(mi.render(scene, seed=seed, spp=spp), dtype=np.float64)
+
+
+def envmap(lat_long: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
+    """An emitter of a lat-long map in the world's frame: bilinear between the map's texel centres."""
+    height, width = lat_long.shape[:2]
+    rows, columns = ENVMAP_FINER * height + 1, ENVMAP_FINER * width
+    theta = np.arange(rows) / (rows - 1) * np.pi
+    phi = (0.5 - (np.arange(columns) + 0.5) / columns) * 2 * np.pi
+    sin = np.sin(theta)[:, None]
+    directions = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
+    bitmap = mitsuba().Bitmap(sampled(lat_long, directions).astype(np.float32))
+    return {"type": "envmap", "bitmap": bitmap}
+
+
+def light_seen(things: dict[str, Any], place, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, max_depth: int = -1):
+    """The radiance that arrives at `place`, [height, 2·height, 3], a lat-long map in the light frame (y-up).
+
+    Six square views of 90° along the light frame's axes, then means over 8 × 8 directions a texel.
+    """
+    size = 2 * height
+    camera = Camera(size, size, size / 2, (size / 2, size / 2))
+    faces = {}
+    for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
+        world_from_camera = rigid(world_from_light @ look(pitch, yaw), place)
+        faces[name] = traced(things, camera, world_from_camera, spp, 6 * seed + number, max_depth)
+    return _texel_means(faces, height)
+
+
+def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
+    """world_from_camera of a level camera that looks along +z (0, 0), turned toward +x by yaw, then upward by pitch."""
+    pitch, yaw = np.radians([pitch_deg, yaw_deg])
+    forward = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)])
+    right = np.array([-np.cos(yaw), 0.0, np.sin(yaw)])
+    return np.stack([right, np.cross(forward, right), forward], axis=-1)
+
+
+def _texel_means(faces: dict[str, np.ndarray], height: int, finer: int = 8) -> Float[np.ndarray, "h w 3"]:
+    directions = lat_long_directions(finer * height, finer * 2 * height)
+    weight = np.broadcast_to(lat_long_solid_angles(finer * height, finer * 2 * height)[:, None, None], (*directions.shape[:2], 1))
+    values = looked_up(faces, directions) * weight
+
+    def cells(array: np.ndarray) -> np.ndarray:
+        return array.reshape(height, finer, 2 * height, finer, -1).sum(axis=(1, 3))
+
+    return cells(values) / cells(weight)
+
+
+def looked_up(faces: dict[str, np.ndarray], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """The pixel of the cube's faces that each direction falls in."""
+    largest = np.abs(directions).argmax(axis=-1)
+    values = np.zeros(directions.shape)
+    for name, (pitch, yaw) in FACE_LOOKS.items():
+        axis, sign = "xyz".index(name[1]), 1 if name[0] == "+" else -1
+        hit = (largest == axis) & (sign * directions[..., axis] > 0)
+        x, y, z = np.moveaxis(directions[hit] @ look(pitch, yaw), -1, 0)
+        size = len(faces[name])
+        column, row = ((np.stack([x, y]) / z + 1) / 2 * size).astype(int).clip(0, size - 1)
+        values[hit] = faces[name][row, column]
+    return values

@@ -1,0 +1,94 @@
+"""Mitsuba's scenes agree with the project's frames and reflectance model."""
+
+import numpy as np
+import pytest
+
+from factorlib.align.camera import Camera
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.generate import tracing
+from factorlib.generate.shapes import sphere
+from factorlib.light.latlong import sampled
+
+pytest.importorskip("mitsuba")
+GREEN = tracing.Material((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)
+MATTE = tracing.Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6)
+PIXEL = Camera(1, 1, 400.0, (0.5, 0.5))
+BALL = np.array([0.6, -0.3, 4.0])  # centre, camera frame; radius 1
+CAMERA = Camera(24, 16, 30.0, (12.0, 8.0))
+AT_ORIGIN = tracing.rigid(YUP_FROM_CAMERA, np.zeros(3))
+
+
+@pytest.mark.parametrize("texel", [(7, 16), (3, 9), (12, 20), (5, 25)])
+def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
+    light = np.zeros((16, 32, 3))
+    light[texel] = 100.0
+    toward = lat_long_directions(16, 32)[texel] @ YUP_FROM_CAMERA  # camera frame
+    ball = tracing.shape(sphere(1.0), {"type": "diffuse", "reflectance": tracing.rgb(0.8)}, tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0]))
+    image = tracing.traced({"ball": ball, "light": tracing.envmap(light)}, CAMERA, AT_ORIGIN, 64, 1, 2)[..., 0]
+    normal = ball_normal(CAMERA, 4.0)
+    inside = np.nan_to_num(np.sum(normal * -CAMERA.rays(), axis=-1)) > 0.5
+    cosine = np.nan_to_num(normal @ toward)
+    irradiance = np.sum(sampled(light, lat_long_directions(128, 256))[..., 0] * lat_long_solid_angles(128, 256)[:, None])
+    expected = 0.8 / np.pi * irradiance * cosine
+    lit, unlit = inside & (cosine > 0.25), inside & (cosine < -0.2)
+    assert lit.sum() > 8
+    assert image[lit] == pytest.approx(expected[lit], rel=0.15)
+    assert image[lit].sum() == pytest.approx(expected[lit].sum(), rel=0.02)
+    assert (image[unlit] < 0.01 * expected.max()).all()
+
+
+@pytest.mark.parametrize("material", [GREEN, MATTE])
+def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
+    """One pixel's worth: a ball's radiance in a smooth light against a sum over directions of the written formula."""
+    light = smooth_light(32)
+    image = pixel_of_ball(material, light)
+    depth = 4.0 - np.sqrt(1 - 0.6**2 - 0.3**2)  # of the ball where the camera's axis meets it
+    normal, view = np.array([0, 0, depth]) - BALL, np.array([0, 0, -1.0])
+    incoming = lat_long_directions(512, 1024) @ YUP_FROM_CAMERA
+    radiance = sampled(light, incoming @ YUP_FROM_CAMERA)
+    weight = lat_long_solid_angles(512, 1024)[:, None, None] * np.maximum(incoming @ normal, 0)[..., None]
+    expected = np.sum(radiance * weight * reflectance(material, normal, incoming, view), axis=(0, 1))
+    assert image == pytest.approx(expected, rel=0.006)
+
+
+def reflectance(material, normal, incoming, view):
+    """k_d/π + k_s D G / (4 (n·i)(n·o)), written out."""
+    alpha = material.roughness**2
+    half = incoming + view
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    ni, no, nh = np.maximum(incoming @ normal, 1e-9), view @ normal, half @ normal
+    d = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+    g = smith(alpha, ni) * smith(alpha, no)
+    return np.array(material.diffuse) / np.pi + np.array(material.specular) * (d * g / (4 * ni * no))[..., None]
+
+
+def smith(alpha, c):
+    return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2))
+
+
+def pixel_of_ball(material, light):
+    pose = tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ BALL)
+    ball = {"type": "sphere", "to_world": tracing.transform(pose), "bsdf": tracing.bsdf(material)}
+    return tracing.traced({"ball": ball, "light": tracing.envmap(light)}, PIXEL, AT_ORIGIN, 200_000, 2, 2)[0, 0]
+
+
+def smooth_light(height):
+    x, y, z = np.moveaxis(lat_long_directions(height, 2 * height), -1, 0)
+    return 1 + np.stack([x * y, np.exp(4 * (0.6 * x + 0.8 * z - 1)) * 3, y * z * z], axis=-1)
+
+
+def test_the_light_seen_is_the_light_there():
+    """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
+    light = smooth_light(16)
+    turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
+    seen = tracing.light_seen({"light": tracing.envmap(light)}, (0, 0, 0), turn, 16, 4, 1)
+    assert seen == pytest.approx(sampled(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)
+
+
+def ball_normal(camera: Camera, distance: float) -> np.ndarray:
+    """Normals of a unit ball at (0, 0, distance) under the pixel centres, NaN beside it."""
+    ray = camera.rays()
+    a, b, c = (ray**2).sum(-1), ray[..., 2] * distance, distance**2 - 1
+    with np.errstate(invalid="ignore"):
+        depth = (b - np.sqrt(b**2 - a * c)) / a
+    return ray * depth[..., None] - [0, 0, distance]
