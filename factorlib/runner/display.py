@@ -1,0 +1,82 @@
+"""What a user sees of a run: bars on a terminal, plain lines elsewhere; a long step always shows life."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from factorlib.runner.plan import Planned, Step
+
+BEAT = 5.0  # seconds between two plain lines about the same step
+
+
+def display_for(stream=None) -> Display:
+    stream = stream or sys.stderr
+    if stream.isatty():
+        from factorlib.runner.bars import Bars
+
+        return Bars()
+    return Display(stream)
+
+
+class Display:
+    """Plain lines: what starts, what it warns of, how long it took."""
+
+    def __init__(self, stream=None):
+        self.stream = stream or sys.stderr
+        self.totals: dict[str, int] = {}
+        self.left: dict[str, int] = {}
+        self._warned: set[str] = set()
+        self._waited: set[Step] = set()
+        self._spoke: dict[Step, float] = {}
+        self._started: dict[Step, float] = {}
+        self._words: dict[Step, str] = {}
+
+    def plan(self, planned: list[Planned]) -> None:
+        """The state of the plan as it is now."""
+        self.totals, self.left = {}, {}
+        for p in planned:
+            self.totals[p.step.stage] = self.totals.get(p.step.stage, 0) + 1
+            self.left[p.step.stage] = self.left.get(p.step.stage, 0) + (p.status != "current")
+
+    def say(self, text: str) -> None:
+        print(text, file=self.stream, flush=True)
+
+    def start(self, step: Step) -> None:
+        self._started[step] = self._spoke[step] = time.monotonic()
+        if step.photo is None:
+            self.say(f"{step.stage:<10} …")
+
+    def waits(self, step: Step) -> None:
+        if step not in self._waited:
+            self._waited.add(step)
+            self.say(f"{step}: waiting: another run is making it")
+
+    def progress(self, step: Step, done: float, total: float, text: str) -> None:
+        share = f"{done / total:4.0%}" if total else ""
+        self._words[step] = f"{share} {text}".strip()
+
+    def tick(self) -> None:
+        now = time.monotonic()
+        for step, spoke in self._spoke.items():
+            if now - spoke >= BEAT:
+                self._spoke[step] = now
+                self.say(f"{step.stage:<10} {step.photo or '':<16} {now - self._started[step]:6.0f} s  {self._words.get(step, '')}".rstrip())
+
+    def warn(self, step: Step, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self.say(f"warning: {step}: {text}")
+
+    def finish(self, step: Step, seconds: float) -> None:
+        self._spoke.pop(step, None)
+        self.say(f"{step.stage:<10} {step.photo or '':<16} {seconds:6.1f} s")
+
+    def fail(self, step: Step, error: str, traceback: str | None) -> None:
+        self._spoke.pop(step, None)
+        self.say(f"error: {step}: {error}")
+        if traceback:
+            self.say(f"  this is a defect of the program, not of your input; details: {traceback}")
+
+    def close(self) -> None:
+        """Nothing more will be shown."""

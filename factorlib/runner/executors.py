@@ -1,0 +1,94 @@
+"""Where steps run: `concurrent.futures` executors, one for each number of threads, all within the machine's cores.
+
+The number of threads of a step is part of its spec, for numerics depend on it; how many steps run at once is the
+machine's affair.  Any executor with `submit` will do in place of a process pool.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
+
+
+class Pools:
+    """Process pools by number of threads; `free` says whether a step of so many threads may start now."""
+
+    def __init__(self, cores: int | None = None):
+        self.cores = cores or _cores()
+        self._pools: dict[int, Executor] = {}
+        self._busy: dict[Future, int] = {}
+
+    def free(self, threads: int) -> bool:
+        busy = sum(self._busy.values())
+        return busy == 0 or busy + threads <= self.cores
+
+    def submit(self, threads: int, function: Callable, *arguments) -> Future:
+        future = self._submit(threads, function, *arguments)
+        self._busy[future] = threads
+        return future
+
+    def done(self, future: Future) -> None:
+        self._busy.pop(future, None)
+
+    def _submit(self, threads: int, function: Callable, *arguments) -> Future:
+        if threads not in self._pools:
+            self._pools[threads] = _pool(max(1, self.cores // threads), threads)
+        try:
+            with _Environment(threads):
+                return self._pools[threads].submit(function, *arguments)
+        except BrokenProcessPool:  # a worker was killed earlier: its step has failed, the others get a new pool
+            self._pools.pop(threads).shutdown(wait=False)
+            return self._submit(threads, function, *arguments)
+
+    def close(self, kill: bool = False) -> None:
+        for pool in self._pools.values():
+            pool.shutdown(wait=False, cancel_futures=True)
+        if kill:
+            for process in multiprocessing.active_children():
+                process.kill()
+        for pool in self._pools.values():
+            pool.shutdown(wait=True)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid()))
+
+
+class _Environment:
+    """What a worker must find in its environment when its interpreter starts."""
+
+    def __init__(self, threads: int):
+        self.wanted = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONHASHSEED": "0"}
+
+    def __enter__(self) -> None:
+        self.before = {name: os.environ.get(name) for name in self.wanted}
+        os.environ.update(self.wanted)
+
+    def __exit__(self, *exception) -> None:
+        for name, value in self.before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _start(threads: int, parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    limit_threads(threads)
+    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    """Nobody waits for a worker whose parent was killed."""
+    while os.getppid() == parent:
+        time.sleep(0.3)
+    os._exit(1)

@@ -1,0 +1,72 @@
+"""Content hashes of files, remembered by what `stat` says of them, so that a run with nothing to do reads nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+if TYPE_CHECKING:
+    from factorlib.runner.closure import Source
+
+Signature = tuple[int, int, int, int]
+FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
+
+
+def signature(path: Path) -> Signature:
+    """What changes when the content does: size, times of content and of inode, inode."""
+    stat = os.stat(path)
+    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
+
+
+def hash_of_file(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
+
+
+class FileHashes:
+    """A cache beside the store; `save` writes it, in whole or not at all."""
+
+    def __init__(self, cache: Path | None):
+        self.cache = cache
+        self._contents, self._sources = self._read()
+        self._changed = False
+
+    def content(self, path: Path) -> str:
+        return self._remembered(self._contents, path, lambda: hash_of_file(path), str)
+
+    def source(self, path: Path, parse: Callable[[], Source]) -> Source:
+        from factorlib.runner.closure import Source
+
+        return self._remembered(self._sources, path, parse, Source)
+
+    def _remembered(self, table: dict, path: Path, make: Callable, type_: type):
+        now = signature(path)
+        entry = table.get(str(path))
+        if entry and tuple(entry[0]) == now:
+            return entry[1] if isinstance(entry[1], type_) else msgspec.convert(entry[1], type_)
+        value = make()
+        if signature(path) == now and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
+            table[str(path)], self._changed = (now, value), True
+        return value
+
+    def _read(self) -> tuple[dict, dict]:
+        try:
+            tables = msgspec.json.decode(self.cache.read_bytes())
+            return tables["contents"], tables["sources"]
+        except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError):
+            return {}, {}
+
+    def save(self) -> None:
+        if not self._changed or self.cache is None:
+            return
+        self.cache.parent.mkdir(parents=True, exist_ok=True)
+        draft = self.cache.with_name(f"{self.cache.name}.{os.getpid()}")
+        draft.write_bytes(msgspec.json.encode({"contents": self._contents, "sources": self._sources}))
+        os.replace(draft, self.cache)
+        self._changed = False

@@ -1,0 +1,53 @@
+"""After a run, or where there was nothing to run: build/<dataset>/<stage> names the current result of each stage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from factorlib.runner.plan import Planned
+from factorlib.runner.project import claim
+from factorlib.runner.store import point, view_of
+from factorlib.runner.survey import Survey
+
+
+def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
+    """Write down which key each step has now; steps of photos and stages that are no more are dropped."""
+    planned = survey.planned(frozenset()) if more is None else []
+    pipeline, spec = survey.spec.pipeline, survey.spec
+    there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
+    before = survey.home.keys()
+    keys = {step: key for step, key in before.items() if step in there} | (more or {})
+    keys |= {str(p.step): p.key for p in planned if p.status == "current"}
+    if keys != before:
+        claim(survey.project, survey.home, survey.data.folder)
+        survey.home.write_keys(keys)
+    if more is None:
+        show(survey, planned)
+
+
+def show(survey: Survey, planned: list[Planned]) -> None:
+    """Point the links at the current results; of a stage over photos, at one folder with all of them."""
+    for stage in dict.fromkeys(p.step.stage for p in planned):
+        current = {p.step.photo: p.output for p in planned if p.step.stage == stage and p.status == "current"}
+        if current:
+            point(survey.home.folder / stage, folder_of(survey, stage, current))
+    for link in survey.home.folder.glob("*"):
+        if link.is_symlink() and link.name not in survey.spec.pipeline.stages:
+            link.unlink()
+
+
+def folder_of(survey: Survey, stage: str, outputs: dict[str | None, str]) -> Path:
+    spec = survey.spec.pipeline.stages[stage]
+    return view_of(survey.store, outputs, spec.gather) if spec.over else survey.store.tree(outputs[None])
+
+
+def results(survey: Survey) -> list[tuple[str, Path]]:
+    """What a user looks at first, as far as it is there."""
+    folder = survey.home.folder
+    found = [
+        ("report", folder / "report" / "index.html"),
+        ("materials", folder / "export" / "materials.json"),
+        ("environment maps", folder / "export" / "illumination"),
+        ("re-syntheses", folder / "render" / "resynthesis"),
+    ]
+    return [(label, path) for label, path in found if path.exists()]

@@ -1,0 +1,118 @@
+"""pipeline.yaml as types: the stages, what each takes, and the parameters that differ from their defaults."""
+
+from __future__ import annotations
+
+import shlex
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.yamlfile import parse_yaml, read_yaml
+
+FORMAT = 1
+DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
+
+
+class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One stage.
+
+    inputs:  names of stages, or `dataset.<slice>`
+    over:    `photo` for a step per photo; otherwise one step for the whole set
+    gather:  in a stage over photos, the file that every `<photo>.json` is gathered into
+    makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
+    threads: threads of its numerics, part of what is computed (a sum depends on them), never the machine's
+    logs:    hand it the log of the steps above it (not part of its key)
+    """
+
+    inputs: list[str] = []
+    over: Literal["photo"] | None = None
+    gather: str | None = None
+    makes: list[str] = []
+    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
+    logs: bool = False
+    params: dict[str, Any] = {}
+
+    @property
+    def slices(self) -> list[str]:
+        return [name.removeprefix(DATASET) for name in self.inputs if name.startswith(DATASET)]
+
+    @property
+    def upstream(self) -> list[str]:
+        return [name for name in self.inputs if not name.startswith(DATASET)]
+
+
+class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """pipeline.yaml."""
+
+    format: int
+    stages: dict[str, Stage]
+
+    def order(self) -> list[str]:
+        """Stages, each after what it takes; otherwise as they stand in the file."""
+        return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
+
+    def needed(self, targets: list[str] | None) -> list[str]:
+        """The targets and everything above them, in order; all stages for None."""
+        wanted = set(self.stages if targets is None else targets)
+        order = self.order()
+        for name in reversed(order):
+            if name in wanted:
+                wanted.update(self.stages[name].upstream)
+        return [name for name in order if name in wanted]
+
+
+def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
+    pipeline = read_yaml(path, Pipeline)
+    if pipeline.format != FORMAT:
+        raise InputError(f"format {pipeline.format} is not known", file=path, key="format", cure=f"this version reads format: {FORMAT}")
+    for name, stage in pipeline.stages.items():
+        _check_stage(name, stage, pipeline, known_slices, path)
+    try:
+        pipeline.order()
+    except CycleError as error:
+        circle = " <- ".join(error.args[1])
+        raise InputError(f"stages that need each other: {circle}", file=path, key="stages", cure="make the second pass a stage of its own") from None
+    return pipeline
+
+
+def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
+    for entry in stage.inputs:
+        known = [DATASET + s for s in known_slices] + list(pipeline.stages)
+        if entry not in known:
+            raise InputError(f"there is no {entry!r}", file=path, key=f"stages.{name}.inputs", cure=did_you_mean(entry, known))
+    if stage.gather and not stage.over:
+        raise InputError("only what is made per photo can be gathered", file=path, key=f"stages.{name}.gather", cure="add over: photo")
+
+
+def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
+    """The pipeline with `stage.parameter=value` words in place of its own; several words in one string are split.
+
+    >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
+    {'lobes': 64, 'tolerance': 0.001}
+    """
+    stages = dict(pipeline.stages)
+    for word in (word for text in settings for word in shlex.split(text)):
+        stage, keys, value = _setting(word, stages)
+        stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
+    return msgspec.structs.replace(pipeline, stages=stages)
+
+
+def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
+    target, equals, value = word.partition("=")
+    stage, *keys = target.split(".")
+    if not equals or not keys or not all(keys):
+        raise InputError(f"{word!r} is no setting", key="SET", cure='write stage.parameter=value, as in SET="solve.lobes=64"')
+    if stage not in stages:
+        raise InputError(f"there is no stage {stage!r}", key=f"SET {word}", cure=did_you_mean(stage, stages))
+    return stage, keys, parse_yaml(value, f"SET {word}")
+
+
+def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
+    first, *rest = keys
+    if rest:
+        inner = params.get(first, {})
+        value = _set(inner if isinstance(inner, dict) else {}, rest, value)
+    return {**params, first: value}

@@ -1,0 +1,171 @@
+"""What must run, and why: a pure function of what is declared, what it all hashes to, and what the store holds.
+
+A step's record is a flat table of everything its result depends on: its name, the source of every module it imports,
+its parameters, its inputs' content hashes, versions.  No path outside the dataset and no time is in it.  Its key is
+the hash of that table, the difference of two tables is the reason for a rerun, and a step whose inputs are not made yet
+is a *maybe*: it reruns only if they come out different.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import msgspec
+
+from factorlib.runner.pipeline import Pipeline
+
+Record = dict[str, Any]
+Status = Literal["current", "to run", "maybe"]
+
+
+class Step(msgspec.Struct, frozen=True, order=True):
+    """One piece of work: a stage, of one photo or of the whole set."""
+
+    stage: str
+    photo: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.stage}/{self.photo}" if self.photo else self.stage
+
+
+class Spec(msgspec.Struct, frozen=True):
+    """The stages that are wanted, over which photos, and the steps that are to run whatever the store holds."""
+
+    pipeline: Pipeline
+    photos: list[str]
+    targets: list[str] | None = None
+    forced: frozenset[Step] = frozenset()
+
+    def steps(self) -> list[Step]:
+        return [step for name in self.pipeline.needed(self.targets) for step in self.steps_of(name)]
+
+    def steps_of(self, stage: str) -> list[Step]:
+        return [Step(stage, photo) for photo in self.photos] if self.pipeline.stages[stage].over else [Step(stage)]
+
+    def above(self, step: Step) -> list[Step]:
+        """The steps whose results a step is handed."""
+        per_photo = [name for name in self.pipeline.stages[step.stage].upstream]
+        return [found for name in per_photo for found in self.steps_of(name) if step.photo is None or found.photo in (None, step.photo)]
+
+
+class Listing(msgspec.Struct, frozen=True):
+    """What the store holds: output hash by key; and the record each step had when it last was current here."""
+
+    outputs: Mapping[str, str]
+    previous: Mapping[str, Record]
+
+
+class Planned(msgspec.Struct, frozen=True):
+    """A step, what is to be done about it, why; its key and record where all its inputs are known, its output where made."""
+
+    step: Step
+    status: Status
+    reasons: list[str]
+    record: Record | None = None
+    key: str | None = None
+    output: str | None = None
+
+
+def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Planned]:
+    """Every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
+    planned: dict[Step, Planned] = {}
+    for step in spec.steps():
+        planned[step] = _planned(step, spec, hashes[step], listing, planned)
+    return list(planned.values())
+
+
+def _planned(step: Step, spec: Spec, own: Record, listing: Listing, planned: Mapping[Step, Planned]) -> Planned:
+    above = [planned[found] for found in spec.above(step)]
+    open_ = [found for found in above if found.output is None]
+    before = listing.previous.get(str(step))
+    if open_:
+        return _planned_below(step, own, above, open_, before, step in spec.forced)
+    record = {**own, **inputs_of(spec, step, {found.step: found.output for found in above})}
+    key = key_of(record)
+    output = listing.outputs.get(key)
+    if step in spec.forced:
+        return Planned(step, "to run", ["forced"], record, key)
+    if output is not None:
+        return Planned(step, "current", [], record, key, output)
+    reasons = difference(before, record) if before is not None else ["not made yet"]
+    return Planned(step, "to run", reasons or ["its result is gone"], record, key)
+
+
+def _planned_below(step: Step, own: Record, above: list[Planned], open_: list[Planned], before: Record | None, forced: bool) -> Planned:
+    """A step under others that are still to run."""
+    if forced:
+        return Planned(step, "to run", ["forced"])
+    if before is None:
+        return Planned(step, "to run", ["not made yet"])
+    known = {**own, **{f"input:{found.step}": found.output for found in above if found.output is not None}}
+    waiting = {f"input:{found.step}" for found in open_}
+    changes = difference({k: v for k, v in before.items() if k not in waiting}, {**_gathered_of(before), **known})
+    if changes:
+        return Planned(step, "to run", changes)
+    return Planned(step, "maybe", [f"if {names(found.step for found in open_)} comes out different"])
+
+
+def _gathered_of(record: Record) -> Record:
+    return {k: v for k, v in record.items() if k.startswith("gathered:")}
+
+
+def inputs_of(spec: Spec, step: Step, outputs: Mapping[Step, str]) -> Record:
+    """The part of a step's record that is the results it is handed."""
+    gathers = {name: spec.pipeline.stages[name].gather for name in spec.pipeline.stages[step.stage].upstream if step.photo is None}
+    gathered = {f"gathered:{name}": file for name, file in gathers.items() if file}
+    return {f"input:{above}": outputs[above] for above in spec.above(step)} | gathered
+
+
+def key_of(record: Record) -> str:
+    """The same table is the same key, on any machine."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:32]
+
+
+_KIND = {
+    "source": "source of {}",
+    "param": "parameter {}",
+    "facts": "{} in the dataset's files",
+    "file": "file {}",
+    "input": "result of {}",
+    "gathered": "gathered file of {}",
+    "data": "package data {}",
+    "package": "package {}",
+}
+
+
+def difference(before: Record, after: Record) -> list[str]:
+    """What changed between two records, in words, one line per cause."""
+    lines = []
+    for name in sorted(before.keys() | after.keys()):
+        if before.get(name, _ABSENT) != after.get(name, _ABSENT):
+            lines.append(_change(name, before.get(name, _ABSENT), after.get(name, _ABSENT)))
+    return lines
+
+
+_ABSENT = object()
+
+
+def _change(name: str, before: Any, after: Any) -> str:
+    kind, colon, what = name.partition(":")
+    label = _KIND.get(kind, "{}").format(what) if colon else name
+    if kind in ("source", "facts", "file", "input", "data"):
+        return f"{label}: " + ("new" if before is _ABSENT else "gone" if after is _ABSENT else "changed")
+    shown = ["default" if v is _ABSENT and kind == "param" else "none" if v is _ABSENT else json.dumps(v) for v in (before, after)]
+    return f"{label}: {shown[0]} -> {shown[1]}"
+
+
+def names(steps: Iterable[Step]) -> str:
+    """Steps by the name of their stage, with the number of photos.
+
+    >>> names([Step("masks", "a"), Step("masks", "b"), Step("train")])
+    'masks (2 photos), train'
+    """
+    counts: dict[str, list[Step]] = {}
+    for step in steps:
+        counts.setdefault(step.stage, []).append(step)
+    return ", ".join(
+        str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} photos)" for stage, found in counts.items()
+    )

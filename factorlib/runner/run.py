@@ -1,0 +1,271 @@
+"""Running a plan: start what is ready, take in what is done, plan again, until nothing is left that can run.
+
+After each result the same pure `plan` is asked anew, so an output that came out unchanged stops what follows there, and
+what another run made meanwhile is used.  A step that fails holds up only what depends on it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from factorlib.runner.display import Display
+from factorlib.runner.executors import Pools
+from factorlib.runner.finish import remember
+from factorlib.runner.pipeline import DATASET
+from factorlib.runner.plan import Planned, Step
+from factorlib.runner.project import claim
+from factorlib.runner.store import view_of
+from factorlib.runner.survey import Survey
+from factorlib.runner.tenancy import tenant
+from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
+
+POLL = 0.1  # seconds between two looks at what the workers say
+
+
+@dataclass
+class Running:
+    """A step in a worker, the lock held for it, and how much of its events has been read."""
+
+    planned: Planned
+    task: Task
+    lock: FileLock
+    future: Future | None = None
+    read: int = 0
+
+
+@dataclass
+class Tally:
+    """What a run came to."""
+
+    ran: list[Step] = field(default_factory=list)
+    failed: dict[Step, Outcome] = field(default_factory=dict)
+    held_up: list[Step] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def run(survey: Survey, display: Display, pools: Pools | None = None) -> Tally:
+    """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
+    pools, started = pools or Pools(), time.perf_counter()
+    claim(survey.project, survey.home, survey.data.folder)
+    with tenant(survey.store, display.say) as folder:
+        work = Run(survey, display, pools, folder)
+        try:
+            work.check()
+            work.go()
+        except BaseException:
+            pools.close(kill=True)
+            raise
+        finally:
+            work.release()
+            remember(survey)
+        pools.close()
+    work.tally.seconds = time.perf_counter() - started
+    return work.tally
+
+
+class Run:
+    """The state of one run."""
+
+    def __init__(self, survey: Survey, display: Display, pools: Pools, folder: Path):
+        self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
+        self.running: dict[Step, Running] = {}
+        self.waiting: set[Step] = set()
+        self.tally = Tally()
+        self.planned: list[Planned] = []
+
+    def go(self) -> None:
+        self._plan()
+        while True:
+            self._start_ready()
+            if not self.running and not self.waiting:
+                break
+            self._wait()
+        self.tally.held_up = [p.step for p in self.planned if p.status != "current" and p.step not in self.tally.failed]
+
+    def check(self) -> None:
+        """Refuse bad parameters before anything has run."""
+        self._plan()
+        stages = dict.fromkeys(p.step.stage for p in self.planned if p.status != "current")
+        checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].params]
+        futures = [self.pools.submit(code.threads, check_params, code) for code in checks]
+        outcomes = [future.result() for future in futures]
+        for future in futures:
+            self.pools.done(future)
+        for code, outcome in zip(checks, outcomes, strict=True):
+            if outcome.error:
+                self._fail(Step(code.stage), outcome)
+        if self.tally.failed:
+            raise Refused(self.tally.failed)
+
+    def release(self) -> None:
+        for work in self.running.values():
+            work.lock.release()
+
+    # ── starting ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def _plan(self) -> None:
+        self.planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        self.display.plan(self.planned)
+
+    def _start_ready(self) -> None:
+        self.waiting = set()
+        for planned in list(self.planned):
+            step = planned.step
+            if planned.status != "to run" or planned.key is None or step in self.running or step in self.tally.failed:
+                continue
+            if self.pools.free(self.survey.spec.pipeline.stages[step.stage].threads):
+                self._start(planned)
+
+    def _start(self, planned: Planned) -> None:
+        lock = FileLock(self.survey.store.locks / f"{planned.key}.lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            self.waiting.add(planned.step)
+            self.display.waits(planned.step)
+            return
+        self.survey.outputs.forget(planned.key)
+        if self.survey.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
+            lock.release()  # another run has made it meanwhile
+            self.waiting.add(planned.step)
+            self._plan()
+            return
+        work = Running(planned, self._task(planned), lock)
+        self.running[planned.step] = work
+        self.display.start(planned.step)
+        work.future = self.pools.submit(work.task.code.threads, run_step, work.task)
+
+    def _code(self, stage: str) -> Code:
+        project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
+        return Code(project.root, project.package, stage, spec.params, project.pipeline_file, spec.threads)
+
+    def _task(self, planned: Planned) -> Task:
+        step, data, project = planned.step, self.survey.data, self.survey.project
+        stage = self.survey.spec.pipeline.stages[step.stage]
+        slices = {name: data.slice(name, step.photo) for name in stage.slices}
+        files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}
+        label = str(step).replace("/", "-")
+        return Task(
+            code=self._code(step.stage),
+            photo=step.photo,
+            makes=stage.makes,
+            gather=stage.gather,
+            folders={name: self._folder(step, name) for name in stage.upstream},
+            facts={DATASET + name: slice_.facts for name, slice_ in slices.items()},
+            files=files,
+            hashes={file: planned.record[f"file:{file}"] for file in files},
+            log=self._log_above(step, self.folder / f"{label}.log.jsonl") if stage.logs else None,
+            store=self.survey.store.root,
+            key=planned.key,
+            record=planned.record,
+            temporary=self.folder / label,
+            events=self.folder / f"{label}.events.jsonl",
+        )
+
+    def _folder(self, step: Step, name: str) -> Path:
+        """Where the files of the stage `name` are for this step."""
+        outputs = {planned.step: planned.output for planned in self.planned}
+        stage, store = self.survey.spec.pipeline.stages[name], self.survey.store
+        if not stage.over:
+            return store.tree(outputs[Step(name)])
+        if step.photo is not None:
+            return store.tree(outputs[Step(name, step.photo)])
+        return view_of(store, {found.photo: outputs[found] for found in self.survey.spec.steps_of(name)}, stage.gather)
+
+    def _log_above(self, step: Step, path: Path) -> Path:
+        """What the steps above cost and said when their present results were made, whichever run made them."""
+        above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
+        logs = [self.survey.store.log(p.key) for p in self.planned if p.step.stage in above and p.key]
+        path.write_text("".join(log.read_text(encoding="utf-8") for log in logs if log.exists()), encoding="utf-8")
+        return path
+
+    # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+    def _wait(self) -> None:
+        futures = {work.future: step for step, work in self.running.items()}
+        if futures:
+            done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
+        else:
+            time.sleep(POLL)
+            done = set()
+        for work in self.running.values():
+            self._listen(work)
+        for future in done:
+            self._take(self.running.pop(futures[future]))
+        if done or self.waiting:
+            for planned in self.planned:
+                if planned.step in self.waiting:
+                    self.survey.outputs.forget(planned.key)
+            self._plan()
+        self.display.tick()
+
+    def _listen(self, work: Running) -> None:
+        """Pass on what a worker has said since the last look."""
+        try:
+            with open(work.task.events, "rb") as stream:
+                stream.seek(work.read)
+                text = stream.read()
+        except OSError:
+            return
+        whole = text[: text.rfind(b"\n") + 1]
+        work.read += len(whole)
+        for line in whole.splitlines():
+            event = json.loads(line)
+            if "warning" in event:
+                self.display.warn(work.planned.step, event["warning"])
+            else:
+                self.display.progress(work.planned.step, event["done"], event["total"], event["text"])
+
+    def _take(self, work: Running) -> None:
+        outcome = _outcome_of(work.future)
+        self.pools.done(work.future)
+        work.lock.release()
+        step = work.planned.step
+        if outcome.error is not None:
+            self._fail(step, outcome)
+            return
+        before = self.survey.outputs.get(work.task.key)
+        if before is not None and before != outcome.output:
+            self.display.warn(step, "made again from the same inputs, it came out different")
+        self.survey.outputs.forget(work.task.key)
+        self.survey.previous[str(step)] = work.task.record
+        self.tally.ran.append(step)
+        self._log(self.survey.store.log(work.task.key).read_text(encoding="utf-8"))
+        remember(self.survey, {str(step): work.task.key})
+        self.display.finish(step, outcome.seconds)
+
+    def _fail(self, step: Step, outcome: Outcome) -> None:
+        self.tally.failed[step] = outcome
+        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
+        where = None
+        if outcome.traceback:
+            path = self.survey.home.folder / "errors" / f"{str(step).replace('/', '-')}.txt"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(outcome.traceback, encoding="utf-8")
+            where = self.survey.project.shown(path)
+        self.display.fail(step, outcome.error, where)
+
+    def _log(self, lines: str) -> None:
+        self.survey.home.folder.mkdir(parents=True, exist_ok=True)
+        with open(self.survey.home.log, "a", encoding="utf-8") as stream:
+            stream.write(lines)
+
+
+class Refused(Exception):
+    """Parameters that no stage takes; each has been shown."""
+
+
+def _outcome_of(future: Future) -> Outcome:
+    try:
+        return future.result()
+    except (BrokenProcessPool, CancelledError):
+        return Outcome(error="its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume")
+    except Exception as error:
+        return Outcome(error=f"{type(error).__name__}: {error}", traceback=repr(error))

@@ -1,0 +1,114 @@
+"""What a plan is made from: each step's own record, from the sources, the dataset and the installed packages."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.closure import Closure, Sources
+from factorlib.runner.filehash import FileHashes
+from factorlib.runner.packages import Packages
+from factorlib.runner.pipeline import DATASET, Pipeline, read_pipeline, with_settings
+from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
+from factorlib.runner.project import Data, Home, Project, home_of
+from factorlib.runner.store import Outputs, Store
+
+
+@dataclass
+class Survey:
+    """All that is known before anything runs; `planned` is what every verb shows.
+
+    records:  each step's record but for the results it is handed
+    previous: the record each step had when it last was current for this dataset
+    """
+
+    project: Project
+    data: Data
+    home: Home
+    store: Store
+    spec: Spec
+    records: dict[Step, Record]
+    outputs: Outputs
+    previous: dict[str, Record]
+
+    def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
+        spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
+        return plan(spec, self.records, Listing(self.outputs, self.previous))
+
+
+def survey(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False) -> Survey:
+    """Read everything a plan needs; every InputError there is about pipeline, settings or dataset comes from here."""
+    pipeline = with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings)
+    for name in targets or []:
+        if name not in pipeline.stages:
+            raise InputError(f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages))
+    folder = project.dataset_folder(dataset)
+    data = project.provider.read(folder)
+    home, store = home_of(project, data.folder), Store(project.build / "store")
+    spec = Spec(pipeline, data.photos, targets)
+    if force:
+        forced = pipeline.stages if targets is None else targets
+        spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
+    hashes, packages = FileHashes(store.cache / "files.json"), Packages(store.cache / "packages.json")
+    records = _records(project, spec, data, hashes, packages)
+    hashes.save()
+    packages.save()
+    outputs, entries = Outputs(store), {step: store.entry(key) for step, key in home.keys().items()}
+    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e})
+
+
+def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages) -> dict[Step, Record]:
+    sources = Sources(project.source_roots, hashes)
+    _check_params(project, spec.pipeline, sources)
+    records = {}
+    for name in spec.pipeline.needed(spec.targets):
+        of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        for step in spec.steps_of(name):
+            records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
+    return records
+
+
+def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> None:
+    """Names of parameters, without importing a stage; their values are checked when it is loaded."""
+    for name, stage in pipeline.stages.items():
+        if not stage.params:
+            continue
+        known = sources.stage_params(project.package, name, project.pipeline_file)
+        for param in stage.params:
+            if param not in known:
+                where = f"stages.{name}.params.{param}"
+                cure = did_you_mean(param, known) if known else "leave it out"
+                raise InputError(f"the stage {name!r} has no parameter {param!r}", file=project.pipeline_file, key=where, cure=cure)
+
+
+def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Packages) -> Record:
+    stage = pipeline.stages[name]
+    record = {"stage": name, "threads": stage.threads, "python": f"{sys.version_info[0]}.{sys.version_info[1]}", "makes": stage.makes}
+    record |= {f"param:{key}": value for key, value in stage.params.items()}
+    record |= {f"source:{module}": digest for module, digest in closure.modules.items()}
+    record |= {f"data:{file}": digest for file, digest in closure.data.items()}
+    return record | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+
+
+def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> Record:
+    """The slices of the dataset a step declares, by hash, and the files they name."""
+    record: Record = {}
+    for name in pipeline.stages[step.stage].slices:
+        slice_ = data.slice(name, step.photo)
+        record[f"facts:{DATASET}{name}"] = hashlib.sha256(json.dumps(slice_.facts, sort_keys=True).encode()).hexdigest()[:32]
+        for file in slice_.files:
+            record[f"file:{file}"] = _hash(data.folder, file, hashes)
+    return record
+
+
+def _hash(folder: Path, file: str, hashes: FileHashes) -> str:
+    try:
+        return hashes.content(folder / file)
+    except OSError as error:
+        raise InputError(f"the file {file!r} cannot be read ({error.strerror})", file=folder, cure="check its name and permissions") from error

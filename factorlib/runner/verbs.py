@@ -1,0 +1,149 @@
+"""What each verb does; every one of them shows or runs the same plan.  Returns the exit code."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.runner import words
+from factorlib.runner.finish import remember, results
+from factorlib.runner.pipeline import read_pipeline
+from factorlib.runner.plan import Planned
+from factorlib.runner.project import Project, home_of
+from factorlib.runner.survey import Survey, survey
+
+
+def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+    """Run the stages that are wanted and what they need, as far as anything must run."""
+    started = time.perf_counter()
+    seen = survey(project, dataset, targets, settings, force)
+    if all(p.status == "current" for p in seen.planned()):
+        remember(seen)
+        print(f"{seen.data.folder.name}: nothing to do, all {len(seen.records)} steps are current")
+        _name_results(seen, targets)
+        return 0
+    return _run(seen, targets, started)
+
+
+def make_stage(project: Project, name: str, verbs: list[str], dataset: str, settings: list[str], force: bool) -> int:
+    """The same for a word from the command line that is no verb: it must be the name of a stage."""
+    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
+    if name not in stages:
+        raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
+    return make(project, dataset, [name], settings, force)
+
+
+def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
+    from factorlib.runner.display import display_for
+    from factorlib.runner.run import Refused, run
+
+    display = display_for()
+    try:
+        tally = run(seen, display)
+    except Refused:
+        return 1
+    except KeyboardInterrupt:
+        display.say("stopped; what was finished is kept, the next run goes on from there")
+        return 130
+    finally:
+        display.close()
+    if tally.failed:
+        print(f"{seen.data.folder.name}: {words.count(list(tally.failed))} failed: {', '.join(map(str, tally.failed))}")
+        if tally.held_up:
+            print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
+        return 1
+    print(f"{seen.data.folder.name}: {words.count(tally.ran)} run, {len(seen.records) - len(tally.ran)} current, {time.perf_counter() - started:.1f} s")
+    _name_results(seen, targets)
+    return 0
+
+
+def _name_results(seen: Survey, targets: list[str] | None) -> None:
+    if targets is not None:
+        for name in targets:
+            print(f"  {name}: {seen.project.shown(seen.home.folder / name)}")
+        return
+    for label, path in results(seen):
+        shown = seen.project.shown(path)
+        print(f"  {label}: {shown}" + ("/*.exr" if path.is_dir() else ""))
+
+
+def show_plan(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+    print("\n".join(words.plan_lines(survey(project, dataset, targets, settings, force).planned())))
+    return 0
+
+
+def show_why(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+    print("\n".join(words.why_lines(survey(project, dataset, targets, settings, force).planned())))
+    return 0
+
+
+def show_status(project: Project, dataset: str, targets: list[str] | None, settings: list[str]) -> int:
+    seen = survey(project, dataset, targets, settings)
+    print("\n".join(words.status_lines(seen.planned(), lambda p: is_running(seen, p), lambda p: warnings_of(seen, p))))
+    return 0
+
+
+def is_running(seen: Survey, planned: Planned) -> bool:
+    """Whether a run holds the lock on a step's key."""
+    from filelock import FileLock, Timeout
+
+    path = seen.store.locks / f"{planned.key}.lock"
+    if not path.exists():
+        return False
+    try:
+        with FileLock(path, timeout=0):
+            return False
+    except Timeout:
+        return True
+
+
+def warnings_of(seen: Survey, planned: Planned) -> list[str]:
+    """What a step said when its present result was made."""
+    log: Path = seen.store.log(planned.key)
+    events = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()] if log.exists() else []
+    return [event["text"] for event in events if event["event"] == "warning"]
+
+
+def show_graph(project: Project, mermaid: bool) -> int:
+    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
+    print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
+    return 0
+
+
+def validate(project: Project, dataset: str, settings: list[str]) -> int:
+    """Check pipeline.yaml, the settings and the dataset, as far as that needs no pixel."""
+    seen = survey(project, dataset, None, settings)
+    print(f"{seen.data.folder.name}: pipeline.yaml and dataset.yaml are good: {len(seen.data.photos)} photos, {len(seen.records)} steps")
+    return 0
+
+
+def clean(project: Project, dataset: str | None) -> int:
+    from factorlib.runner.gc import clean as delete
+
+    home = None if dataset is None else home_of_name(project, dataset)
+    delete(project, home)
+    print(f"deleted {project.shown(project.build if home is None else home.folder)}")
+    return 0
+
+
+def home_of_name(project: Project, dataset: str):
+    """build/<dataset>, also of a dataset that is no longer there."""
+    try:
+        return home_of(project, project.dataset_folder(dataset))
+    except InputError:
+        from factorlib.runner.project import Home
+
+        home = Home(project.build / Path(dataset).name)
+        if not (home.folder / "dataset.txt").exists():
+            raise
+        return home
+
+
+def collect(project: Project) -> int:
+    from factorlib.runner.gc import collect as delete_unused
+
+    freed = delete_unused(project)
+    print(f"deleted {freed.results} results that nothing names any more, {freed.bytes / 1e6:.1f} MB")
+    return 0

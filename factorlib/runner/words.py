@@ -1,0 +1,81 @@
+"""A plan in words: what each verb prints of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.plan import Planned, Step
+
+SHOWN = 8  # reasons of one step that are written out
+
+
+def plan_lines(planned: list[Planned]) -> list[str]:
+    """What would run, one line for steps of a stage that share their reasons."""
+    lines = []
+    for group in _alike([p for p in planned if p.status != "current"]):
+        lines.append(f"{group[0].step.stage:<10} {group[0].status:<7} {_photos(group):<24} {_short(group[0].reasons)}".rstrip())
+    current = sum(p.status == "current" for p in planned)
+    return lines + [f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"]
+
+
+def why_lines(planned: list[Planned]) -> list[str]:
+    """Every reason of every step that is not current."""
+    lines = []
+    for group in _alike([p for p in planned if p.status != "current"]):
+        lines.append(f"{group[0].step.stage} {_photos(group)}".rstrip() + f": {group[0].status}")
+        lines += [f"    {reason}" for reason in group[0].reasons]
+    return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
+
+
+def status_lines(planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]) -> list[str]:
+    """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
+    lines = []
+    for stage in dict.fromkeys(p.step.stage for p in planned):
+        steps = [p for p in planned if p.step.stage == stage]
+        states = ["running" if p.key and p.status != "current" and running(p) else p.status for p in steps]
+        counts = ", ".join(f"{states.count(s)} {s}" for s in ("current", "running", "to run", "maybe") if s in states)
+        lines.append(f"{stage:<10} {counts}")
+    said = dict.fromkeys(f"warning: {p.step}: {text}" for p in planned if p.status == "current" for text in warnings(p))
+    return lines + list(said)
+
+
+def graph_lines(pipeline: Pipeline) -> list[str]:
+    """Each stage under what it takes, in the order they run."""
+    lines = []
+    for name in pipeline.order():
+        stage = pipeline.stages[name]
+        lines.append(f"{name:<10} {'per photo' if stage.over else 'whole set':<10} <- {', '.join(stage.inputs) or '(parameters only)'}")
+    return lines
+
+
+def mermaid_lines(pipeline: Pipeline) -> list[str]:
+    edges = [f"  {above} --> {name}" for name in pipeline.order() for above in pipeline.stages[name].upstream]
+    nodes = [f"  {name}[[{name}]]" if pipeline.stages[name].over else f"  {name}[{name}]" for name in pipeline.order()]
+    return ["graph TD", *nodes, *edges]
+
+
+def _alike(planned: list[Planned]) -> list[list[Planned]]:
+    groups: dict[tuple, list[Planned]] = {}
+    for p in planned:
+        own = [reason.replace(f"/{p.step.photo}", "/<photo>") if p.step.photo else reason for reason in p.reasons]
+        groups.setdefault((p.step.stage, p.status, tuple(own)), []).append(p)
+    return list(groups.values())
+
+
+def _photos(group: list[Planned]) -> str:
+    names = [p.step.photo for p in group if p.step.photo]
+    return ", ".join(names) if len(names) <= 3 else f"{len(names)} photos"
+
+
+def _short(reasons: list[str]) -> str:
+    more = f"; {len(reasons) - SHOWN} more" if len(reasons) > SHOWN else ""
+    return "; ".join(reasons[:SHOWN]) + more
+
+
+def count(steps: list[Step]) -> str:
+    """
+    >>> count([Step("train")])
+    '1 step'
+    """
+    return "1 step" if len(steps) == 1 else f"{len(steps)} steps"

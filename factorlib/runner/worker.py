@@ -1,0 +1,196 @@
+"""One step, in a worker: load its stage, run it in a temporary folder, check what it made, hand it to the store.
+
+A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more
+than `submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import os
+import sys
+import time
+import traceback
+import warnings
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+
+from factorlib.errors import InputError
+from factorlib.runner.cost import Meter
+from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.store import Store
+from factorlib.stage import Inputs
+from factorlib.yamlfile import convert
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+EVERY = 0.2  # seconds between two words of progress
+
+
+class Code(msgspec.Struct, frozen=True):
+    """Which stage, where its module is found, and the parameters given to it (in which file)."""
+
+    root: Path
+    package: str
+    stage: str
+    params: dict[str, Any]
+    settings: Path
+    threads: int
+
+
+class Task(msgspec.Struct, frozen=True):
+    """All a worker is told.  hashes: of the dataset's files, as they were when the key was made."""
+
+    code: Code
+    photo: str | None
+    makes: list[str]
+    gather: str | None
+    folders: dict[str, Path]
+    facts: dict[str, Any]
+    files: dict[str, Path]
+    hashes: dict[str, str]
+    log: Path | None
+    store: Path
+    key: str
+    record: dict[str, Any]
+    temporary: Path
+    events: Path
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it."""
+
+    output: str | None = None
+    error: str | None = None
+    traceback: str | None = None
+    seconds: float = 0.0
+
+
+def run_step(task: Task) -> Outcome:
+    meter = Meter()
+    with Events(task) as events:
+        try:
+            output = _made(task, events)
+            cost = meter.read(task.code.threads)
+            _write_log(task, events, cost)
+            return Outcome(output=output, seconds=cost["seconds"])
+        except InputError as error:
+            return Outcome(error=str(error), seconds=meter.read(task.code.threads)["seconds"])
+        except BaseException as error:  # whatever it is, the parent reports it
+            text = f"{type(error).__name__}: {error}"
+            return Outcome(error=text, traceback=traceback.format_exc(), seconds=meter.read(task.code.threads)["seconds"])
+
+
+def check_params(code: Code) -> Outcome:
+    """Only whether the parameters are good."""
+    try:
+        params_of(load_stage(code), code)
+        return Outcome()
+    except InputError as error:
+        return Outcome(error=str(error))
+    except BaseException as error:
+        return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
+
+
+def load_stage(code: Code) -> ModuleType:
+    if str(code.root) not in sys.path:
+        sys.path.insert(0, str(code.root))
+    module = importlib.import_module(f"{code.package}.{code.stage}")
+    limit_threads(code.threads)
+    return module
+
+
+def params_of(module: ModuleType, code: Code):
+    """The stage's parameters as its own struct, every bound checked."""
+    return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
+
+
+def limit_threads(threads: int) -> None:
+    """The same number for every library; those not loaded yet read the environment."""
+    for name in THREAD_VARIABLES:
+        os.environ[name] = str(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+    if "OpenImageIO" in sys.modules:
+        sys.modules["OpenImageIO"].attribute("threads", threads)
+
+
+def _made(task: Task, events: Events) -> str:
+    module = load_stage(task.code)
+    params = params_of(module, task.code)
+    task.temporary.mkdir(parents=True)
+    inputs = Inputs(folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log)
+    module.main(params, inputs, task.temporary, events.progress)
+    _check_files_still(task)
+    _check_made(task)
+    return Store(task.store).commit(task.key, task.record, task.temporary).output
+
+
+def _check_files_still(task: Task) -> None:
+    for name, before in task.hashes.items():
+        if hash_of_file(task.files[name]) != before:
+            raise InputError("the file changed while it was being read", file=task.files[name], cure="run again")
+
+
+def _check_made(task: Task) -> None:
+    """A stage that does not keep its word is a defect."""
+    promised = list(task.makes) + (["{photo}.json"] if task.gather else [])
+    for pattern in (text.replace("{photo}", task.photo or "") for text in promised):
+        if not any(task.temporary.glob(pattern)):
+            raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
+    if not any(path.is_file() for path in task.temporary.rglob("*")):
+        raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
+
+
+def _write_log(task: Task, events: Events, cost: dict) -> None:
+    """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
+    where = {"stage": task.code.stage, "photo": task.photo, "key": task.key}
+    lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [{"event": "done", **where, **cost}]
+    path = Store(task.store).log(task.key)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
+    draft.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in lines), encoding="utf-8")
+    os.replace(draft, path)
+
+
+class Events(logging.Handler):
+    """Progress and warnings of one step, as JSON lines that the parent reads while it runs."""
+
+    def __init__(self, task: Task):
+        super().__init__(logging.WARNING)
+        self.path, self.warnings, self._last = task.events, [], 0.0
+
+    def __enter__(self) -> Events:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._stream = open(self.path, "a", encoding="utf-8")
+        logging.captureWarnings(True)
+        warnings.simplefilter("ignore", DeprecationWarning)
+        for name in ("factorlib", "py.warnings"):
+            logging.getLogger(name).addHandler(self)
+            logging.getLogger(name).propagate = False
+        return self
+
+    def __exit__(self, *exception) -> None:
+        for name in ("factorlib", "py.warnings"):
+            logging.getLogger(name).removeHandler(self)
+        self._stream.close()
+
+    def progress(self, done: float, total: float, text: str = "") -> None:
+        now = time.monotonic()
+        if now - self._last >= EVERY:
+            self._last = now
+            self._say({"done": float(done), "total": float(total), "text": text})
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage().strip()
+        if text not in self.warnings:
+            self.warnings.append(text)
+            self._say({"warning": text})
+
+    def _say(self, event: dict) -> None:
+        self._stream.write(json.dumps(event) + "\n")
+        self._stream.flush()
