@@ -22,9 +22,9 @@ from tests.evaluate.made_artifacts import Made, make_artifacts
 VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
 SVG_LEAVES = {"line", "polyline", "circle", "path", "rect"}
 LOG = [
-    {"event": "done", "stage": "solve", "photo": None, "seconds": 83.4, "memory_mb": 512.0},
+    {"event": "done", "stage": "solve", "photo": None, "seconds": 83.4, "cpu_seconds": 81.0, "memory_mb": 512.0, "machine": {"cores": 2}},
     {"event": "done", "stage": "masks", "photo": "day", "seconds": 1.25},
-    {"event": "warning", "text": "photo 'day' <is> dark"},
+    {"event": "warning", "stage": "masks", "photo": "day", "text": "photo 'day' <is> dark"},
 ]
 
 
