@@ -20,7 +20,7 @@ MODULES = {
     "closed_form": ("closed_form", "ClosedForm"),
     "network": ("network", "Network"),
 }
-CHUNK = 1 << 18  # evaluations whose intermediate results are held at once
+CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
 
 
 class Response(msgspec.Struct, frozen=True):

@@ -24,7 +24,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.reflection.brdf import LEAST_COSINE, ggx, lobe_integral, smith
+from factorlib.reflection.brdf import LEAST_COSINE, ggx, smith
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.operator import Operator
 
 LEVELS = (12, 18, 27, 40, 60, 90, 135, 202, 303, 455)  # nodes in each direction, raised until two levels agree

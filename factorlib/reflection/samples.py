@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.stats import qmc
 from torch import Tensor
 
-from factorlib.reflection.brdf import lobe_integral
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.reference import converged
 
 

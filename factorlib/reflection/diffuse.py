@@ -1,0 +1,63 @@
+"""The diffuse reflection of a lobe: E[max(n·i, 0)] over the lobe, times its integral, over π.
+
+n·i has mean m = t̄ c and variance τ² = v⊥ s² + v∥ c² over the lobe (c = n·z, s² = 1 − c²).  Were it normally distributed,
+
+    E[max(n·i, 0)] = m Φ(m/τ) + τ φ(m/τ)                                                                   (1)
+
+which is exact as λ → ∞ and 8 % low for constant light.  E[max(x, 0)] − E[max(−x, 0)] = E[x] holds for (1) as for the
+truth, so that what is left is even in c:  (1 − t̄)² Σ_ij a_ij T_i(2t̄ − 1) c^2j, within .03 % of the peak for every λ.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from factorlib.reflection.lobe import lobe_integral, lobe_moments
+
+# `python -m benchmarks.operator_fit` fits these
+REMAINDER = torch.tensor(
+    [
+        [0.117057442, 0.883729683, -4.79232173, 6.88170859, -3.04039177],
+        [0.152959793, 1.50928847, -8.74204502, 12.7903947, -5.69348136],
+        [0.0906702928, 0.932421699, -6.60403835, 10.2107753, -4.64868484],
+        [0.057811445, 0.385699861, -4.05794491, 6.87872462, -3.25317072],
+        [0.0361563157, 0.0507886126, -1.93222626, 3.76897173, -1.88566548],
+        [0.0198825938, -0.0728109554, -0.627304577, 1.5632297, -0.850259332],
+        [0.00842138421, -0.0663660836, -0.0854222051, 0.422190347, -0.263981407],
+        [0.00206693641, -0.0229556863, 0.016476301, 0.0493346973, -0.0417152035],
+    ],
+    dtype=torch.float64,
+)
+
+
+def normal_mean_cosine(sharpness: Tensor, nz: Tensor) -> Tensor:
+    """Equation (1)."""
+    mean, along, across = lobe_moments(sharpness)
+    c = nz.clamp(-1, 1)
+    m = mean * c
+    deviation = torch.sqrt(across * (1 - c**2) + along * c**2 + 1e-30)
+    u = m / deviation
+    return 0.5 * m * torch.special.erfc(-u / math.sqrt(2)) + deviation * torch.exp(-0.5 * u**2) / math.sqrt(2 * math.pi)
+
+
+def remainder_powers(mean: Tensor) -> list[Tensor]:
+    """Coefficients of c⁰, c², c⁴, … at a mean t̄."""
+    x, table = 2 * mean - 1, REMAINDER.to(mean)
+    chebyshev = [torch.ones_like(x), x]
+    for _ in range(len(table) - 2):
+        chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])
+    scale = (1 - mean) ** 2
+    return [scale * sum(a * t for a, t in zip(column, chebyshev, strict=True)) for column in table.T]
+
+
+def diffuse(sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+    """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
+    square, value = nz.clamp(-1, 1) ** 2, 0
+    for coefficient in reversed(remainder_powers(lobe_moments(sharpness)[0])):
+        value = value * square + coefficient
+    mean_cosine = (normal_mean_cosine(sharpness, nz) + value).clamp_min(0)
+    return lobe_integral(sharpness) / math.pi * mean_cosine

@@ -1,0 +1,156 @@
+"""The specular reflection of a lobe as one filtered normal distribution: a formula, smooth in every input.
+
+In the plane of projected half vectors p = (h_x, h_y) (n = (0, 0, 1), o in the plane y = 0) the GGX distribution is a
+Student distribution without singularities, D = 1/(π α² (1 + k p²)²) with k = (1 − α²)/α²  (Tokuyoshi and Kaplanyan 2021),
+and a Student distribution is a mixture of normal ones, 1/(1 + x)² = ∫ τ e^{−τ(1+x)} dτ ≈ Σ w e^{−τx}.  So
+
+    ∫ SG(i) D(h) di  ≈  E / (π α²) Σ w ∫ N(p; c, V) e^{−τ k p²} dp  =  E / (π α²) Σ w |I + 2τkV|^{−½} e^{−τk cᵀ(I + 2τkV)⁻¹c}   (1)
+
+where the lobe was written as a normal distribution of p.  That is its expansion about some p*, whose light is
+i* = 2(o·h*)h* − o and J = ∂i/∂p:  |i − z|² ≈ |i* + J(p − p*) − z|², hence, λ' = λ/(1 − e^{−2λ}) having the lobe's integral,
+
+    V = (λ' JᵀJ)⁻¹,     c = p* + (JᵀJ)⁻¹ Jᵀz,     and a factor e^{−λ(1 − i*·z)²/2} for the part of z − i* along i*.          (2)
+
+Where the product of light and D has its weight depends on both: about the half vector of o and z if the light is the
+narrower, about p = 0 if D is.  So p* is a blend of the two by their widths, improved by one Gauss–Newton step to the
+product's mode.  There the spread of n·i says how much of the light is above the horizon, by a logistic law.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from factorlib.reflection.brdf import LEAST_ALPHA, LEAST_COSINE, smith
+from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
+
+# (τ, w) of 1/(1 + x)² ≈ Σ w e^{−τx}: `python -m benchmarks.operator_fit` fits these
+GAUSSIANS = (
+    (0.00370478348, 2.76179309e-05),
+    (0.0196104062, 0.000547760716),
+    (0.0761014876, 0.0068956554),
+    (0.26432913, 0.0651432807),
+    (0.872885721, 0.374531075),
+    (2.79042235, 0.552530467),
+)
+LOGISTIC = 1.702  # the logistic law of this scale is within .01 of the normal one
+PEAK = 3.0  # −∂²/∂p² of the logarithm of D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
+
+
+class Filtered(msgspec.Struct):
+    """What the formula is made of; each of the shape of its inputs."""
+
+    value: Tensor
+    ratio: Tensor  # 1 − e^{−2λ}
+    sharpness: Tensor  # λ'
+    px: Tensor  # p* about which the lobe was expanded
+    py: Tensor
+    misfit: Tensor  # λ (1 − i*·z)² / 2
+    density: Tensor  # D of (1), D(0) = 1
+    spread: Tensor  # log |I + 2kV|
+    distance: Tensor  # k c²
+    ni: Tensor  # n·i*
+    deviation: Tensor  # of n·i
+    lit: Tensor  # part of the light above the horizon
+    cosine: Tensor  # mean n·i of that
+
+
+def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
+    """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over n·i > 0, from tensors of one shape."""
+    alpha, no = alpha.clamp(LEAST_ALPHA, 1), no.clamp(LEAST_COSINE, 1)
+    so = torch.sqrt((1 - no * no).clamp_min(1e-8))
+    zx = (oz - no * nz) / so
+    zy = torch.sqrt((1 - nz * nz - zx * zx).clamp_min(1e-8))
+    k = (1 - alpha * alpha) / (alpha * alpha)
+    lam = gaussian_sharpness(sharpness)
+    geometry = so, no, zx, zy, nz
+    px, py = _blend(k, lam, oz, *geometry)
+    px, py = _mode(k, lam, px, py, *geometry)
+    xx, yy, xy, det, cx, cy, along, ni, nix, niy = _expansion(px, py, *geometry)
+    cx, cy = px + cx, py + cy
+    misfit = 0.5 * sharpness * (1 - along) ** 2
+    density, spread = _student(k, lam, xx, yy, xy, det, cx, cy, sharpness / lam, misfit)
+    curvature = _curvature(k, px, py) / lam
+    variance = (nix * nix * (yy + curvature) + niy * niy * (xx + curvature) - 2 * nix * niy * xy) / _plus(xx, yy, det, curvature)
+    deviation = torch.sqrt(variance / lam + lobe_moments(sharpness)[1] * ni * ni + 1e-8)
+    u = LOGISTIC * (ni / deviation).clamp_min(-20)
+    lit = torch.sigmoid(u)
+    cosine = deviation * softplus(u) / (LOGISTIC * lit)
+    shadowed = lit * smith(alpha, cosine) * smith(alpha, no) / (4 * no)
+    value = 2 / (lam * alpha * alpha) * density * shadowed
+    return Filtered(value, sharpness / lam, lam, px, py, misfit, density, spread, k * (cx * cx + cy * cy), ni, deviation, lit, cosine)
+
+
+def _blend(k: Tensor, lam: Tensor, oz: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, Tensor]:
+    """p between n and the half vector of o and z, by the widths of light and D (isotropic)."""
+    x, y, z = so + zx, zy, no + nz
+    length = torch.sqrt(x * x + y * y + z * z + 1e-6)
+    x, y, z = x / length, y / length, z / length
+    variance = 1 / (lam * (2 + 2 * oz).clamp_min(4e-3))
+    tail = 1 + k * (x * x + y * y) / (1 + 2 * k * variance)
+    share = tail / (tail + k * variance)
+    x, y, z = share * x, share * y, share * z + 1 - share
+    scale = torch.rsqrt(x * x + y * y + z * z + 1e-12)
+    return x * scale, y * scale
+
+
+def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, *geometry: Tensor) -> tuple[Tensor, Tensor]:
+    """One Gauss–Newton step from p to the mode of light times D: (JᵀJ + r)⁻¹ JᵀJ c, kept inside the disc."""
+    xx, yy, xy, det, cx, cy, *_ = _expansion(px, py, *geometry)
+    cx, cy = px + cx, py + cy
+    r = _curvature(k, px, py) / lam
+    shrink = r / _plus(xx, yy, det, r)
+    x = cx - shrink * ((yy + r) * cx - xy * cy)
+    y = cy - shrink * ((xx + r) * cy - xy * cx)
+    outside = torch.sqrt((x * x + y * y) / 0.97 + 1e-12).clamp_min(1.0)
+    return x / outside, y / outside
+
+
+def _curvature(k: Tensor, px: Tensor, py: Tensor) -> Tensor:
+    return PEAK * k / (1 + k * (px * px + py * py))
+
+
+def _plus(xx: Tensor, yy: Tensor, det: Tensor, r: Tensor) -> Tensor:
+    """|JᵀJ + r I|."""
+    return det + r * (xx + yy) + r * r
+
+
+def _expansion(px: Tensor, py: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
+    """JᵀJ (xx, yy, xy, its determinant), its solution for Jᵀz, i·z, n·i and the derivatives of n·i, at p."""
+    hn = torch.sqrt((1 - px * px - py * py).clamp_min(1e-2))
+    oh = so * px + no * hn
+    oh = torch.sqrt(oh * oh + 1e-4)
+    tx, ty = px / hn, py / hn
+    ax, ay = so - no * tx, -no * ty  # ∂(o·h)/∂p
+    # ∂i/∂p = 2 ∂(o·h)/∂p h + 2 (o·h) ∂h/∂p, halved
+    xx1, xx2, xx3 = ax * px + oh, ax * py, ax * hn - oh * tx
+    yy1, yy2, yy3 = ay * px, ay * py + oh, ay * hn - oh * ty
+    xx = 4 * (xx1 * xx1 + xx2 * xx2 + xx3 * xx3)
+    yy = 4 * (yy1 * yy1 + yy2 * yy2 + yy3 * yy3)
+    xy = 4 * (xx1 * yy1 + xx2 * yy2 + xx3 * yy3)
+    bx = 2 * (xx1 * zx + xx2 * zy + xx3 * nz)
+    by = 2 * (yy1 * zx + yy2 * zy + yy3 * nz)
+    det = xx * yy - xy * xy
+    det = det.clamp_min(1e-7)
+    along = 2 * oh * (px * zx + py * zy + hn * nz) - (so * zx + no * nz)
+    return xx, yy, xy, det, (yy * bx - xy * by) / det, (xx * by - xy * bx) / det, along, 2 * oh * hn - no, 2 * xx3, 2 * yy3
+
+
+def _student(k, lam, xx, yy, xy, det, cx, cy, ratio, misfit) -> tuple[Tensor, Tensor]:
+    """Σ of (1) with the factor of (2), and log |I + 2kV|; V = (λ' JᵀJ)⁻¹, exponents of the true λ = ratio λ'."""
+    volume = lam * det
+    trace = (xx + yy) / volume
+    determinant = 1 / (volume * lam)
+    square = cx * cx + cy * cy
+    across = (yy * cx * cx + xx * cy * cy - 2 * xy * cx * cy) / volume  # cᵀVc
+    density = 0
+    for rate, weight in GAUSSIANS:
+        f = 2 * rate * k
+        inflation = 1 + f * (trace + f * determinant)
+        exponent = 0.5 * f * (square + f * (trace * square - across)) / inflation
+        density = density + weight * torch.exp(-ratio * exponent - misfit) * torch.rsqrt(inflation)
+    return density, torch.log1p(2 * k * (trace + 2 * k * determinant))
