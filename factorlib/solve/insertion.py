@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from factorlib.light.lobes import lobe_integral
 from factorlib.solve.normal_equations import predicted_radiance, residuals
 from factorlib.solve.problem import Block
 from factorlib.solve.unknowns import Light, Materials
@@ -99,11 +100,6 @@ def _pursuit(atoms, residual, axis, sharpness, count: int) -> tuple[list[int], l
 
 def pruned(light: Light, least_share: float = 1e-5) -> Light:
     """Without the lobes that hold less than `least_share` of the light's energy; never without all of them."""
-    energy = lobe_energy(light.sharpness) * light.weight.sum(1)
+    energy = lobe_integral(light.sharpness) * light.weight.sum(1)
     kept = energy > least_share * max(float(energy.sum()), 1e-30)
     return light.take(kept) if kept.any() else light.take(slice(0, 1))
-
-
-def lobe_energy(sharpness: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:
-    """∫ exp(λ(ω·z − 1)) dω = 2π (1 − e^{−2λ}) / λ."""
-    return -2 * np.pi * np.expm1(-2 * sharpness) / sharpness

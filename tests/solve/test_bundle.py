@@ -10,7 +10,7 @@ from factorlib.solve.problem import connected_components
 from factorlib.stage import serial_map
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
-QUICK = Bundle(lobes=12, insert=6, rounds=4, iterations=10, polish=15)
+QUICK = Bundle(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)
 
 
 def rooms(count=2, lobes=4, photos=1, seed=3):

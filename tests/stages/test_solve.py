@@ -1,0 +1,101 @@
+import logging
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from tests.solve.problems import MATERIALS, random_light, sphere_normals
+
+from factorlib.errors import InputError
+from factorlib.jsonfile import read_json
+from factorlib.reflection import reflection_operator
+from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.problem import Noise, blocks_of_observations
+from factorlib.stage import Inputs, silent
+from factorlib.urm.observations import Observations, write_observations
+from stages import solve
+
+NAMES = ("red", "green", "blue")
+
+
+def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0) -> Observations:
+    """A sphere of each material of `shown` under a light of two lobes, as `closed_form` renders it."""
+    normals = sphere_normals(size)
+    n = len(normals) * len(shown)
+    empty = Observations(
+        normal=np.tile(normals, (len(shown), 1)), view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=np.ones((n, 3)),
+        clipped=np.zeros((n, 3), bool), material=np.repeat(shown, len(normals)), photo=np.zeros(n, int),
+        illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n),
+        materials=NAMES, photos=(photo,), illuminations=(photo,),
+    )  # fmt: skip
+    (block,) = blocks_of_observations(empty, Noise())
+    light = random_light(np.random.default_rng(seed), 2)
+    radiance = predicted_radiance(block, light, MATERIALS, reflection_operator("closed_form"))
+    return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
+
+
+def run(folder, seen: dict[str, Observations], **params):
+    urm, out = folder / "urm", folder / "out"
+    urm.mkdir(parents=True), out.mkdir()
+    for name, part in seen.items():
+        write_observations(urm / f"{name}.parquet", part)
+    light = {name: {"illumination": name, "world_from_camera": None} for name in seen}
+    inputs = Inputs({"urm": urm, "train": folder}, {"dataset.materials": list(NAMES), "dataset.light": light})
+    quick = {"operator": "closed_form", "lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
+    solve.main(solve.Params(**{**quick, **params}), inputs, out, silent)
+    return out
+
+
+@pytest.fixture(scope="module")
+def linked():
+    return {"a": observations("a", [0, 1], 1), "b": observations("b", [1, 2], 2)}
+
+
+def test_writes_the_fixed_artifacts(tmp_path, linked):
+    out = run(tmp_path, linked)
+    found = read_json(out / "materials.json")
+    assert set(found) == {"materials", "gauge", "model"}
+    for name in NAMES:
+        material = found["materials"][name]
+        assert material["alpha"] == pytest.approx(material["roughness"] ** 2)
+        assert len(material["diffuse"]) == len(material["specular"]) == len(material["stderr"]["diffuse"]) == 3
+    lobes = pq.read_table(out / "lobes.parquet").to_pydict()
+    assert set(lobes["illumination"]) == {"a", "b"}
+    assert min(lobes["weight_r"]) >= 0
+    assert read_json(out / "exposures.json") == {"a": [1.0] * 3, "b": [1.0] * 3}
+    assert (out / "convergence.parquet").exists() and (out / "uncertainty.json").exists()
+
+
+def test_the_same_observations_give_the_same_bytes(tmp_path, linked):
+    one, other = run(tmp_path / "1", linked), run(tmp_path / "2", dict(reversed(linked.items())))
+    for file in sorted(p.name for p in one.iterdir()):
+        assert (one / file).read_bytes() == (other / file).read_bytes(), file
+
+
+def test_brighter_photos_change_lights_not_materials(tmp_path, linked):
+    brighter = {"a": observations("a", [0, 1], 1, unit=8.0), "b": linked["b"]}
+    one, other = run(tmp_path / "1", linked), run(tmp_path / "2", brighter)
+    a, b = (read_json(folder / "materials.json")["materials"] for folder in (one, other))
+    for name in NAMES:
+        np.testing.assert_allclose(a[name]["diffuse"], b[name]["diffuse"], rtol=1e-4)
+    weights = [np.array(pq.read_table(f / "lobes.parquet").to_pydict()["weight_g"]) for f in (one, other)]
+    is_a = np.array(pq.read_table(one / "lobes.parquet").to_pydict()["illumination"]) == "a"
+    np.testing.assert_allclose(weights[1][is_a], 8 * weights[0][is_a], rtol=1e-3, atol=1e-6)
+
+
+def test_photos_that_are_not_linked_are_named(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        run(tmp_path, {"a": observations("a", [0, 1], 1), "b": observations("b", [2], 2)})
+    assert "2 sets that share no material" in caplog.text
+    assert "blue" in caplog.text
+
+
+def test_a_material_nobody_saw_is_named(tmp_path, caplog, linked):
+    with caplog.at_level(logging.WARNING):
+        out = run(tmp_path, {"a": linked["a"]})
+    assert "'blue' is observed in no photo" in caplog.text
+    assert np.isfinite(read_json(out / "materials.json")["materials"]["blue"]["diffuse"]).all()
+
+
+def test_nothing_to_see_is_an_error_that_says_where_to_look(tmp_path, linked):
+    with pytest.raises(InputError, match="no valid observation"):
+        run(tmp_path, {"a": linked["a"].take(np.zeros(0, int))})
