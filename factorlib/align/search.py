@@ -30,17 +30,17 @@ EXIF_SIGMA = 0.05  # whole millimetres, and focus
 CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
-class Search(msgspec.Struct, frozen=True):
-    """How hard to look."""
+class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How hard to look.  The tuples hold one number per round of refinement, in order; most guesses fall in the first."""
 
     views: Count = 300  # directions, evenly over the sphere
-    rolls: Count = 24
+    rolls: Count = 20
     apart_deg: float = 14.0  # between guesses
-    keep: tuple[Count, Count, Count] = (32, 8, 3)  # guesses refined at each resolution
-    resolution: tuple[Count, Count, Count] = (90, 200, 400)  # pixels of the mask's longer side
-    margin: tuple[float, float, float] = (0.35, 0.2, 0.1)  # of that side, seen around the mask
-    steps: tuple[Count, Count, Count] = (12, 12, 10)
-    cut_effort: Count = 2  # times the views and guesses where frame or occluder cut the mask: it says less
+    cut_effort: Count = 2  # times the views and first guesses where frame or occluder cut the mask: it says less
+    keep: tuple[Count, Count, Count, Count] = (32, 14, 7, 3)  # guesses refined
+    steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
+    resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)  # pixels of the mask's longer side
+    margin: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)  # of that side, seen around the mask
 
 
 class RunnerUp(msgspec.Struct, frozen=True):
@@ -76,16 +76,15 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
     effort = search.cut_effort if is_cut(evidence) else 1
     guesses = candidates(caster, evidence, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
     states = [guess.state for guess in guesses]
-    ranked: list[Refined] = []
-    for level in range(3):
-        target = target_of(evidence, caster.mesh.labels, search.resolution[level], search.margin[level])
-        results = [refined(caster, target, camera, s, prior, search.steps[level]) for s in states[: effort * search.keep[level]]]
-        ranked = _distinct(results, prior)
+    others: list[Refined] = []
+    for keep, steps, resolution, margin in zip(search.keep, search.steps, search.resolution, search.margin):
+        kept = states[: keep if others else effort * keep]
+        target = target_of(evidence, caster.mesh.labels, resolution, margin)
+        ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
         states = [result.state for result in ranked]
-        if level == 1:
-            others = ranked
+        others = ranked + others
     best = ranked[0]
-    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked + others))
+    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, others))
 
 
 def value(result: Refined, prior: FocalPrior) -> float:
