@@ -1,0 +1,62 @@
+"""python -m factorlib.generate synthetic|eames: the data sets the project carries, or others of the same protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from shutil import rmtree
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from factorlib.errors import InputError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+Seed = Annotated[int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")]
+Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
+Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
+
+
+@app.command()
+def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
+    """Three materials in three lights on exact shapes, direct light only."""
+    from factorlib.generate import synthetic as set_
+
+    _write(set_, out or Path("data/synthetic"), seed, lights)
+
+
+@app.command()
+def eames(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
+    """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
+    from factorlib.generate import eames as set_
+
+    _write(set_, out or Path("data/eames"), seed, lights)
+
+
+def _write(set_, out: Path, seed: int, lights: Path | None) -> None:
+    """Generate beside `out`, then put it in its place."""
+    try:
+        maps = sorted(path for path in lights.iterdir() if path.suffix.lower() in (".hdr", ".exr")) if lights else []
+        if lights and not maps:
+            raise InputError("no .hdr or .exr in this folder", file=lights, cure="name a folder of lat-long maps")
+        _check_replaceable(out)
+        fresh = out.with_name(out.name + ".new")
+        rmtree(fresh, ignore_errors=True)
+        with Progress() as bar:
+            task = bar.add_task(f"{out}", total=1)
+            set_.generate(fresh, seed, maps, set_.Parameters(), lambda done, total, text: bar.update(task, completed=done, total=total, description=text))
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    rmtree(out, ignore_errors=True)
+    fresh.rename(out)
+    typer.echo(f"{out}: {sum(path.stat().st_size for path in out.rglob('*') if path.is_file()) / 1e6:.1f} MB")
+
+
+def _check_replaceable(out: Path) -> None:
+    if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
+        raise InputError("this folder holds something else than a data set", file=out, cure="name an empty folder, or a data set to replace")
+
+
+if __name__ == "__main__":
+    app()

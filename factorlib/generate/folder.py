@@ -1,0 +1,141 @@
+"""Writing a data set: photos as cameras write them, label masks, truth, and the YAML that names them all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from jaxtyping import Bool, Float, Int
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.raster import Maps, rasterise
+from factorlib.dataset.schema import LEFT_OUT
+from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
+from factorlib.images.focal import FILM_DIAGONAL
+from factorlib.images.transfer import srgb_encode
+
+SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
+JPEG_QUALITY = 95
+
+
+def write_photo(path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None) -> None:
+    """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, quality 95, EXIF focal if given)."""
+    if path.suffix == ".exr":
+        return write_rgb_exr(path, radiance)
+    encoded = srgb_encode(np.clip(radiance, 0, 1))
+    kind, top = (np.uint16, 65535) if path.suffix == ".png" else (np.uint8, 255)
+    attributes: dict[str, Any] = {"DateTime": FIXED_DATE, "Software": "factorlib", "oiio:ColorSpace": "sRGB"}
+    if path.suffix == ".jpg":
+        attributes |= {"Compression": f"jpeg:{JPEG_QUALITY}", "jpeg:subsampling": "4:4:4"}
+    if focal_35mm is not None:
+        attributes["Exif:FocalLengthIn35mmFilm"] = round(focal_35mm)
+    write_codes(path, (encoded * top + 0.5).astype(kind), attributes)
+
+
+def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
+    """Pixels of a whole-millimetre 35 mm equivalent, by the convention of CIPA DCG-001."""
+    return round(focal_35mm) / FILM_DIAGONAL * float(np.hypot(width, height))
+
+
+def write_labels(path: Path, labels: Int[np.ndarray, "h w"]) -> None:
+    """A one-channel 8-bit PNG: 0 background, k the k-th material, 255 left out."""
+    write_codes(path, labels.astype(np.uint8)[..., None], {})
+
+
+def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> None:
+    """Integer pixels [h, w, c] by OpenImageIO."""
+    height, width, channels = codes.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if codes.dtype == np.uint16 else oiio.UINT8)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    if not (output.open(str(path), spec) and output.write_image(np.ascontiguousarray(codes))):
+        raise OSError(f"{path}: cannot be written: {output.geterror()}")
+    output.close()
+
+
+def write_light(path: Path, lat_long: Float[np.ndarray, "h w 3"]) -> None:
+    write_rgb_exr(path, lat_long, LAT_LONG)
+
+
+def write_normals(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
+    """Unit normals in the camera frame, 0 where there is no object."""
+    write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
+
+
+def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Parts (name -> vertices [V, 3], faces [F, 3]) as groups of a Wavefront OBJ without normals."""
+    lines, first = [], 1
+    for name, (vertices, faces) in parts.items():
+        lines += [f"g {name}", *(f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices)]
+        lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + first]
+        first += len(vertices)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def labels_of(meshes, camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
+    """The material label of each pixel; 255 where its square, or a quarter pixel beyond, shows more than one thing."""
+    return whole_pixels(_subpixels(meshes, camera, poses).label)
+
+
+def object_masks(meshes, camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
+    """Where each object fills at least half of the pixel."""
+    number = _subpixels(meshes, camera, poses).object
+    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS].reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
+    return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
+
+
+def _subpixels(meshes, camera: Camera, poses: list[Pose]) -> Maps:
+    """Maps on a grid SUBPIXELS times finer, with one pixel of border all round."""
+    window = camera.window(-1, -1, 1 / SUBPIXELS, (camera.width + 2) * SUBPIXELS, (camera.height + 2) * SUBPIXELS)
+    return rasterise(meshes, window, poses)
+
+
+def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
+    """Of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
+    reach = SUBPIXELS + 2
+    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
+    height, width = (n // SUBPIXELS - 2 for n in fine.shape)
+    windows = windows[:height, :width].reshape(height, width, -1)
+    low, high = windows.min(axis=-1), windows.max(axis=-1)
+    return np.where(low == high, low, LEFT_OUT)
+
+
+def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
+    """Nested mappings as YAML; lists of mappings as blocks, other lists on one line."""
+    path.write_text(f"# {comment}\n{yaml_text(value)}", encoding="utf-8")
+
+
+def yaml_text(value: dict[str, Any], indent: int = 0) -> str:
+    """
+    >>> print(yaml_text({"a": [1, 0.5], "b": [{"c": "x", "d": {"e": 1e-7}}]}), end="")
+    a: [1, 0.5]
+    b:
+      - c: x
+        d:
+          e: 0.0
+    """
+    pad, text = " " * indent, ""
+    for key, item in value.items():
+        if isinstance(item, dict):
+            text += f"{pad}{key}:\n{yaml_text(item, indent + 2)}"
+        elif isinstance(item, list) and item and isinstance(item[0], dict):
+            blocks = [yaml_text(one, indent + 4) for one in item]
+            text += f"{pad}{key}:\n" + "".join(f"{pad}  - {block[indent + 4 :]}" for block in blocks)
+        else:
+            text += f"{pad}{key}: {_flow(item)}\n"
+    return text
+
+
+def _flow(item: Any) -> str:
+    if isinstance(item, (list, tuple)):
+        return "[" + ", ".join(map(_flow, item)) + "]"
+    return str(round(item, 6)) if isinstance(item, float) and abs(item) >= 1e-4 else "0.0" if isinstance(item, float) else str(item)
+
+
+def pose_entry(pose: Pose) -> dict[str, Any]:
+    """cam_from_object as dataset.yaml and truth.yaml write it."""
+    return {"rotation": [[round(float(v), 6) for v in row] for row in pose.rotation], "translation": [float(v) for v in pose.translation]}
+

@@ -1,0 +1,138 @@
+"""Surroundings that light a scene: a sky with its sun over a ground, and rooms with windows and lamps.
+
+Every surrounding is a dictionary of Mitsuba objects in a world with y up, its ground or floor at y = −EYE and nothing
+within a metre of the origin, so that the light which arrives at the origin, or at a chair on the floor, can be traced.
+Radiance is in arbitrary units: a data set scales each light by its photo's exposure.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.errors import InputError
+from factorlib.generate.tracing import light_seen, rgb, transform
+from factorlib.images.photo import read_photo
+from factorlib.light.latlong import turned_map
+
+EYE = 1.2  # height of the origin over the ground
+Things = dict[str, Any]
+TURNS = {"+x": (0, 90, 0), "-x": (0, -90, 0), "+z": (0, 0, 0), "-z": (0, 180, 0), "+y": (-90, 0, 0), "-y": (90, 0, 0)}
+
+
+def daylight(
+    rng: np.random.Generator,
+    elevation_deg: float,
+    azimuth_deg: float,
+    turbidity: float = 4.0,
+    sun_scale: float = 0.12,
+    sun_aperture_deg: float = 3.0,
+    ground=(0.32, 0.3, 0.26),
+) -> Things:
+    """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
+
+    The sun is veiled: wider and weaker than the real one, of which 0.5° across nothing but a mirror would tell.
+    """
+    up, turn = np.radians([elevation_deg, azimuth_deg])
+    sun = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
+    sky = {
+        "type": "sunsky", "turbidity": turbidity, "sun_scale": sun_scale, "sun_aperture": sun_aperture_deg,
+        "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
+    }  # fmt: skip
+    things = {"sky": sky, "ground": wall("-y", EYE, (200, 200), ground)}
+    return things | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
+
+
+def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> Things:
+    """A coloured block some metres away; none stands before the sun."""
+    angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
+    size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
+    place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
+    return block(place, size, np.degrees(angle), vivid(rng))
+
+
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # sunsky's zenith is its +z; its sun_direction is the world's
+
+
+
+def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2) -> Things:
+    """A closed room of coloured walls with bright windows, warm lamps, pictures and blocks for furniture."""
+    half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
+    ceiling = 2.9 - EYE
+    things = {
+        "floor": wall("-y", EYE, half[[0, 2]], rng.uniform(0.15, 0.45) * np.array([1.2, 0.95, 0.7])),
+        "ceiling": wall("+y", ceiling, half[[0, 2]], (0.75, 0.74, 0.7)),
+    }
+    sides = ["+x", "-x", "+z", "-z"]
+    for side in sides:
+        distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
+        things[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), rise=0.25)
+        things[f"picture{side}"] = wall(side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5))
+    for k, side in enumerate(rng.permutation(sides)[:windows]):
+        distance = (half[0] if side[1] == "x" else half[2]) - 0.03
+        day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
+        things[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, rng.uniform(-1, 1), 0.45, glow=day)
+    for k in range(lamps):
+        place = [rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]), rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1])]
+        warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
+        things[f"lamp_{k}"] = {"type": "sphere", "center": place, "radius": rng.uniform(0.12, 0.18), "emitter": {"type": "area", "radiance": rgb(warm)}}
+    for k in range(4):
+        angle = rng.uniform(0, 2 * np.pi)
+        size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
+        place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
+        things[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
+    return things
+
+
+def wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """A light paint."""
+    return np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
+
+
+def vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """A strong colour."""
+    return np.clip(rng.dirichlet([0.6, 0.6, 0.6]) * 0.9, 0.02, 0.8)
+
+
+def wall(side: str, distance: float, half, colour, along: float = 0.0, rise: float = 0.0, glow=None) -> Things:
+    """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin."""
+    mi = _transforms()
+    turn = mi().translate([0, 0, distance])
+    pitch, yaw, _ = TURNS[side]
+    to_world = mi().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch) @ turn.translate([along, rise, 0]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
+    thing = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
+    return thing if glow is None else thing | {"emitter": {"type": "area", "radiance": rgb(glow)}}
+
+
+def block(place, half, turn_deg: float, colour) -> Things:
+    """A box of half sizes `half` about `place`, turned about y."""
+    mi = _transforms()
+    to_world = mi().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
+    return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
+
+
+def _transforms():
+    from factorlib.generate.mitsuba_variant import mitsuba
+
+    return mitsuba().ScalarTransform4f
+
+
+def map_of(things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place=(0, 0, 0)):
+    """The light of a surrounding at a place, in a turned y-up frame."""
+    return light_seen(things, place, world_from_light, height, spp, seed, max_depth=8)
+
+
+def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
+    """A lat-long map of a user's (.exr, .hdr), averaged to `height` rows, of mean radiance 1."""
+    radiance = read_photo(path, "linear").radiance.astype(float)
+    rows, columns = radiance.shape[:2]
+    if columns != 2 * rows:
+        raise InputError(f"{columns} × {rows} pixels is no lat-long map", file=path, cure="its width must be twice its height")
+    finer = max(1, rows // height)
+    if rows % height:
+        raise InputError(f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows")
+    radiance = radiance.reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
+    return radiance / radiance.mean()

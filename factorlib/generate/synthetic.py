@@ -1,0 +1,203 @@
+"""The synthetic set: three materials in three lights on exact shapes at given poses, with every truth known.
+
+Each object is traced alone in its light by direct light only, so that the image is what the model says it is: no
+object shadows or mirrors another.  One photo is a linear EXR, one a 16-bit PNG, one an 8-bit JPEG with some highlights
+clipped; one pose is not given.  Seed 0 is the set the project carries; others have other materials, views and lights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.align.camera import Camera, Pose, rotation_of_vector
+from factorlib.align.raster import rasterise
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.generate import folder, lights
+from factorlib.generate.lights import Things
+from factorlib.generate.shapes import SHAPES
+from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import write_ply
+
+Progress = Callable[[int, int, str], None]
+DISTANCE = 5.0
+
+
+class Parameters(msgspec.Struct, frozen=True):
+    """Pixels, pixels, pixels, rows, samples per pixel of photos and of lights."""
+
+    width: int = 192
+    height: int = 128
+    focal_px: float = 250.0
+    light_rows: int = 128
+    spp: int = 2048
+    light_spp: int = 48
+
+
+class Placed(msgspec.Struct, frozen=True):
+    """A shape of a material at a place in the photo, turned about the vertical, then tilted about two axes, radians."""
+
+    shape: str
+    material: str
+    x: float
+    turn: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    posed: bool = True
+
+
+class Shot(msgspec.Struct, frozen=True):
+    """A photo: its file's kind, its objects, and the brightest fraction of object pixels that clips (None: nothing)."""
+
+    name: str
+    suffix: str
+    placed: tuple[Placed, ...]
+    clipped: float | None = None
+
+
+MATERIALS = {
+    "red": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+    "green": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+    "blue": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+}
+SHOTS = (
+    Shot("garden", ".exr", (Placed("sphere", "red", -1.22), Placed("vase", "green", 0.0), Placed("blob", "blue", 1.22, 0.6))),
+    Shot("parlour", ".png", (Placed("bottle", "green", -1.22), Placed("sphere", "blue", 0.0), Placed("vase", "red", 1.22))),
+    Shot(
+        "study", ".jpg",
+        (Placed("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False), Placed("bottle", "blue", 0.0, 0.0, (0.25, 0.15)), Placed("sphere", "green", 1.22)),
+        clipped=0.01,
+    ),
+)  # fmt: skip
+
+
+def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress) -> None:
+    """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
+    for name in ("photos", "masks", "meshes", "truth"):
+        (out / name).mkdir(parents=True)
+    rng = np.random.default_rng([7, seed])
+    materials = drawn_materials(rng, spread=0.0 if seed == 0 else 0.25)
+    meshes = {name: make() for name, make in SHAPES.items()}
+    for name, mesh in meshes.items():
+        write_ply(out / f"meshes/{name}.ply", mesh)
+    photos, poses = [], {}
+    for number, shot in enumerate(SHOTS):
+        progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
+        world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
+        light = light_of(number, world_from_camera, lat_longs, rng, parameters)
+        progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
+        poses[shot.name] = placements(shot, world_from_camera, rng, spread=0.0 if seed == 0 else 1.0)
+        photos.append(write_shot(out, shot, light, materials, meshes, poses[shot.name], parameters, seed))
+    write_records(out, materials, photos, poses)
+    progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
+
+
+def drawn_materials(rng: np.random.Generator, spread: float) -> dict[str, Material]:
+    """The set's materials, each number times exp(spread · normal), within k_d + k_s ≤ 0.95."""
+    drawn = {}
+    for name, material in MATERIALS.items():
+        factor = np.exp(spread * rng.standard_normal(5))
+        diffuse = np.array(material.diffuse) * factor[:3]
+        specular = np.array(material.specular) * factor[3]
+        shrink = min(1.0, 0.95 / (diffuse.max() + specular.max()))
+        roughness = float(np.clip(material.roughness * factor[4], 0.15, 0.8))
+        drawn[name] = Material(_rounded(diffuse * shrink), _rounded(specular * shrink), round(roughness, 4))
+    return drawn
+
+
+def _rounded(values) -> tuple[float, ...]:
+    return tuple(round(float(v), 4) for v in values)
+
+
+def light_of(number: int, world_from_camera, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters) -> Float[np.ndarray, "h w 3"]:
+    """The light of photo `number`, in the camera's y-up frame: daylight for the first, rooms for the others."""
+    if lat_longs:
+        return lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
+    seed = int(rng.integers(1 << 24))
+    turn = world_from_camera @ YUP_FROM_CAMERA
+    return lights.map_of(surroundings(number, world_from_camera, rng), turn, parameters.light_rows, parameters.light_spp, seed)
+
+
+def surroundings(number: int, world_from_camera, rng: np.random.Generator) -> Things:
+    if number:
+        return lights.room(rng, windows=2, lamps=number)
+    forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
+    return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70))
+
+
+def placements(shot: Shot, world_from_camera, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
+    """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
+    poses = {}
+    for placed in shot.placed:
+        turn = rotation_of_vector(np.array([0, placed.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
+        tilt = rotation_of_vector(np.array([placed.tilt[0], 0, placed.tilt[1]]) + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3))
+        poses[name_of(placed)] = Pose(world_from_camera.T @ tilt @ turn, np.array([placed.x, 0.02, DISTANCE]))
+    return poses
+
+
+def name_of(placed: Placed) -> str:
+    return f"{placed.material}_{placed.shape}"
+
+
+def write_shot(out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh], poses: dict[str, Pose], parameters: Parameters, seed: int) -> dict:
+    """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry."""
+    camera = Camera(parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2))
+    order = list(materials)
+    labelled = [msgspec.structs.replace(meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16)) for p in shot.placed]
+    labels = folder.labels_of(labelled, camera, list(poses.values()))
+    radiance = composed(shot, light, materials, meshes, poses, camera, parameters.spp, seed)
+    exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT), shot)
+    folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure)
+    folder.write_labels(out / f"masks/{shot.name}.png", labels)
+    folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
+    folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal)
+    return entry(shot, poses, parameters)
+
+
+def composed(shot: Shot, light, materials, meshes, poses: dict[str, Pose], camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
+    """The photo: each third of its width shows the object that stands there, traced alone."""
+    radiance = np.zeros((camera.height, camera.width, 3))
+    world = rigid(YUP_FROM_CAMERA, np.zeros(3))
+    edges = np.linspace(0, camera.width, len(shot.placed) + 1).astype(int)
+    for number, (placed, pose) in enumerate(zip(shot.placed, poses.values(), strict=True)):
+        thing = shape(meshes[placed.shape], bsdf(materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
+        alone = traced({"thing": thing, "light": envmap(light)}, camera, world, spp, 100 * seed + number, max_depth=2)
+        radiance[:, edges[number] : edges[number + 1]] = alone[:, edges[number] : edges[number + 1]]
+    return radiance
+
+
+def exposure_of(radiance: Float[np.ndarray, "h w 3"], on_object: Bool[np.ndarray, "h w"], shot: Shot) -> float:
+    """The factor that clips the wanted fraction of object pixels, or that lets the brightest just not clip."""
+    brightest = radiance[on_object].max(axis=-1)
+    return float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
+
+
+def entry(shot: Shot, poses: dict[str, Pose], parameters: Parameters) -> dict:
+    """The photo in dataset.yaml."""
+    objects = []
+    for placed in shot.placed:
+        pose = {"pose": folder.pose_entry(poses[name_of(placed)])} if placed.posed else {}
+        objects.append({"name": name_of(placed), "mesh": name_of(placed), **pose})
+    return {
+        "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
+        "camera": {"focal_px": parameters.focal_px}, "objects": objects,
+    }  # fmt: skip
+
+
+def write_records(out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]]) -> None:
+    """dataset.yaml and truth/truth.yaml."""
+    used = {name_of(placed): placed for shot in SHOTS for placed in shot.placed}
+    meshes = {name: {"file": f"meshes/{placed.shape}.ply", "material": placed.material} for name, placed in used.items()}
+    record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
+    folder.write_yaml(out / "dataset.yaml", record, "Generated: python -m factorlib.generate synthetic")
+    truth = {
+        "materials": {name: msgspec.to_builtins(material) for name, material in materials.items()},
+        "illumination": {name: f"truth/{name}_light.exr" for name in poses},
+        "normals": {name: f"truth/{name}_normal.exr" for name in poses},
+        "poses": {photo: {name: folder.pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
+    }
+    folder.write_yaml(out / "truth/truth.yaml", truth, "What the photos were made of; light in the units of the photos")
