@@ -1,0 +1,103 @@
+"""The align stage from masks and dataset slices to its files."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from tests.align.scenes import blob, chair, photo_of
+
+from factorlib.align.raster import rasterise
+from factorlib.align.search import Search
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr, write_exr
+from factorlib.jsonfile import write_json
+from factorlib.meshes import write_ply
+from factorlib.stage import Inputs, silent
+from stages import align
+
+QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
+
+
+def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, source=None, seed=8, edit=lambda label: label):
+    """Inputs of one photo of `mesh_in_photo`, told to be of `mesh_given`; and the truth."""
+    caster, camera, pose = photo_of(mesh_in_photo, seed, width=200, height=150)
+    label = edit(rasterise(caster, camera, pose).label.astype(float))
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    zero = np.zeros(label.shape)
+    write_exr(masks / "a.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
+    write_json(masks / "a.json", {"width": 200, "height": 150, "focal_px": focal, "focal_source": source})
+    write_ply(tmp_path / "thing.ply", mesh_given)
+    thing = {"name": "thing", "mesh": "thing"}
+    if pose_given:
+        thing["pose"] = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+    facts = {
+        "dataset.materials": ["white"],
+        "dataset.objects": {"camera": {}, "objects": [thing], "meshes": {"thing": {"file": "thing.ply", "material": "white"}}},
+    }
+    return Inputs({"masks": masks}, facts, {"thing.ply": tmp_path / "thing.ply"}, "a"), caster, camera, pose
+
+
+def run(tmp_path, inputs, name="out", **params):
+    out = tmp_path / name
+    out.mkdir()
+    align.main(align.Params(search=QUICK, **params), inputs, out, silent)
+    return out, json.loads((out / "a.json").read_text())
+
+
+def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
+    inputs, caster, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
+    out, entry = run(tmp_path, inputs)
+    thing = entry["objects"]["thing"]
+    assert thing["rotation"] == pose.rotation.tolist() and thing["translation"] == pose.translation.tolist()
+    assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["principal_point"] == [100.0, 75.0]
+    assert thing["source"] == "given" and thing["silhouette_iou"] > 0.99 and thing["label_agreement"] == 1
+    maps, truth = read_exr(out / "a.exr"), rasterise(caster, camera, pose)
+    both = (maps["label"] > 0) & (truth.label > 0)
+    for k, axis in enumerate("xyz"):
+        assert np.allclose(maps[f"normal.{axis}"][both], truth.normal[..., k][both], atol=1e-3)
+        assert np.allclose(maps[f"view.{axis}"][both], truth.view[..., k][both], atol=1e-6)
+    assert set(maps) >= {"depth", "label", "object", "confidence"} and (out / "a_overlay.png").stat().st_size > 0
+
+
+def test_focal_length_of_a_given_pose_is_found(tmp_path):
+    inputs, _, camera, _ = step(tmp_path, chair(), chair(), pose_given=True)
+    entry = run(tmp_path, inputs)[1]
+    assert entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.01) and entry["camera"]["focal_source"] == "estimated"
+
+
+def test_found_from_nothing_and_the_same_bytes_twice(tmp_path):
+    inputs, _, _, _ = step(tmp_path, chair(), chair())
+    first, entry = run(tmp_path, inputs, "first")
+    second, _ = run(tmp_path, inputs, "second")
+    thing = entry["objects"]["thing"]
+    assert thing["silhouette_iou"] > 0.97 and thing["doubts"] == [] and thing["source"] == "found"
+    assert 0 <= thing["runner_up"]["score"] < thing["score"]
+    for file in sorted(p.name for p in first.iterdir()):
+        assert (first / file).read_bytes() == (second / file).read_bytes(), file
+
+
+def test_exif_of_a_crop_is_found_out(tmp_path, caplog):
+    inputs, _, camera, _ = step(tmp_path, chair(), chair(), focal=90.0, source="exif")
+    with caplog.at_level(logging.WARNING, "factorlib.align"):
+        entry = run(tmp_path, inputs)[1]
+    assert "EXIF" in caplog.text and "camera.focal_px" in caplog.text
+    assert entry["camera"]["focal_source"] == "estimated" and entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.2)
+
+
+def test_a_wrong_mesh_is_doubted_and_stops_a_strict_run(tmp_path, caplog):
+    inputs, _, _, _ = step(tmp_path, chair(), blob(), focal=300.0, source="dataset")
+    with caplog.at_level(logging.WARNING, "factorlib.align"):
+        entry = run(tmp_path, inputs)[1]
+    assert entry["objects"]["thing"]["doubts"] and "give the object's pose" in caplog.text
+    with pytest.raises(InputError, match="overlap"):
+        run(tmp_path, inputs, "strict", strict=True)
+
+
+def test_object_without_a_pixel_is_refused(tmp_path):
+    inputs, _, _, _ = step(tmp_path, chair(), chair(), edit=lambda label: label * 0)
+    with pytest.raises(InputError, match="no pixel of the mask shows object 'thing'"):
+        run(tmp_path, inputs)
