@@ -70,7 +70,7 @@ SHOTS = (
     Shot(
         "study", ".jpg",
         (Placed("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False), Placed("bottle", "blue", 0.0, 0.0, (0.25, 0.15)), Placed("sphere", "green", 1.22)),
-        clipped=0.01,
+        clipped=0.03,
     ),
 )  # fmt: skip
 
@@ -96,10 +96,10 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
-def drawn_materials(rng: np.random.Generator, spread: float) -> dict[str, Material]:
-    """The set's materials, each number times exp(spread · normal), within k_d + k_s ≤ 0.95."""
+def drawn_materials(rng: np.random.Generator, spread: float, about: dict[str, Material] = MATERIALS) -> dict[str, Material]:
+    """The materials of `about`, each number times exp(spread · normal), within k_d + k_s ≤ 0.95."""
     drawn = {}
-    for name, material in MATERIALS.items():
+    for name, material in about.items():
         factor = np.exp(spread * rng.standard_normal(5))
         diffuse = np.array(material.diffuse) * factor[:3]
         specular = np.array(material.specular) * factor[3]
@@ -171,8 +171,10 @@ def composed(shot: Shot, light, materials, meshes, poses: dict[str, Pose], camer
 
 
 def exposure_of(radiance: Float[np.ndarray, "h w 3"], on_object: Bool[np.ndarray, "h w"], shot: Shot) -> float:
-    """The factor that clips the wanted fraction of object pixels, or that lets the brightest just not clip."""
+    """The factor that clips the wanted fraction of object pixels; for none, the brightest just not; floats have mean ¼."""
     brightest = radiance[on_object].max(axis=-1)
+    if shot.suffix == ".exr":
+        return float(0.25 / brightest.mean())
     return float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
 
 
