@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import yaml
@@ -28,7 +28,7 @@ _CORE = [  # YAML 1.2.2, section 10.3.2
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-    yaml_implicit_resolvers: dict = {}
+    yaml_implicit_resolvers: ClassVar[dict] = {}
 
 
 for _tag, _pattern in _CORE:
@@ -88,7 +88,9 @@ def _syntax_error(error: yaml.YAMLError, path: str | Path) -> InputError:
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or str(error)
     context = getattr(error, "context", None)
     found = f"not YAML: {problem}" + (f" {context}" if context else "")
-    return InputError(found, file=_at(path, mark.line + 1 if mark else None), cure="look for a bracket, quote, colon or indent on or above this line")
+    return InputError(
+        found, file=_at(path, mark.line + 1 if mark else None), cure="look for a bracket, quote, colon or indent on or above this line"
+    )
 
 
 def _value_of(node: yaml.Node, keys: Keys, lines: dict[Keys, int], path: str | Path, above: tuple) -> Any:

@@ -69,7 +69,10 @@ def _params_of(tree: ast.Module) -> list[str] | None:
 
 
 def _drop_docstring(node: ast.AST) -> None:
-    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node, clean=False) is not None:
+    if (
+        isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and ast.get_docstring(node, clean=False) is not None
+    ):
         node.body = node.body[1:] or [ast.Pass()]
 
 
@@ -132,7 +135,10 @@ class Sources:
             folder = self.roots[0] / package
             known = [p.stem for p in folder.glob("*.py") if p.stem != "__init__"]
             raise InputError(
-                f"the stage {stage!r} has no module {package}/{stage}.py", file=pipeline_file, key=f"stages.{stage}", cure=did_you_mean(stage, known)
+                f"the stage {stage!r} has no module {package}/{stage}.py",
+                file=pipeline_file,
+                key=f"stages.{stage}",
+                cure=did_you_mean(stage, known),
             )
         return file
 
@@ -150,7 +156,9 @@ class Sources:
 
     def _data(self, modules: dict[str, Path]) -> dict[str, str]:
         """Weights and templates beside the modules, or in folders beside them that are no packages."""
-        packages = {name.rpartition(".")[0]: file.parent for name, file in modules.items() if not file.is_dir() and file.name != "__init__.py"}
+        packages = {
+            name.rpartition(".")[0]: file.parent for name, file in modules.items() if not file.is_dir() and file.name != "__init__.py"
+        }
         packages |= {name: file.parent for name, file in modules.items() if file.name == "__init__.py"}
         packages.pop("", None)  # beside a module that is in no package lies anything
         files = {f"{name}:{path.relative_to(folder).as_posix()}": path for name, folder in packages.items() for path in _data_files(folder)}

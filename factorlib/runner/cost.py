@@ -14,7 +14,7 @@ class Meter:
 
     def __init__(self):
         _reset_peak()
-        self.started = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
+        self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
 
     def read(self, threads: int) -> dict:
@@ -24,12 +24,19 @@ class Meter:
             "cpu_seconds": round(_cpu_seconds() - self.cpu, 3),
             "memory_mb": round(_peak_bytes() / 2**20, 1),
             "threads": threads,
-            "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()},
+            "machine": {
+                "system": platform.system(),
+                "processor": platform.machine(),
+                "cores": os.cpu_count(),
+                "python": platform.python_version(),
+            },
         }
 
 
 def _cpu_seconds() -> float:
-    return sum(resource.getrusage(who).ru_utime + resource.getrusage(who).ru_stime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(
+        resource.getrusage(who).ru_utime + resource.getrusage(who).ru_stime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
 
 
 def _reset_peak() -> None:

@@ -7,7 +7,7 @@ import time
 
 from factorlib.runner.plan import Planned, Step
 
-BEAT = 5.0  # seconds between two plain lines about the same step
+BEAT = 10.0  # seconds between two plain lines about the same step
 
 
 def display_for(stream=None) -> Display:
@@ -28,6 +28,7 @@ class Display:
         self.left: dict[str, int] = {}
         self._warned: set[str] = set()
         self._waited: set[Step] = set()
+        self._begun: set[str] = set()
         self._spoke: dict[Step, float] = {}
         self._started: dict[Step, float] = {}
         self._words: dict[Step, str] = {}
@@ -44,8 +45,10 @@ class Display:
 
     def start(self, step: Step) -> None:
         self._started[step] = self._spoke[step] = time.monotonic()
-        if step.photo is None:
-            self.say(f"{step.stage:<10} …")
+        if step.stage not in self._begun:
+            self._begun.add(step.stage)
+            left = self.left.get(step.stage, 1)
+            self.say(f"{step.stage:<10} " + ("…" if step.photo is None else f"{left} photo{'s' * (left > 1)} …"))
 
     def waits(self, step: Step) -> None:
         if step not in self._waited:
@@ -61,7 +64,9 @@ class Display:
         for step, spoke in self._spoke.items():
             if now - spoke >= BEAT:
                 self._spoke[step] = now
-                self.say(f"{step.stage:<10} {step.photo or '':<16} {now - self._started[step]:6.0f} s  {self._words.get(step, '')}".rstrip())
+                self.say(
+                    f"{step.stage:<10} {step.photo or '':<16} {now - self._started[step]:6.0f} s  {self._words.get(step, '')}".rstrip()
+                )
 
     def warn(self, step: Step, text: str) -> None:
         if text not in self._warned:

@@ -63,7 +63,9 @@ def _cores() -> int:
 
 
 def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid()))
+    return ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid())
+    )
 
 
 class _Environment:

@@ -74,7 +74,9 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
         pipeline.order()
     except CycleError as error:
         circle = " <- ".join(error.args[1])
-        raise InputError(f"stages that need each other: {circle}", file=path, key="stages", cure="make the second pass a stage of its own") from None
+        raise InputError(
+            f"stages that need each other: {circle}", file=path, key="stages", cure="make the second pass a stage of its own"
+        ) from None
     return pipeline
 
 

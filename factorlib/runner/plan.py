@@ -47,8 +47,8 @@ class Spec(msgspec.Struct, frozen=True):
 
     def above(self, step: Step) -> list[Step]:
         """The steps whose results a step is handed."""
-        per_photo = [name for name in self.pipeline.stages[step.stage].upstream]
-        return [found for name in per_photo for found in self.steps_of(name) if step.photo is None or found.photo in (None, step.photo)]
+        upstream = self.pipeline.stages[step.stage].upstream
+        return [found for name in upstream for found in self.steps_of(name) if step.photo is None or found.photo in (None, step.photo)]
 
 
 class Listing(msgspec.Struct, frozen=True):
@@ -166,6 +166,4 @@ def names(steps: Iterable[Step]) -> str:
     counts: dict[str, list[Step]] = {}
     for step in steps:
         counts.setdefault(step.stage, []).append(step)
-    return ", ".join(
-        str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} photos)" for stage, found in counts.items()
-    )
+    return ", ".join(str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} photos)" for stage, found in counts.items())

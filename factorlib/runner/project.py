@@ -82,7 +82,11 @@ class Project(msgspec.Struct, frozen=True):
         if path.is_dir() or path.is_file():
             return path if path.is_dir() else path.parent
         known = [p.parent.name for p in (self.root / "data").glob("*/dataset.yaml")]
-        cure = did_you_mean(name, known) if known and "/" not in name else "name a folder in data/, or give a path to one with a dataset.yaml in it"
+        cure = (
+            did_you_mean(name, known)
+            if known and "/" not in name
+            else "name a folder in data/, or give a path to one with a dataset.yaml in it"
+        )
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
 

@@ -147,7 +147,7 @@ class Run:
         return Code(project.root, project.package, stage, spec.params, project.pipeline_file, spec.threads)
 
     def _task(self, planned: Planned) -> Task:
-        step, data, project = planned.step, self.survey.data, self.survey.project
+        step, data = planned.step, self.survey.data
         stage = self.survey.spec.pipeline.stages[step.stage]
         slices = {name: data.slice(name, step.photo) for name in stage.slices}
         files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}

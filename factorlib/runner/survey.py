@@ -111,4 +111,6 @@ def _hash(folder: Path, file: str, hashes: FileHashes) -> str:
     try:
         return hashes.content(folder / file)
     except OSError as error:
-        raise InputError(f"the file {file!r} cannot be read ({error.strerror})", file=folder, cure="check its name and permissions") from error
+        raise InputError(
+            f"the file {file!r} cannot be read ({error.strerror})", file=folder, cure="check its name and permissions"
+        ) from error

@@ -54,7 +54,9 @@ def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
         if tally.held_up:
             print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
         return 1
-    print(f"{seen.data.folder.name}: {words.count(tally.ran)} run, {len(seen.records) - len(tally.ran)} current, {time.perf_counter() - started:.1f} s")
+    print(
+        f"{seen.data.folder.name}: {words.count(tally.ran)} run, {len(seen.records) - len(tally.ran)} current, {time.perf_counter() - started:.1f} s"
+    )
     _name_results(seen, targets)
     return 0
 
