@@ -1,166 +1,149 @@
-"""The moulded side chair: a plastic shell on splayed dowel legs, in metres, y up, z toward the sitter's knees.
+"""The moulded side chair: a smooth shell with thickness on four splayed, tapered dowel legs with struts.
 
-Shell   A sheet S(u, v) bent along a profile in the y-z plane, v from the front lip (1) to the top of the back (−1),
-        u across (±1).  Toward its sides it rises along the profile's normal, which makes the hollow of the seat and the
-        embrace of the back.  The outline is a superellipse in (u, v), so its corners are round; the sheet is given
-        thickness along its own normals and a half-round rim.  One closed grid: the middle of the upper side is its top
-        pole, the middle of the lower side its bottom pole.
-Legs    Four tapered dowels, two bars under the seat and four struts that cross below it.
-
-The numbers describe the kind of chair, measured from nothing and nobody's drawing.
+Object frame: metres, y up, the floor at y = 0, the sitter looks along +z; made after the proportions of the well-known
+chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  `chair` is the one that is photographed;
+`rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere.
 """
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from factorlib.generate.shapes import closed_grid, smooth
+from factorlib.generate.shapes import smooth
 from factorlib.meshes.mesh import Mesh
 
-SHELL, LEGS = 1, 2  # labels of the parts
-OUTLINE = 5.0  # exponent of the superellipse: 2 is an ellipse, ∞ a rectangle
-FLANK = 2.6  # power of |u| by which the sides rise
-PROFILE = np.array([  # z, y from the front lip over the seat to the top of the back
-    (0.222, 0.398), (0.212, 0.424), (0.165, 0.440), (0.080, 0.433), (-0.020, 0.422), (-0.098, 0.427), (-0.156, 0.449),
-    (-0.198, 0.494), (-0.226, 0.562), (-0.246, 0.642), (-0.262, 0.722), (-0.275, 0.788), (-0.288, 0.826)])  # fmt: skip
-ALONG = (0.0, 0.12, 0.30, 0.45, 0.58, 0.75, 0.90, 1.0)  # fractions of the profile's length where the widths stand
-HALF_WIDTH = (0.200, 0.224, 0.236, 0.230, 0.214, 0.214, 0.222, 0.212)
-RISE = (0.006, 0.030, 0.050, 0.070, 0.078, 0.064, 0.042, 0.028)
-TOP, FOOT = np.array([0.120, 0.405, 0.105]), np.array([0.215, 0.012, 0.205])  # axis of the front right leg
+Part = tuple[np.ndarray, np.ndarray]  # vertices [V, 3], faces [F, 3]
+
+PROFILE = ((0.235, 0.405), (0.222, 0.428), (0.17, 0.436), (0.05, 0.420), (-0.07, 0.418), (-0.155, 0.447), (-0.200, 0.520),
+           (-0.222, 0.610), (-0.246, 0.710), (-0.272, 0.800), (-0.282, 0.815))  # z, y of the middle, front lip to top  # fmt: skip
+HALF_WIDTH = ((0.0, 0.212), (0.25, 0.228), (0.5, 0.235), (0.62, 0.222), (0.8, 0.210), (1.0, 0.190))  # at v along the profile
+CURL = ((0.0, 0.004), (0.15, 0.022), (0.35, 0.050), (0.52, 0.075), (0.66, 0.062), (0.85, 0.036), (1.0, 0.022))  # rise of the rim
+CORNERS = 0.5  # 0 a rectangular outline, 1 an oval one
+THICKNESS = 0.008
+TOPS = ((-0.105, 0.105), (0.105, 0.105), (0.105, -0.095), (-0.105, -0.095))  # x, z of the legs under the seat
+FEET = ((-0.225, 0.215), (0.225, 0.215), (0.225, -0.225), (-0.225, -0.225))
+SEAT_Y = 0.424
+LEG_RADII = (0.0125, 0.0155, 0.0105)  # top, middle, foot
+STRUTS = ((0, 0.36, 1, 0.62), (1, 0.36, 2, 0.62), (2, 0.36, 3, 0.62), (3, 0.36, 0, 0.62))  # leg, how far down, leg, how far down
+STRUT_RADIUS = 0.005
 
 
-class Chair(msgspec.Struct, frozen=True):
-    """What distinguishes one model of the chair from another; lengths in metres.
-
-    rows, columns: of the shell's grid, over both sides.  rise: factor on the hollow.  lean_deg: back tilted backward.
-    stretch: factors on x, y, z.  taper: foot radius over top radius.  splay: feet further out.
-    """
-
-    rows: int = 100
-    columns: int = 160
-    thickness: float = 0.009
-    rise: float = 1.0
-    lean_deg: float = 0.0
-    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    leg_radius: float = 0.0165
-    taper: float = 0.62
-    splay: float = 0.0
-    strut_radius: float = 0.0055
-    sides: int = 24
+def chair() -> dict[str, Part]:
+    """shell and legs, fine enough to be rendered smooth."""
+    return {"shell": shell(64, 96), "legs": legs(24, 14)}
 
 
-RENDERED = Chair()
-GIVEN = Chair(
-    rows=30, columns=52, thickness=0.012, rise=0.93, lean_deg=1.2, stretch=(1.012, 0.995, 0.99), leg_radius=0.0160, taper=0.75, splay=0.004,
-    strut_radius=0.0060, sides=8,
-)  # fmt: skip
+def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
+    """shell and legs with few faces, bent by about 4 mm in ways that differ from seed to seed."""
+    axes, phases = rng.normal(0, 5, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 1))
+    shifts = rng.normal(0, 0.002, (4, 3))
+
+    def bent(part: Part) -> Part:
+        vertices, faces = part
+        return vertices + np.sin(vertices @ axes.T + phases.T) @ shifts, faces
+
+    return {"shell": bent(shell(14, 22)), "legs": bent(legs(7, 3, radii=(0.0135, 0.0155, 0.0115)))}
 
 
-def chair(model: Chair = RENDERED) -> Mesh:
-    """Shell (label 1) and legs (label 2) as one mesh."""
-    return joined(list(parts(model).values()))
+def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
+    """One mesh of all parts, smooth within each, with their material labels."""
+    meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
+    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    return Mesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first)]).astype(np.int32),
+        normals=np.concatenate([mesh.normals for mesh in meshes]),
+        face_label=np.concatenate([mesh.face_label for mesh in meshes]),
+    )
 
 
-def parts(model: Chair = RENDERED) -> dict[str, Mesh]:
-    """Shell and legs, each a mesh of its own."""
-    return {"shell": shell(model), "legs": legs(model)}
+def shell(across: int, along: int) -> Part:
+    """The shell's upper and lower sides, half a thickness off its middle surface, joined by a rounded rim."""
+    s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
+    u, v = s * np.sqrt(1 - CORNERS * t**2 / 2), t * np.sqrt(1 - CORNERS * s**2 / 2)
+    middle, step = middle_surface(u, v), 1e-4
+    normal = np.cross(middle_surface(u + step, v) - middle_surface(u - step, v), middle_surface(u, v - step) - middle_surface(u, v + step))
+    normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
+    upper, lower = middle + normal * THICKNESS / 2, middle - normal * THICKNESS / 2
+    border = ring(*u.shape)
+    outward = rim_outward(middle.reshape(-1, 3)[border], normal.reshape(-1, 3)[border])
+    edge = middle.reshape(-1, 3)[border] + outward * THICKNESS / 2
+    return stitched(upper, lower, edge, border)
 
 
-def joined(meshes: list[Mesh]) -> Mesh:
-    """One mesh of several that share nothing."""
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + k for mesh, k in zip(meshes, first)]).astype(np.int32)
-    vertices, normals, label = (np.concatenate([getattr(m, name) for m in meshes]) for name in ("vertices", "normals", "face_label"))
-    return Mesh(vertices, faces, normals, label)
+def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    """A point of the shell: u from −1 to 1 across, v from −1 (front lip) to 1 (top of the back)."""
+    profile = np.array(PROFILE)
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    curve = CubicSpline(length / length[-1], profile)
+    at = (v + 1) / 2
+    (z, y), (dz, dy) = np.moveaxis(curve(at), -1, 0), np.moveaxis(curve(at, 1), -1, 0)
+    speed = np.hypot(dz, dy)
+    width, rise = (PchipInterpolator(*np.array(table).T)(at) for table in (HALF_WIDTH, CURL))
+    lift = rise * np.abs(u) ** 2.4
+    return np.stack([u * (width - 0.35 * lift), y - lift * dz / speed, z + lift * dy / speed], axis=-1)
 
 
-def shell(model: Chair) -> Mesh:
-    """The seat and back, a closed surface."""
-    half = model.thickness / 2
-    u, v, height = _sheet_grid(model, half / 0.21)
-    points = sheet(model, u, v) + height[..., None] * half * sheet_normal(model, u, v)
-    zero = np.zeros(())
-    middle, up = sheet(model, zero, zero), half * sheet_normal(model, zero, zero)
-    return smooth(*_stretched(model, closed_grid(points, middle + up, middle - up)), SHELL)
+def ring(rows: int, columns: int) -> np.ndarray:
+    """Indices of the border of a grid, once around."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    return np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
 
 
-def _sheet_grid(model: Chair, rim: float):
-    """u, v and height in half thicknesses (+1 upper side, −1 lower), [rows, columns], from the middle over the rim to the middle."""
-    turn = max(3, model.rows // 12)  # rows around the rim
-    flat = (model.rows - turn) // 2
-    reach = np.linspace(0, 1, flat + 1)[1:-1] * (1 - rim)
-    angle = np.linspace(0, np.pi, turn + 2)
-    radius = np.concatenate([reach, 1 - rim + rim * np.sin(angle), reach[::-1]])
-    height = np.concatenate([np.ones(flat - 1), np.cos(angle), -np.ones(flat - 1)])
-    phi = np.arange(model.columns) / model.columns * 2 * np.pi
-    across, along = np.sin(phi), np.cos(phi)
-    edge = (np.abs(across) ** OUTLINE + np.abs(along) ** OUTLINE) ** (-1 / OUTLINE)
-    roundness = radius[:, None] ** 1.5  # circles in the middle, where corners would crowd, the outline at the rim
-    scale = radius[:, None] * ((1 - roundness) + roundness * edge)
-    return scale * across, scale * along, np.broadcast_to(height[:, None], scale.shape)
+def rim_outward(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Unit directions out of a closed border, in the surface."""
+    along = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    out = np.cross(along, normal)
+    out *= np.sign(np.sum(out * (points - points.mean(axis=0)), axis=1).sum())
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def sheet(model: Chair, u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-    """Points of the sheet; v = 1 is the front lip, −1 the top of the back."""
-    along = np.clip((1 - v) / 2, 0, 1)
-    profile, slope = _profile(model)
-    z, y = np.moveaxis(profile(along), -1, 0)
-    dz, dy = np.moveaxis(slope(along), -1, 0)
-    length = np.hypot(dz, dy)
-    rise = model.rise * PchipInterpolator(ALONG, RISE)(along) * np.abs(u) ** FLANK
-    x = u * PchipInterpolator(ALONG, HALF_WIDTH)(along)
-    return np.stack([x, y - rise * dz / length, z + rise * dy / length], axis=-1)
+def stitched(upper: np.ndarray, lower: np.ndarray, edge: np.ndarray, border: np.ndarray) -> Part:
+    """Two grids of points and the edge between their borders as one closed surface, wound outward."""
+    rows, columns = upper.shape[:2]
+    count = rows * columns
+    index = np.arange(count).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+    rim = 2 * count + np.arange(len(border))
+    bands = [band(border, rim), band(rim, border + count)]
+    vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3), edge])
+    return vertices, np.concatenate([top, top[:, ::-1] + count, *bands])
 
 
-def _profile(model: Chair):
-    """(z, y) over the fraction of length [0, 1] from the lip, smoothed, and its derivative; the back leans by the model's angle."""
-    pivot, angle = PROFILE[6], np.radians(model.lean_deg)
-    offset = PROFILE - pivot
-    turned = offset @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) + pivot
-    points = np.where(np.arange(len(PROFILE))[:, None] > 6, turned, PROFILE)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    curve = CubicSpline(length / length[-1], points)
-    return curve, curve.derivative()
+def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Triangles between two closed rings of as many points."""
+    a, b, c, d = first, np.roll(first, -1), second, np.roll(second, -1)
+    return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
-def sheet_normal(model: Chair, u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"], step: float = 1e-4) -> Float[np.ndarray, "*n 3"]:
-    """Unit normal of the sheet on the side one sits on."""
-    across = sheet(model, u + step, v) - sheet(model, u - step, v)
-    low, high = np.maximum(v - step, -1), np.minimum(v + step, 1)
-    normal = np.cross(sheet(model, u, high) - sheet(model, u, low), across)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+def legs(sides: int, rings: int, radii=LEG_RADII) -> Part:
+    """Four legs and the struts between neighbours."""
+    top = [np.array([x, SEAT_Y, z]) for x, z in TOPS]
+    foot = [np.array([x, 0.0, z]) for x, z in FEET]
+    dowels = [dowel(a, b, radii, sides, rings) for a, b in zip(top, foot, strict=True)]
+    for one, low, other, high in STRUTS:
+        ends = top[one] + low * (foot[one] - top[one]), top[other] + high * (foot[other] - top[other])
+        dowels.append(dowel(*ends, (STRUT_RADIUS,) * 3, max(5, sides // 2), 2))
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in dowels])
+    return np.concatenate([d[0] for d in dowels]), np.concatenate([d[1] + offset for d, offset in zip(dowels, first)])
 
 
-def legs(model: Chair) -> Mesh:
-    """Dowels, bars and struts."""
-    corners = [np.array([sx, 1.0, sz]) for sx, sz in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-    foot = FOOT + [model.splay, 0, model.splay]
-    tops, feet = [TOP * c for c in corners], [foot * c for c in corners]
-    rods = [rod(top, low, model.leg_radius, model.leg_radius * model.taper, model.sides) for top, low in zip(tops, feet)]
-    rods += [rod(tops[a], tops[b], 0.011, 0.011, model.sides) for a, b in ((0, 3), (1, 2), (0, 1), (2, 3))]
-    for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
-        ends = tops[a] + 0.22 * (feet[a] - tops[a]), tops[b] + 0.62 * (feet[b] - tops[b])
-        rods.append(rod(*ends, model.strut_radius, model.strut_radius, model.sides))
-    return smooth(*_stretched(model, joined(rods)), LEGS)
-
-
-def rod(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float, end_radius: float, sides: int, rings: int = 12) -> Mesh:
-    """A round bar that tapers, with half-round ends."""
+def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii, sides: int, rings: int) -> Part:
+    """A closed round rod of radius `radii` at its start, middle and end."""
     axis = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(axis, [0.3, 0.1, 1.0])
-    side /= np.linalg.norm(side)
-    round_end = np.linspace(0, np.pi / 2, 4)[1:]
-    along = np.concatenate([-np.cos(round_end) * radius, np.linspace(0, np.linalg.norm(end - start), rings)[1:-1],
-                            np.linalg.norm(end - start) + np.sin(round_end - round_end[0]) * end_radius])  # fmt: skip
-    width = np.concatenate([np.sin(round_end) * radius, np.linspace(radius, end_radius, rings)[1:-1], np.cos(round_end - round_end[0]) * end_radius])
-    phi = -np.arange(sides) / sides * 2 * np.pi
-    ring = np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * np.cross(axis, side)
-    points = start + along[:, None, None] * axis + width[:, None, None] * ring
-    return closed_grid(points, start - radius * axis, end + end_radius * axis)
-
-
-def _stretched(model: Chair, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices * np.array(model.stretch), mesh.faces
+    across = np.cross(axis, [0.3, 0.2, 1.0])
+    across /= np.linalg.norm(across)
+    angle = np.arange(sides) / sides * 2 * np.pi
+    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+    at = np.linspace(0, 1, rings)
+    radius = PchipInterpolator([0, 0.5, 1], radii)(at)
+    points = start + at[:, None, None] * (end - start) + radius[:, None, None] * circle
+    index = np.arange(rings * sides).reshape(rings, sides)
+    tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
+    last = rings * sides
+    right = np.roll(index, -1, axis=1)
+    caps = [np.stack([np.full(sides, last), index[0], right[0]], -1), np.stack([np.full(sides, last + 1), right[-1], index[-1]], -1)]
+    return np.concatenate([points.reshape(-1, 3), [start, end]]), np.concatenate([tube, *caps])[:, ::-1]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float, Int
@@ -139,3 +141,13 @@ def pose_entry(pose: Pose) -> dict[str, Any]:
     """cam_from_object as dataset.yaml and truth.yaml write it."""
     return {"rotation": [[round(float(v), 6) for v in row] for row in pose.rotation], "translation": [float(v) for v in pose.translation]}
 
+
+def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Mapping[str, Pose]]) -> None:
+    """truth/truth.yaml: materials (structs), and by photo the light, the normals and the poses."""
+    truth = {
+        "materials": {name: msgspec.to_builtins(material) for name, material in materials.items()},
+        "illumination": {name: f"truth/{name}_light.exr" for name in poses},
+        "normals": {name: f"truth/{name}_normal.exr" for name in poses},
+        "poses": {photo: {name: pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
+    }
+    write_yaml(out / "truth/truth.yaml", truth, "What the photos were made of; lights in the units of their photos, seen from the objects")

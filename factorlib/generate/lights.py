@@ -58,8 +58,8 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 
 
 
-def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2) -> Things:
-    """A closed room of coloured walls with bright windows, warm lamps, pictures and blocks for furniture."""
+def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0) -> Things:
+    """A closed room of coloured walls with bright windows, warm lamps, pictures and furniture, none toward `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
     things = {
@@ -80,7 +80,7 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2) -> Things:
         warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
         things[f"lamp_{k}"] = {"type": "sphere", "center": place, "radius": rng.uniform(0.12, 0.18), "emitter": {"type": "area", "radiance": rgb(warm)}}
     for k in range(4):
-        angle = rng.uniform(0, 2 * np.pi)
+        angle = np.radians(clear_deg + rng.uniform(45, 315))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
         things[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
@@ -94,7 +94,7 @@ def wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 def vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A strong colour."""
-    return np.clip(rng.dirichlet([0.6, 0.6, 0.6]) * 0.9, 0.02, 0.8)
+    return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
 
 def wall(side: str, distance: float, half, colour, along: float = 0.0, rise: float = 0.0, glow=None) -> Things:
@@ -122,7 +122,7 @@ def _transforms():
 
 def map_of(things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place=(0, 0, 0)):
     """The light of a surrounding at a place, in a turned y-up frame."""
-    return light_seen(things, place, world_from_light, height, spp, seed, max_depth=8)
+    return light_seen(things, place, world_from_light, height, spp, seed, max_depth=-1)
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:

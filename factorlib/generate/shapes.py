@@ -18,8 +18,8 @@ VASE = ((0.0, 0.78), (0.22, 0.77), (0.33, 0.72), (0.31, 0.62), (0.29, 0.52), (0.
         (0.55, -0.38), (0.42, -0.62), (0.36, -0.74), (0.28, -0.78), (0.0, -0.79))  # fmt: skip
 BOTTLE = ((0.0, 0.86), (0.12, 0.85), (0.16, 0.80), (0.155, 0.70), (0.16, 0.52), (0.24, 0.36), (0.38, 0.20), (0.43, 0.02),
           (0.43, -0.30), (0.43, -0.62), (0.41, -0.72), (0.34, -0.77), (0.0, -0.78))  # fmt: skip
-BUMPS = (((0.75, 0.45, 0.35), 0.55, 4.0), ((-0.8, -0.1, 0.5), 0.30, 5.0), ((-0.1, 0.9, -0.4), 0.25, 6.0),
-         ((0.2, -0.9, 0.3), 0.22, 3.0), ((0.3, 0.1, -0.95), 0.18, 4.0))  # direction, height, sharpness  # fmt: skip
+BUMPS = (((0.8, 0.5, 0.3), 0.75, 3.5), ((-0.85, -0.15, 0.4), 0.40, 5.0), ((-0.15, 0.9, -0.4), 0.20, 5.0),
+         ((0.25, -0.9, 0.3), 0.30, 3.0), ((0.2, 0.1, -0.95), 0.35, 4.0))  # direction, height, sharpness  # fmt: skip
 
 
 def sphere(radius: float = 0.6) -> Mesh:
@@ -31,7 +31,7 @@ def blob() -> Mesh:
     """A smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction):
-        size = np.full(direction.shape[:-1], 0.45)
+        size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)
             size += 0.45 * height * np.exp(sharpness * (direction @ axis - 1))

@@ -80,7 +80,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
     rng = np.random.default_rng([7, seed])
-    materials = drawn_materials(rng, spread=0.0 if seed == 0 else 0.25)
+    materials = drawn_materials(rng, 0.0 if seed == 0 else 0.25, MATERIALS)
     meshes = {name: make() for name, make in SHAPES.items()}
     for name, mesh in meshes.items():
         write_ply(out / f"meshes/{name}.ply", mesh)
@@ -196,10 +196,4 @@ def write_records(out: Path, materials: dict[str, Material], photos: list[dict],
     meshes = {name: {"file": f"meshes/{placed.shape}.ply", "material": placed.material} for name, placed in used.items()}
     record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
     folder.write_yaml(out / "dataset.yaml", record, "Generated: python -m factorlib.generate synthetic")
-    truth = {
-        "materials": {name: msgspec.to_builtins(material) for name, material in materials.items()},
-        "illumination": {name: f"truth/{name}_light.exr" for name in poses},
-        "normals": {name: f"truth/{name}_normal.exr" for name in poses},
-        "poses": {photo: {name: folder.pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
-    }
-    folder.write_yaml(out / "truth/truth.yaml", truth, "What the photos were made of; light in the units of the photos")
+    folder.write_truth(out, materials, poses)
