@@ -152,5 +152,5 @@ def _student(k, lam, xx, yy, xy, det, cx, cy, ratio, misfit) -> tuple[Tensor, Te
         f = 2 * rate * k
         inflation = 1 + f * (trace + f * determinant)
         exponent = 0.5 * f * (square + f * (trace * square - across)) / inflation
-        density = density + weight * torch.exp(-ratio * exponent - misfit) * torch.rsqrt(inflation)
+        density = density + weight * torch.exp(-(ratio * exponent + misfit).clamp_max(60)) * torch.rsqrt(inflation)
     return density, torch.log1p(2 * k * (trace + 2 * k * determinant))

@@ -1,120 +1,129 @@
-"""Reflection networks: the closed forms times exp(a small perceptron of symmetric features).
+"""The reflection networks: each formula times the exponential of a small fully connected network.
 
-The closed form keeps the limits right, so the perceptron only has to learn a smooth factor.  Its features are smooth
-functions of the 2 (diffuse) and 5 (specular) scalars on which reflection depends.
+    R = closed form · exp(s · tanh(net(features) / s)),     s = 4
+
+Features are smooth functions of the symmetric inputs, most of them what the formula is made of: where it expanded the
+light, how far the product is from the normal, how much is above the horizon.  A lobe sharper than the training saw keeps
+the formula's limit: the correction fades as 1/√λ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn.functional import silu
 
 from factorlib.errors import InputError
-from factorlib.reflection.brdf import LEAST_COSINE, lobe_integral
-from factorlib.reflection.closed_form import filtered_specular, lobe_moments, mean_cosine
+from factorlib.reflection import diffuse as diffuse_form
+from factorlib.reflection.filtering import Filtered, filtered_specular
+from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import Operator
 
 SHIPPED = Path(__file__).parent / "weights"
-PARTS = ("diffuse", "specular")
-MOST = 6.0  # the learned factor stays within exp(±6)
-ROUGHNESS, SHARPNESS = (0.1, 1.0), (0.05, 10000.0)  # beyond, the factor is that of the nearest trained input
+LARGEST = 4.0  # of the logarithm of the correction
+SHARPEST = 1e4  # in training
 
 
-class Correction(nn.Module):
-    """log factor = perceptron((features − mean) / deviation), SiLU between layers, bounded by ±MOST."""
+class Layers(msgspec.Struct, frozen=True):
+    """A fully connected network of SiLU layers; `mean` and `scale` standardise its features."""
 
-    def __init__(self, inputs: int, width: int, depth: int):
-        super().__init__()
-        sizes = [inputs, *[width] * depth, 1]
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        self.register_buffer("mean", torch.zeros(inputs))
-        self.register_buffer("deviation", torch.ones(inputs))
+    mean: Float[Tensor, "features"]
+    scale: Float[Tensor, "features"]
+    weights: list[Tensor]  # [out, in] each
+    biases: list[Tensor]
 
-    def forward(self, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-        x = (features - self.mean) / self.deviation
-        for layer in self.layers[:-1]:
-            x = nn.functional.silu(layer(x))
-        return MOST * torch.tanh(self.layers[-1](x)[:, 0] / MOST)
+    def __call__(self, features: Float[Tensor, "*b features"]) -> Float[Tensor, "*b"]:
+        x = (features - self.mean) * self.scale
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = silu(torch.nn.functional.linear(x, weight, bias))
+        return torch.nn.functional.linear(x, self.weights[-1], self.biases[-1])[..., 0]
+
+    def to(self, dtype: torch.dtype) -> Layers:
+        return Layers(self.mean.to(dtype), self.scale.to(dtype), [w.to(dtype) for w in self.weights], [b.to(dtype) for b in self.biases])
 
 
-def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "n f"]:
-    """n flat cases."""
-    sharpness = sharpness.clamp(*SHARPNESS)
+def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
+    """Logarithm of the factor on the formula."""
+    fade = torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
+    return fade * LARGEST * torch.tanh(layers(features) / LARGEST)
+
+
+def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> Float[Tensor, "*b features"]:
+    """Bounded, smooth, and of the order of one; see `Filtered` for what they are made of."""
+    alpha = alpha.clamp(0.005, 1)
+    log_width = torch.log(form.sharpness.clamp_max(2e4))
+    u = form.ni / form.deviation
+    columns = (
+        torch.log(alpha),
+        log_width,
+        form.ratio,
+        no,
+        torch.log(no.clamp_min(1e-4) + 0.02),
+        nz,
+        oz,
+        form.px,
+        form.py * form.py,
+        form.misfit / (1 + form.misfit),
+        torch.log(form.density + 1e-5),
+        torch.log1p(form.spread),
+        torch.log1p(torch.log1p(form.distance)),
+        form.ni,
+        torch.log(form.deviation + 1e-3),
+        u * torch.rsqrt(4 + u * u),
+        u * torch.rsqrt(0.2 + u * u),
+        form.cosine / (form.cosine + alpha),
+        form.lit,
+        no / (no + alpha),
+    )
+    return torch.stack(torch.broadcast_tensors(*columns), -1)
+
+
+def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "*b features"]:
     mean, along, across = lobe_moments(sharpness)
-    u = mean * nz / torch.sqrt(across * (1 - nz**2).clamp_min(0) + along * nz**2 + 1e-9)
-    return torch.stack([mean, nz, mean * nz, torch.log1p(sharpness), torch.tanh(u / 2), torch.log1p((0.5 * u) ** 2)], -1)
-
-
-def specular_features(roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n f"]:
-    """n flat cases."""
-    roughness, sharpness = roughness.clamp(*ROUGHNESS), sharpness.clamp(*SHARPNESS)
-    alpha2 = roughness**4
-    mean, _, across = lobe_moments(sharpness)
-    mirror = (2 * no * nz - oz).clamp(-1, 1)
-    length = torch.sqrt((2 + 2 * oz).clamp_min(1e-4))
-    off2 = (1 - ((no + nz) / length) ** 2).clamp_min(0)
-    horizon = nz / torch.sqrt(across)
-    return torch.stack([
-        torch.log(roughness), torch.log1p(sharpness), no, torch.log(no), nz, oz, mirror, mean * nz, length,
-        torch.log(alpha2 + across), torch.log(alpha2 / (alpha2 + across)),
-        torch.log1p((1 - mirror) / (alpha2 + across)), torch.log1p(off2 / (alpha2 + across / 2)),
-        torch.tanh(horizon / 2), torch.tanh(nz / (alpha2 + 0.05)),
-    ], -1)  # fmt: skip
-
-
-FEATURES = {"diffuse": 6, "specular": 15}
+    u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
+    columns = mean, torch.log(gaussian_sharpness(sharpness).clamp_max(2e4)), nz, nz * nz, u * torch.rsqrt(1 + u * u), u * torch.rsqrt(8 + u * u)
+    return torch.stack(torch.broadcast_tensors(*columns), -1)
 
 
 class Network(Operator):
-    """Closed forms times learned corrections.  `weights`: folder of the two files, None for the shipped ones."""
+    """weights: folder with diffuse.safetensors and specular.safetensors; None takes the shipped ones."""
 
     def __init__(self, weights: str | Path | None = None, dtype: torch.dtype = torch.float32):
         super().__init__(dtype)
         folder = Path(weights) if weights is not None else SHIPPED
-        self.corrections = {part: read_correction(folder / f"{part}.safetensors", part).to(dtype) for part in PARTS}
+        self.layers = {part: read_layers(folder / f"{part}.safetensors").to(dtype) for part in ("diffuse", "specular")}
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        return corrected_diffuse(self.corrections["diffuse"], sharpness.expand(nz.shape).reshape(-1), nz.reshape(-1)).reshape(nz.shape)
+        nz = nz.clamp(-1, 1)
+        return diffuse_form.diffuse(sharpness, nz) * torch.exp(correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
-        flat = [t.expand(nz.shape).reshape(-1) for t in (roughness, sharpness, no[:, None], nz, oz)]
-        return corrected_specular(self.corrections["specular"], *flat).reshape(nz.shape)
+        alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, no[:, None], nz, oz)
+        form = filtered_specular(alpha, sharpness, no, nz, oz)
+        return form.value * torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))
 
 
-def corrected_diffuse(correction: Correction, sharpness: Tensor, nz: Tensor) -> Float[Tensor, "n"]:
-    nz = nz.clamp(-1, 1)
-    factor = torch.exp(correction(diffuse_features(sharpness, nz)))
-    return lobe_integral(sharpness) / torch.pi * mean_cosine(sharpness, nz) * factor
+def write_layers(path: Path, layers: Layers, **metadata: str) -> None:
+    """Weights as safetensors; the metadata say the architecture."""
+    tensors = {"feature.mean": layers.mean, "feature.scale": layers.scale}
+    for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+        tensors |= {f"layer.{k}.weight": weight, f"layer.{k}.bias": bias}
+    sizes = [layers.weights[0].shape[1], *(len(b) for b in layers.biases)]
+    about = {"architecture": "standardise, linear, SiLU, …, linear", "sizes": " ".join(map(str, sizes)), **metadata}
+    save_file({name: t.detach().float().contiguous() for name, t in tensors.items()}, path, metadata=about)
+    path.chmod(0o644)
 
 
-def corrected_specular(correction: Correction, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n"]:
-    no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
-    factor = torch.exp(correction(specular_features(roughness, sharpness, no, nz, oz)))
-    return filtered_specular(roughness**2, sharpness, no, nz, oz) * factor
-
-
-def write_correction(path: str | Path, correction: Correction) -> None:
-    save_file({name: tensor.contiguous() for name, tensor in correction.state_dict().items()}, str(path))
-
-
-def read_correction(path: str | Path, part: str) -> Correction:
-    """Raises InputError where the file is missing or of another architecture."""
-    try:
-        state = load_file(str(path))
-        layers = [state[f"layers.{k}.weight"] for k in range(sum(name.endswith("weight") for name in state))]
-        correction = Correction(layers[0].shape[1], layers[0].shape[0], len(layers) - 1)
-        correction.load_state_dict(state)
-        _expect(layers, FEATURES[part])
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise InputError(f"not the weights of a {part} network ({error})", file=path, cure="run the stage `train` again") from error
-    return correction.eval().requires_grad_(False)
-
-
-def _expect(layers: Sequence[Tensor], inputs: int) -> None:
-    if layers[0].shape[1] != inputs:
-        raise ValueError(f"{layers[0].shape[1]} features, {inputs} expected")
+def read_layers(path: Path) -> Layers:
+    if not path.exists():
+        raise InputError("no weights of the reflection network here", file=path, cure="make them by `make train`, or leave `weights` out")
+    with safe_open(path, framework="pt") as file:
+        count = sum(name.endswith(".bias") for name in file.keys())  # noqa: SIM118
+        weights, biases = ([file.get_tensor(f"layer.{k}.{kind}") for k in range(count)] for kind in ("weight", "bias"))
+        return Layers(file.get_tensor("feature.mean"), file.get_tensor("feature.scale"), weights, biases)

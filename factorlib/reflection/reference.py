@@ -28,7 +28,7 @@ from factorlib.reflection.brdf import LEAST_COSINE, ggx, smith
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.operator import Operator
 
-LEVELS = (12, 18, 27, 40, 60, 90, 135, 202, 303, 455)  # nodes in each direction, raised until two levels agree
+LEVELS = (8, 12, 18, 27, 40, 60, 90, 135, 202, 303, 455)  # nodes in each direction, raised until two levels agree
 FLOOR = 1e-5  # errors are relative to S + FLOOR × the lobe's integral
 REACH = 7.6  # a lobe is cut at e^(−REACH²/2) of its peak
 NODES_AT_ONCE = 1 << 17

@@ -16,7 +16,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from factorlib.reflection.lobe import lobe_integral
-from factorlib.reflection.reference import converged
+from factorlib.reflection.reference import converged, diffuse_quadrature
 
 
 class Samples(msgspec.Struct, frozen=True):
@@ -38,6 +38,31 @@ class Samples(msgspec.Struct, frozen=True):
 
     def __len__(self) -> int:
         return len(self.alpha)
+
+
+class DiffuseSamples(msgspec.Struct, frozen=True):
+    """The two scalars of the diffuse part and its value, float64."""
+
+    sharpness: Float[Tensor, "n"]
+    nz: Float[Tensor, "n"]
+    value: Float[Tensor, "n"]
+
+    def scale(self) -> Float[Tensor, "n"]:
+        """S + E/100, as for the specular part."""
+        return self.value + lobe_integral(self.sharpness) / 100
+
+    def __len__(self) -> int:
+        return len(self.sharpness)
+
+
+def diffuse_samples(count: int, seed: int, *, sharpness=(0.3, 5000.0)) -> DiffuseSamples:
+    """Sharpness log-uniform; n·z uniform for one half, within three widths of the horizon for the other."""
+    u = torch.from_numpy(qmc.Sobol(3, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count])
+    lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 0]
+    even = 2 * u[:, 1] - 1
+    nz = torch.where(u[:, 2] < 0.5, even, (3 * even / torch.sqrt(lam)).clamp(-1, 1))
+    value = torch.cat([diffuse_quadrature(a, c) for a, c in zip(lam.split(4096), nz.split(4096), strict=True)])
+    return DiffuseSamples(lam, nz, value)
 
 
 def specular_inputs(count: int, seed: int, *, alpha=(0.01, 1.0), sharpness=(0.3, 5000.0), least_no: float = 0.02) -> tuple[Tensor, ...]:

@@ -1,136 +1,131 @@
-"""Training the reflection networks from nothing: samples by quadrature, Adam on the relative error.
+"""Training of the reflection networks on samples of the reference.
 
-The error is that of the operator's evaluation, |R − S| / (S + E/100), with S the reference and E the lobe's integral;
-training lowers its pseudo-Huber mean.  The weights kept are those of the least held-out 95th percentile.
+The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at its tip; Adam, with a step that warms up and
+falls to zero by a cosine; the weights that are kept are those of the least held-out error.  Everything is seeded and the
+threads are fixed, so that the same parameters give the same bytes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import msgspec
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.reflection.brdf import lobe_integral
-from factorlib.reflection.network import FEATURES, Correction, corrected_diffuse, corrected_specular, diffuse_features, specular_features
-from factorlib.reflection.reference import diffuse_by_quadrature, specular_by_quadrature
-
-Report = Callable[[float, float, str], None]
-BATCH = 500  # samples whose quadrature is done at once
+from factorlib.reflection.diffuse import diffuse
+from factorlib.reflection.filtering import filtered_specular
+from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
+from factorlib.reflection.samples import DiffuseSamples, Samples
 
 
-class Training(msgspec.Struct, frozen=True):
-    """samples and steps of the specular network; polar × azimuth nodes of its quadrature (error below 1e-3 for 95 %)."""
+class Schedule(msgspec.Struct, frozen=True):
+    """steps of `batch` samples each;  rate: greatest step of Adam;  width, depth: of the hidden layers."""
 
-    samples: int = 120_000
-    held_out: int = 8_000
-    steps: int = 4_000
-    batch: int = 4_096
-    width: int = 64
-    depth: int = 3
-    rate: float = 4e-3
-    polar: int = 48
-    azimuth: int = 64
-    seed: int = 0
+    steps: int
+    batch: int
+    rate: float
+    width: int
+    depth: int
+    seed: int
 
 
-class Curve(msgspec.Struct, frozen=True):
-    part: str
+class Problem(msgspec.Struct, frozen=True):
+    """What a network is fitted to: features, the formula's value, the exact value and the unit of its error."""
+
+    features: Float[Tensor, "n f"]
+    sharpness: Float[Tensor, "n"]
+    formula: Float[Tensor, "n"]
+    exact: Float[Tensor, "n"]
+    unit: Float[Tensor, "n"]
+
+    def rows(self, index) -> Problem:
+        return Problem(*(getattr(self, name)[index] for name in self.__struct_fields__))
+
+    def float(self) -> Problem:
+        return Problem(*(getattr(self, name).float() for name in self.__struct_fields__))
+
+    def errors(self, layers: Layers) -> Float[Tensor, "n"]:
+        return (self.formula * torch.exp(correction(layers, self.features, self.sharpness)) - self.exact) / self.unit
+
+
+def specular_problem(samples: Samples) -> Problem:
+    form = filtered_specular(*samples.inputs())
+    features = specular_features(samples.alpha, samples.no, samples.nz, samples.oz, form)
+    return Problem(features, samples.sharpness, form.value, samples.value, samples.scale())
+
+
+def diffuse_problem(samples: DiffuseSamples) -> Problem:
+    formula = diffuse(samples.sharpness, samples.nz)
+    return Problem(diffuse_features(samples.sharpness, samples.nz), samples.sharpness, formula, samples.value, samples.scale())
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One point of the training curve."""
+
     step: int
-    loss: float
-    median: float
-    p95: float
-    worst: float
+    training_loss: float
+    held_out_median_error: float
+    held_out_p95_error: float
 
 
-def specular_cases(count: int, seed: int) -> list[Tensor]:
-    """roughness, sharpness, n·o, n·z, o·z: α log-uniform .01–1, λ log-uniform .1–5000, n·o uniform .02–1; the axis around the
-    mirror direction with a spread of 2√(α²/2 + 1/λ) for two thirds, uniform on the sphere for one third."""
-    g = torch.Generator().manual_seed(seed)
-    uniform = lambda: torch.rand(count, generator=g, dtype=torch.float64)  # noqa: E731
-    normal = lambda: torch.randn(count, 3, generator=g, dtype=torch.float64)  # noqa: E731
-    alpha, sharpness, no = 0.01 * 100 ** uniform(), 0.1 * 50_000 ** uniform(), 0.02 + 0.98 * uniform()
-    sin = torch.sqrt(1 - no**2)
-    view = torch.stack([sin, 0 * no, no], 1)
-    near = view * torch.tensor([-1.0, 1.0, 1.0]) + 2 * torch.sqrt(alpha**2 / 2 + 1 / sharpness)[:, None] * normal()
-    axis = torch.where((uniform() < 2 / 3)[:, None], near, normal())
-    axis = axis / axis.norm(dim=1, keepdim=True)
-    return [alpha.sqrt(), sharpness, no, axis[:, 2], (axis * view).sum(1)]
-
-
-def diffuse_cases(count: int, seed: int) -> list[Tensor]:
-    """sharpness log-uniform .05–5000 and n·z: half uniform, half within three widths of the horizon."""
-    g = torch.Generator().manual_seed(seed)
-    sharpness = 0.05 * 100_000 ** torch.rand(count, generator=g, dtype=torch.float64)
-    uniform = 2 * torch.rand(count, generator=g, dtype=torch.float64) - 1
-    near = (3 * uniform / torch.sqrt(sharpness)).clamp(-1, 1)
-    return [sharpness, torch.where(torch.rand(count, generator=g) < 0.5, uniform, near)]
-
-
-def relative_error(value: Tensor, reference: Tensor, sharpness: Tensor) -> Tensor:
-    """(R − S) / (S + E/100)."""
-    return (value - reference) / (reference + lobe_integral(sharpness) / 100)
-
-
-def specular_reference(cases: list[Tensor], polar: int, azimuth: int, report: Report = lambda *_: None) -> Tensor:
-    count = len(cases[0])
-    values = []
-    for i in range(0, count, BATCH):
-        values.append(specular_by_quadrature(*(c[i : i + BATCH] for c in cases), polar, azimuth))
-        report(i / count, 1.0, "samples")
-    return torch.cat(values)
-
-
-def trained_networks(training: Training, report: Report = lambda *_: None) -> tuple[dict[str, Correction], list[Curve]]:
-    """Both networks and their training curves; the same `training` gives the same weights on the same number of threads."""
-    t = training
-    cases = specular_cases(t.samples + t.held_out, t.seed + 1)
-    values = specular_reference(cases, t.polar, t.azimuth, lambda done, _, text: report(0.3 * done, 1.0, text))
-    specular = _fitted("specular", cases, values, training, lambda done, text: report(0.3 + 0.6 * done, 1.0, text))
-    cases = diffuse_cases(t.samples // 4 + t.held_out, t.seed + 2)
-    small = msgspec.structs.replace(t, width=24, depth=2, steps=max(t.steps // 2, 1))
-    diffuse = _fitted("diffuse", cases, diffuse_by_quadrature(*cases), small, lambda done, text: report(0.9 + 0.1 * done, 1.0, text))
-    return {"diffuse": diffuse[0], "specular": specular[0]}, [*diffuse[1], *specular[1]]
-
-
-EVALUATE = {"diffuse": corrected_diffuse, "specular": corrected_specular}
-FEATURES_OF = {"diffuse": diffuse_features, "specular": specular_features}
-
-
-def _fitted(part: str, cases: list[Tensor], values: Tensor, t: Training, report: Callable) -> tuple[Correction, list[Curve]]:
-    torch.manual_seed(t.seed)
-    network = Correction(FEATURES[part], t.width, t.depth)
-    held = [c[-t.held_out :].float() for c in (*cases, values)]
-    train = [c[: -t.held_out].float() for c in (*cases, values)]
-    features = FEATURES_OF[part](*train[:-1])
-    network.mean.copy_(features.mean(0))
-    network.deviation.copy_(features.std(0))
-    sharpness_at = {"diffuse": 0, "specular": 1}[part]
-    optimiser = torch.optim.Adam(network.parameters(), lr=t.rate, betas=(0.9, 0.98))
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, t.rate, total_steps=t.steps, pct_start=0.05)
-    generator = torch.Generator().manual_seed(t.seed)
-    curve, best, kept = [], float("inf"), None
-    for step in range(t.steps):
-        rows = torch.randint(len(train[0]), (t.batch,), generator=generator)
-        batch = [c[rows] for c in train]
-        error = relative_error(EVALUATE[part](network, *batch[:-1]), batch[-1], batch[sharpness_at])
-        scale = 0.02
-        loss = (scale * (torch.sqrt(1 + (error / scale) ** 2) - 1)).mean()
-        optimiser.zero_grad()
+def train(problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None]) -> tuple[Layers, list[Step]]:
+    """The network of least held-out error, and the curve."""
+    problem, held_out = problem.float(), held_out.float()
+    generator = torch.Generator().manual_seed(schedule.seed)
+    layers = initial_layers(problem.features, schedule, generator)
+    parameters = [*layers.weights, *layers.biases]
+    optimiser = torch.optim.Adam(parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+    slope = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda k: _rate(k, schedule.steps))
+    best, kept, curve, running = math.inf, layers, [], 0.0
+    every = max(1, schedule.steps // 40)
+    order = torch.empty(0, dtype=torch.long)
+    for step in range(1, schedule.steps + 1):
+        if len(order) < schedule.batch:
+            order = torch.randperm(len(problem.exact), generator=generator)
+        batch, order = problem.rows(order[: schedule.batch]), order[schedule.batch :]
+        loss = robust(batch.errors(layers)).mean()
+        optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-        schedule.step()
-        if (step + 1) % max(t.steps // 20, 1) == 0:
-            curve.append(_point(part, step + 1, float(loss), network, held, sharpness_at))
-            report((step + 1) / t.steps, f"{part} step {step + 1}: error {curve[-1].median:.2%}, 95th percentile {curve[-1].p95:.2%}")
-            if curve[-1].p95 < best:
-                best, kept = curve[-1].p95, {k: v.clone() for k, v in network.state_dict().items()}
-    network.load_state_dict(kept)
-    return network.eval().requires_grad_(False), curve
+        slope.step()
+        running += (float(loss.detach()) - running) / min(step, every)
+        if step % every == 0:
+            point = _measured(step, running, layers, held_out)
+            curve.append(point)
+            report(point)
+            if (score := point.held_out_median_error + 0.1 * point.held_out_p95_error) < best:
+                best, kept = score, _copy(layers)
+    return kept, curve
 
 
-def _point(part: str, step: int, loss: float, network: Correction, held: list[Tensor], sharpness_at: int) -> Curve:
+def robust(error: Tensor) -> Tensor:
+    """|e| away from its tip, and more than that where e is large, so that no single case is left behind."""
+    return torch.sqrt(error * error + 1e-6) + 2 * error * error
+
+
+def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator: torch.Generator) -> Layers:
+    sizes = [features.shape[1], *[schedule.width] * schedule.depth, 1]
+    weights = [torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in zip(sizes, sizes[1:], strict=False)]
+    weights[-1] *= 0.1
+    biases = [torch.zeros(b) for b in sizes[1:]]
+    for tensor in (*weights, *biases):
+        tensor.requires_grad_()
+    return Layers(features.mean(0), 1 / (features.std(0) + 1e-3), weights, biases)
+
+
+def _rate(step: int, steps: int) -> float:
+    warm = min(1.0, (step + 1) / max(1, steps // 30))
+    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
+
+
+def _measured(step: int, loss: float, layers: Layers, held_out: Problem) -> Step:
     with torch.no_grad():
-        error = relative_error(EVALUATE[part](network, *held[:-1]), held[-1], held[sharpness_at]).abs()
-    return Curve(part, step, loss, float(error.median()), float(error.quantile(0.95)), float(error.max()))
+        error = held_out.errors(layers).abs()
+    return Step(step, loss, float(error.median()), float(error.quantile(0.95)))
+
+
+def _copy(layers: Layers) -> Layers:
+    return Layers(layers.mean, layers.scale, [w.detach().clone() for w in layers.weights], [b.detach().clone() for b in layers.biases])

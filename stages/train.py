@@ -1,0 +1,91 @@
+"""Train the reflection networks on samples of the reference operator; needs nothing but parameters.
+
+Writes specular.safetensors and diffuse.safetensors, training.parquet (the curve) and accuracy.json (held-out errors).
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from factorlib.jsonfile import write_json
+from factorlib.reflection.accuracy import diffuse_table, specular_table
+from factorlib.reflection.network import write_layers
+from factorlib.reflection.samples import diffuse_samples, specular_samples
+from factorlib.reflection.training import Schedule, Step, diffuse_problem, specular_problem, train
+from factorlib.stage import Inputs, Progress
+
+Meta = msgspec.Meta
+HELD_OUT_TOLERANCE = 1e-5  # of the reference; a tenth of the median error that is measured with it, or less
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """samples: of the reference, to fit;  held_out: others, to measure;  tolerance: of the reference on `samples`.
+
+    steps, batch, rate: of Adam;  width, depth: hidden layers of the specular network;  diffuse_…: of the diffuse one.
+    """
+
+    samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 262_144
+    held_out: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
+    tolerance: Annotated[float, Meta(gt=0, le=0.1)] = 1e-3
+    steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 16_000
+    batch: Annotated[int, Meta(ge=64, le=1 << 16)] = 2048
+    rate: Annotated[float, Meta(gt=0, le=0.1)] = 4e-3
+    width: Annotated[int, Meta(ge=4, le=1024)] = 64
+    depth: Annotated[int, Meta(ge=1, le=16)] = 3
+    diffuse_samples: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
+    diffuse_steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 2000
+    diffuse_width: Annotated[int, Meta(ge=4, le=1024)] = 16
+    diffuse_depth: Annotated[int, Meta(ge=1, le=16)] = 2
+    seed: Annotated[int, Meta(ge=0)] = 0
+
+
+# What training sees beyond what is measured, so that the edges of the domain are not the edges of the training set.
+WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
+    try:
+        curves = {"diffuse": _diffuse(params, out, progress), "specular": _specular(params, out, progress)}
+    finally:
+        torch.set_num_threads(threads)
+    write_json(out / "accuracy.json", {part: table for part, (table, _) in curves.items()})
+    _write_curves(out / "training.parquet", {part: curve for part, (_, curve) in curves.items()})
+
+
+def _specular(params: Params, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
+    progress(0, 1, "specular: samples of the reference")
+    seen = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
+    held_out = specular_samples(params.held_out, params.seed + 1_000_003, tolerance=HELD_OUT_TOLERANCE)
+    schedule = Schedule(params.steps, params.batch, params.rate, params.width, params.depth, params.seed)
+    problem = specular_problem(held_out)
+    layers, curve = train(specular_problem(seen), problem, schedule, _report(progress, "specular", params.steps))
+    write_layers(out / "specular.safetensors", layers, inputs="see factorlib.reflection.network.specular_features")
+    return specular_table(problem.float().errors(layers), *held_out.inputs()), curve
+
+
+def _diffuse(params: Params, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
+    seen = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
+    held_out = diffuse_samples(params.held_out, params.seed + 1_000_003)
+    schedule = Schedule(params.diffuse_steps, params.batch, params.rate, params.diffuse_width, params.diffuse_depth, params.seed)
+    problem = diffuse_problem(held_out)
+    layers, curve = train(diffuse_problem(seen), problem, schedule, _report(progress, "diffuse", params.diffuse_steps))
+    write_layers(out / "diffuse.safetensors", layers, inputs="see factorlib.reflection.network.diffuse_features")
+    return diffuse_table(problem.float().errors(layers), held_out.sharpness, held_out.nz), curve
+
+
+def _report(progress: Progress, part: str, steps: int):
+    def report(point: Step) -> None:
+        progress(point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)")
+
+    return report
+
+
+def _write_curves(path: Path, curves: dict[str, list[Step]]) -> None:
+    rows = [{"part": part, **msgspec.structs.asdict(point)} for part, curve in curves.items() for point in curve]
+    pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
