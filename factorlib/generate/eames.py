@@ -36,8 +36,8 @@ class Parameters(msgspec.Struct, frozen=True):
     width: int = 480
     height: int = 360
     light_rows: int = 128
-    spp: int = 192
-    light_spp: int = 32
+    spp: int = 224
+    light_spp: int = 24
 
 
 class Shot(msgspec.Struct, frozen=True):
@@ -69,12 +69,12 @@ MATERIALS = {
     "wood": Material((0.44, 0.27, 0.13), (0.04, 0.04, 0.04), 0.45),
 }
 SHOTS = (
-    Shot("terrace", ("red", "white"), -25, 2.7, 1.5, 35, "exif", sun=(48, 55)),
-    Shot("kitchen", ("yellow",), 38, 2.0, 1.35, 42, "nothing", windows=2, lamps=1),
-    Shot("hall", ("black", "yellow"), 20, 2.4, 1.5, 35, "given", windows=1, lamps=3),
-    Shot("garden", ("white",), 62, 2.3, 1.3, 50, "exif", sun=(18, -75), turbidity=6.0),
-    Shot("office", ("red",), -48, 2.1, 1.45, 40, "nothing", windows=3, lamps=1),
-    Shot("patio", ("black",), 150, 2.2, 1.2, 45, "exif", sun=(32, -30), turbidity=3.0),
+    Shot("terrace", ("red", "white"), -25, 2.5, 1.5, 45, "exif", sun=(48, 55)),
+    Shot("kitchen", ("yellow",), 38, 2.0, 1.35, 45, "nothing", windows=2, lamps=1),
+    Shot("hall", ("black", "yellow"), 20, 2.3, 1.5, 40, "given", windows=1, lamps=3),
+    Shot("garden", ("white",), 62, 2.3, 1.3, 55, "exif", sun=(18, -75), turbidity=6.0),
+    Shot("office", ("red",), -48, 2.1, 1.45, 43, "nothing", windows=3, lamps=1),
+    Shot("patio", ("black",), 150, 2.2, 1.2, 50, "exif", sun=(32, -30), turbidity=3.0),
 )
 CLIPPED = 0.02  # of the chairs' pixels
 APART = 0.42  # half the distance between two chairs, metres

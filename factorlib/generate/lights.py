@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.generate.tracing import light_seen, rgb, transform
+from factorlib.generate.tracing import envmap, light_seen, rgb, transform
 from factorlib.images.photo import read_photo
 from factorlib.light.latlong import turned_map
 
+SKY_ROWS = 256
 EYE = 1.2  # height of the origin over the ground
 Things = dict[str, Any]
 TURNS = {"+x": (0, 90, 0), "-x": (0, -90, 0), "+z": (0, 0, 0), "-z": (0, 180, 0), "+y": (-90, 0, 0), "-y": (90, 0, 0)}
@@ -34,7 +35,8 @@ def daylight(
 ) -> Things:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
-    The sun is veiled: wider and weaker than the real one, of which 0.5° across nothing but a mirror would tell.
+    The sun is veiled: wider and weaker than the real one, whose 0.5° nothing but a mirror would tell.  The sky is handed
+    on as a map, which Mitsuba samples with less noise than the model itself.
     """
     up, turn = np.radians([elevation_deg, azimuth_deg])
     sun = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
@@ -42,7 +44,8 @@ def daylight(
         "type": "sunsky", "turbidity": turbidity, "sun_scale": sun_scale, "sun_aperture": sun_aperture_deg,
         "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
     }  # fmt: skip
-    things = {"sky": sky, "ground": wall("-y", EYE, (200, 200), ground)}
+    seen = light_seen({"sky": sky}, (0, 0, 0), np.eye(3), SKY_ROWS, 4, 0, max_depth=2)
+    things = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), ground)}
     return things | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
 
 
@@ -80,7 +83,7 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
         warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
         things[f"lamp_{k}"] = {"type": "sphere", "center": place, "radius": rng.uniform(0.12, 0.18), "emitter": {"type": "area", "radiance": rgb(warm)}}
     for k in range(4):
-        angle = np.radians(clear_deg + rng.uniform(45, 315))
+        angle = np.radians(clear_deg + rng.uniform(75, 285))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
         things[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))

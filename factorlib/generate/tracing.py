@@ -94,10 +94,10 @@ def traced(things: dict[str, Any], camera: Camera, world_from_camera, spp: int, 
     return np.array(mi.render(scene, seed=seed, spp=spp), dtype=np.float64)
 
 
-def envmap(lat_long: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
+def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
     """An emitter of a lat-long map in the world's frame: bilinear between the map's texel centres."""
     height, width = lat_long.shape[:2]
-    rows, columns = ENVMAP_FINER * height + 1, ENVMAP_FINER * width
+    rows, columns = finer * height + 1, finer * width
     theta = np.arange(rows) / (rows - 1) * np.pi
     phi = (0.5 - (np.arange(columns) + 0.5) / columns) * 2 * np.pi
     sin = np.sin(theta)[:, None]
