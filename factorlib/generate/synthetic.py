@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 
 from factorlib.align.camera import Camera, Pose, rotation_of_vector
 from factorlib.align.raster import rasterise
@@ -159,14 +160,15 @@ def write_shot(out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh],
 
 
 def composed(shot: Shot, light, materials, meshes, poses: dict[str, Pose], camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """The photo: each third of its width shows the object that stands there, traced alone."""
+    """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
     radiance = np.zeros((camera.height, camera.width, 3))
     world = rigid(YUP_FROM_CAMERA, np.zeros(3))
-    edges = np.linspace(0, camera.width, len(shot.placed) + 1).astype(int)
+    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, list(poses.values()))
+    nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses.values(), strict=True)):
         thing = shape(meshes[placed.shape], bsdf(materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
         alone = traced({"thing": thing, "light": envmap(light)}, camera, world, spp, 100 * seed + number, max_depth=2)
-        radiance[:, edges[number] : edges[number + 1]] = alone[:, edges[number] : edges[number + 1]]
+        radiance[nearest == number] = alone[nearest == number]
     return radiance
 
 
