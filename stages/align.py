@@ -111,7 +111,9 @@ def doubts(iou: float, agreement: float, found: Found | None, params: Params) ->
         reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
     other = found.runner_up if found else None
     if other and found.score - other.score < params.least_lead and other.normal_difference_deg > 5:
-        reasons.append(f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})")
+        reasons.append(
+            f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})"
+        )
     return reasons
 
 

@@ -21,7 +21,7 @@ class Camera(msgspec.Struct, frozen=True):
         parameters = [self.focal, *self.centre]
         return pycolmap.Camera(model="SIMPLE_PINHOLE", width=self.width, height=self.height, params=parameters)
 
-    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Pixels of points in the camera frame, z > 0."""
         return self.focal * points[..., :2] / points[..., 2:] + np.array(self.centre)
 

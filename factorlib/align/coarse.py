@@ -67,12 +67,10 @@ def is_cut(evidence: Evidence) -> bool:
     unknown = ndimage.distance_transform_edt(~(ndimage.distance_transform_edt(unknown) > reach)) <= reach + 1  # opened
     inside = np.pad(evidence.inside, pad)
     border = inside & ~ndimage.binary_erosion(inside)
-    return np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border)
+    return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
 
 
-def candidates(
-    caster: Caster, evidence: Evidence, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float
-) -> list[Candidate]:
+def candidates(caster: Caster, evidence: Evidence, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float) -> list[Candidate]:
     """The `keep` best guesses that differ by `apart_deg` in rotation, best first."""
     labels = caster.mesh.labels
     low, high, extent = extent_of(evidence)

@@ -37,9 +37,7 @@ def whole_evidence(channels: Mapping[str, Float[np.ndarray, "h w"]]) -> Evidence
     return Evidence(label)
 
 
-def object_evidence(
-    channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool
-) -> Evidence:
+def object_evidence(channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool) -> Evidence:
     """Of object `number` (from 1), whose mesh carries `labels`.
 
     With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object

@@ -39,7 +39,9 @@ class Placed(msgspec.Struct, frozen=True):
     found: list[Found | None]  # None where the pose was given
 
 
-def placed(things: Sequence[Thing], camera: Camera, focal: float | None, source: str | None, photo: str, search: Search = Search()) -> Placed:
+def placed(
+    things: Sequence[Thing], camera: Camera, focal: float | None, source: str | None, photo: str, search: Search = Search()
+) -> Placed:
     """Poses of all things.  The focal length, where not given, is found with the object that shows most, and kept.
 
     Raises InputError for an object to search whose mask has no pixel.
@@ -69,7 +71,9 @@ def placed(things: Sequence[Thing], camera: Camera, focal: float | None, source:
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))])
 
 
-def _judged(thing: Thing, camera: Camera, prior: FocalPrior, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
+def _judged(
+    thing: Thing, camera: Camera, prior: FocalPrior, found: Found, source: str | None, photo: str, search: Search
+) -> tuple[Found, str]:
     """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
     if source != "exif":
         return found, "estimated"

@@ -117,7 +117,9 @@ def _fill(maps: Maps, wins: np.ndarray, number: int, mesh: Mesh, hits: Hits, cam
     maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
 
 
-def toward_viewer(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+def toward_viewer(
+    normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Normals bent, where n·v < MIN_COSINE, to n·v = MIN_COSINE in the plane of normal and view; and where that was."""
     cosine = np.sum(normal * view, axis=1)
     bent = cosine < MIN_COSINE

@@ -1,8 +1,10 @@
 """Refinement of a pose on contours, by Gauss-Newton.
 
 The contour of the mesh in the image is rendered anew at every step, to a fraction of a pixel: between a pixel in and
-one out, rays are halved in.  (With whole pixels most residuals are exactly 0 and a robust fit sticks to them.)  To first order the image of an occluding contour
-moves, across itself, as the surface points on it do; so each contour point's 3D point carries the derivative.
+one out, rays are halved in.  (With whole pixels most residuals are exactly 0, and a robust fit sticks to them.)  To
+first order the image of an occluding contour moves, across itself, as the surface points on it do; so each contour
+point's 3D point carries the derivative.  COLMAP's absolute pose refinement on the same correspondences, measured on
+real photos, ends in the same place.
 Two kinds of residual, both in window pixels and both per material, so that the border between two parts counts too:
 
     mesh → mask    the mask's signed distance at each contour point of the mesh

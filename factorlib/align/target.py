@@ -72,7 +72,7 @@ def target_of(evidence: Evidence, labels: tuple[int, ...], resolution: int, marg
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
     window = Evidence(evidence.label[np.ix_(y, x)])
-    at_frame = (low[1] == 0, high[1] == height, low[0] == 0, high[0] == width)
+    at_frame = tuple(bool(x) for x in (low[1] == 0, high[1] == height, low[0] == 0, high[0] == width))
     regions = {label: region_of(window.label, label, at_frame) for label in labels}
     return Target(float(low[0]), float(low[1]), pixel, window, regions)
 
@@ -91,7 +91,9 @@ def region_of(labels: Int[np.ndarray, "h w"], label: int, at_frame: tuple[bool, 
     return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour - 1.0, outward)
 
 
-def border_pairs(inside: Bool[np.ndarray, "h w"], outside: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
+def border_pairs(
+    inside: Bool[np.ndarray, "h w"], outside: Bool[np.ndarray, "h w"]
+) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
     """(row, column) of each pixel in `inside` with a right, left, lower or upper neighbour in `outside`, and of that."""
     pairs = []
     for axis in (0, 1):

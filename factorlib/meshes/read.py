@@ -123,12 +123,19 @@ def _label(names, materials, parts, default, overrides, file) -> int:
     for mapping in (overrides, parts):
         chosen = {mapping[name] for name in names if name in mapping}
         if len(chosen) > 1:
-            raise InputError(f"part {' / '.join(names)} gets several materials: {', '.join(sorted(chosen))}", file=file, cure="name it once")
+            raise InputError(
+                f"part {' / '.join(names)} gets several materials: {', '.join(sorted(chosen))}", file=file, cure="name it once"
+            )
         if chosen:
             return list(materials).index(chosen.pop()) + 1
     if default is None:
         part = " / ".join(names) or "(unnamed)"
-        raise InputError(f"part {part} has no material", file=file, key=part, cure=f"add it to `parts`, e.g. {names[0] if names else 'name'}: {materials[0]}")
+        raise InputError(
+            f"part {part} has no material",
+            file=file,
+            key=part,
+            cure=f"add it to `parts`, e.g. {names[0] if names else 'name'}: {materials[0]}",
+        )
     return list(materials).index(default) + 1
 
 

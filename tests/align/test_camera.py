@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from tests.align.scenes import blob, photo_of
 
 from factorlib.align.camera import Camera, angle_between, rotation_of_vector
 from factorlib.align.coarse import fibonacci_directions, looking_along, toward
 from factorlib.align.state import State, state_of
+from tests.align.scenes import blob, photo_of
 
 RNG = np.random.default_rng(0)
 

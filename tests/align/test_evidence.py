@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
-from tests.align.scenes import at, ball, chair, dumbbell, evidence_of, mesh_of, photo_of
 
-from factorlib.align.confidence import confidence
 from factorlib.align.coarse import is_cut
+from factorlib.align.confidence import confidence
 from factorlib.align.evidence import UNKNOWN, Evidence, label_agreement, labelled_iou, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
 from factorlib.align.raster import rasterise
 from factorlib.align.target import target_of
+from tests.align.scenes import at, ball, chair, dumbbell, evidence_of, mesh_of, photo_of
 
 
 def channels(label, left_out=None, owner=None):
     label = np.array(label, float)
     zero = np.zeros(label.shape)
-    return {"label": label, "left_out": zero if left_out is None else np.array(left_out), "object": zero if owner is None else np.array(owner)}
+    return {
+        "label": label,
+        "left_out": zero if left_out is None else np.array(left_out),
+        "object": zero if owner is None else np.array(owner),
+    }
 
 
 def test_left_out_is_unknown():

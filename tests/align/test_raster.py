@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.align.scenes import at, ball, blob, chair, mesh_of, photo_of
 
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.raster import MIN_COSINE, Caster, rasterise, toward_viewer
+from tests.align.scenes import at, ball, blob, chair, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))
 STILL = Pose(np.eye(3), np.array([0.1, -0.2, 4.0]))

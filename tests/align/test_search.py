@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from tests.align.scenes import ball, blob, chair, dumbbell, evidence_of, mesh_of, normal_error_deg, photo_of
 
 from factorlib.align.camera import Pose, angle_between
 from factorlib.align.coarse import is_cut
@@ -14,6 +13,7 @@ from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import Search, find, focal_prior
 from factorlib.meshes.read import usable
 from factorlib.meshes.soup import Soup, no_normals
+from tests.align.scenes import ball, blob, chair, dumbbell, evidence_of, mesh_of, normal_error_deg, photo_of
 
 KNOWN = "dataset"
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search

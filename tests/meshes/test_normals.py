@@ -14,7 +14,9 @@ from factorlib.meshes.soup import Soup, no_normals
 def mesh_of(vertices, faces, normals=None, crease_deg=60.0):
     faces = np.asarray(faces)
     supplied = no_normals(len(faces)) if normals is None else normals
-    return usable(Soup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied), np.ones(len(faces), int), crease_deg, "m")
+    return usable(
+        Soup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied), np.ones(len(faces), int), crease_deg, "m"
+    )
 
 
 def test_sphere():
@@ -28,7 +30,9 @@ def test_cube_is_sharp_and_rounded_by_the_crease_angle():
     box = trimesh.creation.box((1, 1, 1))
     sharp, smooth = mesh_of(box.vertices, box.faces), mesh_of(box.vertices, box.faces, crease_deg=100)
     assert len(sharp.vertices) == 24 and np.allclose(np.abs(sharp.normals).max(axis=1), 1)
-    assert len(smooth.vertices) == 8 and np.allclose(smooth.normals, smooth.vertices / np.linalg.norm(smooth.vertices, axis=1, keepdims=True))
+    assert len(smooth.vertices) == 8 and np.allclose(
+        smooth.normals, smooth.vertices / np.linalg.norm(smooth.vertices, axis=1, keepdims=True)
+    )
 
 
 def test_angles_not_triangle_counts_weigh():
@@ -58,7 +62,9 @@ def test_flipped_faces_are_turned_back():
     faces[::3] = faces[::3, ::-1]
     mesh = mesh_of(ball.vertices, faces)
     assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.99
-    assert mesh_of(ball.vertices, ball.faces[:, ::-1]).normals @ [0, 0, 1] == pytest.approx(mesh_of(ball.vertices, ball.faces).normals @ [0, 0, 1])
+    assert mesh_of(ball.vertices, ball.faces[:, ::-1]).normals @ [0, 0, 1] == pytest.approx(
+        mesh_of(ball.vertices, ball.faces).normals @ [0, 0, 1]
+    )
 
 
 def test_open_patch_keeps_the_winding_of_most_of_its_area():
@@ -70,7 +76,9 @@ def test_open_patch_keeps_the_winding_of_most_of_its_area():
 
 def test_a_moebius_strip_is_left_as_it_is():
     t = np.linspace(0, 2 * np.pi, 21)[:-1]
-    rim = [np.stack([(2 + s * np.cos(t / 2)) * np.cos(t), (2 + s * np.cos(t / 2)) * np.sin(t), s * np.sin(t / 2)], axis=1) for s in (-0.5, 0.5)]
+    rim = [
+        np.stack([(2 + s * np.cos(t / 2)) * np.cos(t), (2 + s * np.cos(t / 2)) * np.sin(t), s * np.sin(t / 2)], axis=1) for s in (-0.5, 0.5)
+    ]
     a, b = np.arange(20), np.arange(20) + 20
     a_next, b_next = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]
     faces = np.concatenate([np.stack([a, a_next, b], axis=1), np.stack([b, a_next, b_next], axis=1)])

@@ -7,7 +7,6 @@ import logging
 
 import numpy as np
 import pytest
-from tests.align.scenes import blob, chair, photo_of
 
 from factorlib.align.raster import rasterise
 from factorlib.align.search import Search
@@ -17,6 +16,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
 from factorlib.stage import Inputs, silent
 from stages import align
+from tests.align.scenes import blob, chair, photo_of
 
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
 
