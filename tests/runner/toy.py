@@ -1,0 +1,137 @@
+"""A project of four small stages over text files, in a folder of its own, with a provider of its own.
+
+`python toy.py <root> <dataset> [setting …]` runs it as a user would, in a process that can be killed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import msgspec
+
+from factorlib.runner import verbs
+from factorlib.runner.project import Data, Project, Provider
+from factorlib.runner.survey import survey
+
+LETTERS = '''
+"""Counting."""
+def letters(text):
+    """How many letters."""
+    return sum(c.isalpha() for c in text)
+'''
+UPPER = """
+import json, logging, time
+from typing import Annotated
+import msgspec
+from factorlib.errors import InputError
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    sleep: float = 0.0
+    times: Annotated[int, msgspec.Meta(ge=1)] = 1
+def main(params, inputs, out, progress):
+    progress(0, 1, "reading")
+    text = inputs.file(inputs.facts["dataset.photo"]["image"]).read_text()
+    if "bad" in text:
+        raise InputError("a bad word", file=inputs.facts["dataset.photo"]["image"], key="line 1", cure="use a better one")
+    if "odd" in text:
+        logging.getLogger("factorlib.upper").warning("%s is odd", inputs.photo)
+    (out / f"{inputs.photo}.txt").write_text(text.upper() * params.times)
+    (out / f"{inputs.photo}.json").write_text(json.dumps({"size": len(text)}))
+    time.sleep(params.sleep)
+"""
+COUNT = """
+import json
+import msgspec
+from toylib.letters import letters
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+def main(params, inputs, out, progress):
+    (out / f"{inputs.photo}.json").write_text(json.dumps({"letters": letters((inputs["upper"] / f"{inputs.photo}.txt").read_text())}))
+"""
+TABLE = """
+import json
+import msgspec
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    scale: int = 2
+def main(params, inputs, out, progress):
+    (out / "table.json").write_text(json.dumps(params.scale))
+"""
+TOTAL = """
+import json
+from pathlib import Path
+import msgspec
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+def main(params, inputs, out, progress):
+    counts = json.loads((inputs["count"] / "counts.json").read_text())
+    scale = json.loads((inputs["table"] / "table.json").read_text())
+    template = (Path(__file__).parent / "templates" / "total.html").read_text()
+    (out / "total.txt").write_text(template + str(scale * sum(c["letters"] for c in counts.values())))
+    (out / "log.txt").write_text(str(len(inputs.log.read_text().splitlines())))
+"""
+PIPELINE = """
+format: 1
+stages:
+  upper: {inputs: [dataset.photo], over: photo, gather: sizes.json, makes: ["{photo}.txt"]}
+  count: {inputs: [upper], over: photo, gather: counts.json}
+  table: {}
+  total: {inputs: [count, table], threads: 2, logs: true, makes: [total.txt]}
+"""
+
+
+class Slice(msgspec.Struct):
+    facts: object
+    files: list[str]
+
+
+def read(folder: Path) -> Data:
+    photos = sorted(path.stem for path in folder.glob("*.txt"))
+
+    def slice_(name, photo):
+        return Slice({"image": f"{photo}.txt"}, [f"{photo}.txt"])
+
+    return Data(folder, photos, slice_)
+
+
+def make_project(root: Path, **texts: str) -> Project:
+    """The toy at `root`, with a dataset `set` of the given texts."""
+    for name, text in {"upper": UPPER, "count": COUNT, "table": TABLE, "total": TOTAL}.items():
+        write(root / "stages" / f"{name}.py", text)
+    write(root / "stages" / "__init__.py", "")
+    write(root / "stages" / "templates" / "total.html", "total: ")
+    write(root / "toylib" / "letters.py", LETTERS)
+    write(root / "pipeline.yaml", PIPELINE)
+    for name, text in (texts or {"a": "Alpha", "b": "Beta"}).items():
+        write(root / "data" / "set" / f"{name}.txt", text)
+    return toy(root)
+
+
+def toy(root: Path) -> Project:
+    return Project(root, Provider(("photo",), read))
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def state(project: Project, dataset: str = "set", settings: tuple[str, ...] = (), **more) -> dict[str, str]:
+    return {str(p.step): p.status for p in survey(project, dataset, None, list(settings), **more).planned()}
+
+
+def reasons(project: Project, step: str, dataset: str = "set", settings: tuple[str, ...] = ()) -> list[str]:
+    return next(p.reasons for p in survey(project, dataset, None, list(settings)).planned() if str(p.step) == step)
+
+
+def copy(project: Project, target: Path) -> Project:
+    shutil.copytree(project.root, target, symlinks=True)
+    return toy(target)
+
+
+if __name__ == "__main__":
+    sys.exit(verbs.make(toy(Path(sys.argv[1])), sys.argv[2], None, sys.argv[3:], False))

@@ -1,0 +1,91 @@
+"""YAML is read as YAML 1.2 says, and every complaint says where and what to do."""
+
+import math
+from typing import Annotated
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorlib.errors import InputError
+from factorlib.yamlfile import load_yaml, parse_yaml, read_yaml
+
+
+class Inner(msgspec.Struct, forbid_unknown_fields=True):
+    size: Annotated[int, msgspec.Meta(ge=1)]
+    name: str = ""
+
+
+class Outer(msgspec.Struct, forbid_unknown_fields=True):
+    ratio: float
+    table: dict[str, Inner] = {}
+    rows: list[Inner] = []
+    either: Inner | str | None = None
+
+
+def refusal(tmp_path, text):
+    file = tmp_path / "x.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_yaml(file, Outer)
+    assert caught.value.cure
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("1e-3", 0.001), ("1.", 1.0), (".5", 0.5), ("-.inf", -math.inf), ("+12e03", 12000.0), ("12", 12), ("-7", -7), ("0x1F", 31), ("0o17", 15),
+        ("017", 17), ("true", True), ("False", False), ("~", None), ("", None), ("no", "no"), ("on", "on"), ("1_000", "1_000"), ("2024-01-02", "2024-01-02"),
+        ("'1'", "1"), ("[a, {b: 1}]", ["a", {"b": 1}]), ("{1: a, true: b}", {"1": "a", "true": "b"}), ("1:30", "1:30"),
+    ],
+)  # fmt: skip
+def test_scalars_are_those_of_yaml_1_2(text, value):
+    found = parse_yaml(text)
+    assert found == value and type(found) is type(value)
+
+
+@given(st.floats(allow_nan=False))
+def test_every_float_that_python_writes_comes_back(number):
+    assert parse_yaml(repr(number).replace("inf", ".inf")) == number
+
+
+def test_a_good_file(tmp_path):
+    file = tmp_path / "x.yaml"
+    file.write_text("ratio: 1e-3\ntable: {a: &one {size: 2}, b: *one}\nrows: [{size: 1, name: no}]\n")
+    assert read_yaml(file, Outer) == Outer(0.001, {"a": Inner(2), "b": Inner(2)}, [Inner(1, "no")])
+    assert load_yaml(file)["table"]["b"] == {"size": 2}
+
+
+@pytest.mark.parametrize(
+    "text, line, key, words",
+    [
+        ("ratio: 1\nratoi: 2\n", 2, "ratoi", "did you mean 'ratio'"),
+        ("ratio: 1\ntable:\n  a: {size: 1}\n  b: {sise: 1, size: 1}\n", 4, "table.b.sise", "did you mean 'size'"),
+        ("ratio: 1\nrows:\n- size: 1\n- size: 1\n  nam: x\n", 5, "rows[1].nam", "did you mean 'name'"),
+        ("ratio: 1\neither: {siz: 1}\n", 2, "either.siz", "did you mean 'size'"),
+        ("ratio: 1\nratio: 2\n", 2, "ratio", "twice, first on line 1"),
+        ("ratio: 1\ntable: {a: {size: 1}, a: {size: 2}}\n", 2, "table.a", "twice"),
+        ("ratio: 1\nrows:\n- {size: 0}\n", 3, "rows[0].size", ">= 1"),
+        ("ratio: 1\ntable:\n  ok: {size: 1}\n  bad: {size: 1, name: 7}\n", 4, "table.bad.name", '"7"'),
+        ("ratio: one\n", 1, "ratio", "'one'"),
+        ("table: {}\n", 1, None, "'ratio' is missing"),
+        ("ratio: 1\nrows: [\n", 3, None, "not YAML"),
+        ("ratio: 1\nrows: &a [*a]\n", 2, "rows[0]", "contains itself"),
+        ("ratio: !!python/name:os.system x\n", 1, "ratio", "tag"),
+        ("ratio: 1\n? [a, b]\n: 2\n", 2, None, "a key that is not a word"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_with_its_place(tmp_path, text, line, key, words):
+    error = refusal(tmp_path, text)
+    assert (str(error.file), error.key) == (f"{tmp_path}/x.yaml:{line}", key)
+    assert words in str(error)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_yaml(tmp_path / "none.yaml", Outer)
+    (tmp_path / "x.yaml").write_bytes(b"ratio: \xff")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_yaml(tmp_path / "x.yaml", Outer)
