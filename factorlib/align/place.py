@@ -13,7 +13,7 @@ from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, Found, Search, find, focal_prior
+from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, WELL_FOUND, Found, Search, find, focal_prior, with_focal_free
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
 
@@ -78,7 +78,10 @@ def _judged(
     if source != "exif":
         return found, "estimated"
     broad = FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
-    free = find(thing.caster, thing.evidence, camera, broad, search)
+    if found.score >= WELL_FOUND:
+        free = with_focal_free(thing.caster, thing.evidence, camera, found, broad, search)
+    else:
+        free = find(thing.caster, thing.evidence, camera, broad, search)
     if free.score < found.score + CLEARLY_BETTER:
         return found, "exif"
     log.warning(

@@ -27,6 +27,7 @@ DISTINCT_DEG = 15.0  # a runner-up is turned by more than this
 UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected costs
 UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
 EXIF_SIGMA = 0.05  # whole millimetres, and focus
+WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
 CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
@@ -85,6 +86,13 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
         others = ranked + others
     best = ranked[0]
     return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, others))
+
+
+def with_focal_free(caster: Caster, evidence: Evidence, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
+    """The pose found, refined once more under another `prior` of the focal length."""
+    target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    result = refined(caster, target, camera, found.state, prior, 2 * search.steps[-1])
+    return Found(result.state, result.score, result.log_focal_sigma(), found.runner_up)
 
 
 def value(result: Refined, prior: FocalPrior) -> float:
