@@ -16,6 +16,7 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.report.overview import overview
 from factorlib.report.page import page
 from factorlib.report.photos import photo_row, strip
+from factorlib.report.tags import material_tags
 from factorlib.stage import Inputs, Progress
 
 
@@ -26,12 +27,12 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     errors = run.json("evaluate", "metrics.json")["resynthesis"]["photos"]
-    rows = []
+    rows, tags = [], material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
     for done, name in enumerate(run.set.photos):
         progress(done, len(run.set.photos) + 1, name)
-        rows.append(photo_row(run, name, errors.get(name)))
+        rows.append(photo_row(run, name, tags, errors.get(name)))
         (out / "figures" / "photos" / f"{name}.png").write_bytes(strip(rows[-1]))
     progress(len(rows), len(rows) + 1, "page")
     (out / "figures" / "overview.png").write_bytes(overview(run, rows))
-    (out / "index.html").write_text(page(run, rows), encoding="utf-8")
+    (out / "index.html").write_text(page(run, rows, tags), encoding="utf-8")

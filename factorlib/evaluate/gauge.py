@@ -8,8 +8,9 @@ scalar_per_set     one number scales everything in the set
 channel_per_photo  one number for each channel and each photo (light, relit picture): the most forgiving, where
                    even a grey ball scores well, so never to be quoted alone
 
-Each factor is the least-squares one: Σ f·e·t / Σ e², every picture weighted by 1 / white², so that a bright photo
-does not drown a dark one.
+Each factor is the least-squares one, Σ e·t / Σ e², every picture weighted by 1 / white², so that a bright photo does
+not drown a dark one.  For pictures, samples brighter than white are left out, estimate and truth alike: the tone map cuts
+them, and one wrong highlight would decide.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ GAUGES = ("none", "scalar_per_set", "channel_per_photo")
 
 
 def gauge_factors(
-    estimates: Sequence[Samples], truths: Sequence[Samples], whites: Sequence[float]
+    estimates: Sequence[Samples], truths: Sequence[Samples], whites: Sequence[float], below_white: bool = False
 ) -> dict[str, Float[np.ndarray, "photos 3"]]:
-    """The factor of each photo and channel on the estimate, for each gauge."""
+    """The factor of each photo and channel on the estimate, for each gauge; below_white: leave out what is brighter."""
+    if below_white:
+        kept = [np.maximum(e, t).max(axis=-1) <= w for e, t, w in zip(estimates, truths, whites, strict=True)]
+        estimates, truths = ([s[k] for s, k in zip(samples, kept, strict=True)] for samples in (estimates, truths))
     cross = np.array([(e * t).sum(axis=0) / w**2 for e, t, w in zip(estimates, truths, whites)]).reshape(-1, 3)
     square = np.array([(e * e).sum(axis=0) / w**2 for e, w in zip(estimates, whites)]).reshape(-1, 3)
     return {

@@ -96,7 +96,7 @@ def compare_relighting(
 def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]) -> list[RelitBall]:
     _, inside = ball_normals(BALL_SIZE)
     whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
-    factors = [gauge_factors(pictures, true, whites) for pictures in kinds]
+    factors = [gauge_factors(pictures, true, whites, below_white=True) for pictures in kinds]
 
     def gauged(i: int, gauge: str) -> Kinds:
         shown = zip(KINDS, kinds, factors)

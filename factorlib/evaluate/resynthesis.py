@@ -1,9 +1,10 @@
 """How well the solved materials in the solved light give back the photos; this needs no truth.
 
-A pixel counts where mask and mesh name the same material and the surface faces the camera (`factorlib.urm`), and no
-channel of the photo is clipped.  What is left out is counted: `clipped`, `invalid` (left out by the mask or not
-finite), `uncovered` (in the mask, but without the mesh).  Of the clipped pixels, `clipped_satisfied` is the fraction
-whose re-synthesis is at least what was clipped, up to 2 %.
+A pixel counts where mask and mesh name the same material and the surface faces the camera, whether the solve used it
+or not, and no channel of the photo is clipped.  What is left out is counted: `clipped`, `invalid` (left out by the mask
+or not finite), `uncovered` (in the mask, but not explained by the mesh).  `unused` pixels count, but the solve did not
+use them: their normals had no confidence.  Of the clipped pixels, `clipped_satisfied` is the fraction whose re-synthesis
+is at least what was clipped, up to 2 %.
 
 Null: each material in each photo is one flat colour, its own mean over the counted pixels.
 """
@@ -42,13 +43,14 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 class PhotoErrors(msgspec.Struct, frozen=True):
-    """pixels, clipped, invalid, uncovered: numbers of pixels.  exposure = 1 / white of the photo.
+    """pixels, unused (of these), clipped, invalid, uncovered: numbers of pixels.  exposure = 1 / white of the photo.
 
     gauges: gauge -> scores over all counted pixels; null where none counts.  materials: material -> gauge -> scores.
     """
 
     exposure: float
     pixels: int
+    unused: int
     clipped: int
     invalid: int
     uncovered: int
@@ -71,17 +73,26 @@ def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
     """From the channels of the stages `masks` and `align` and the re-synthesis of the same size."""
     label, clipped = np.rint(photo["label"]), np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
     rgb = np.nan_to_num(np.stack([photo[c] for c in "RGB"], axis=-1), posinf=0.0, neginf=0.0)
-    valid, observed = photo["valid"] > 0.5, observed_pixels(photo, geometry)
+    valid, observed = photo["valid"] > 0.5, agreeing_pixels(photo, geometry)
     pixels, bounds = observed & ~clipped, observed & clipped
     left_out = photo["left_out"] > 0.5 if "left_out" in photo else np.zeros(valid.shape, bool)
     counts = {
-        "pixels": pixels, "clipped": bounds, "uncovered": valid & ~observed, "invalid": left_out | ((label > 0.5) & ~valid)
-    }  # fmt: skip
+        "pixels": pixels,
+        "unused": pixels & ~observed_pixels(photo, geometry),
+        "clipped": bounds,
+        "uncovered": valid & ~observed,
+        "invalid": left_out | ((label > 0.5) & ~valid),
+    }
     held = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
     return Shot(
         rgb, resynthesis, label, pixels, white_of(rgb, pixels), {k: int(v.sum()) for k, v in counts.items()},
         float(held.mean()) if bounds.any() else None,
     )  # fmt: skip
+
+
+def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h w"]:
+    """Where mask and mesh name the same material and the surface faces the camera, however little its normal is trusted."""
+    return observed_pixels(photo, {**geometry, "confidence": np.ones_like(geometry["confidence"])})
 
 
 def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[str], Shot]) -> Resynthesis:
@@ -110,7 +121,7 @@ def _factors(names: list[str], shot: Callable[[str], Shot]) -> dict[str, dict[st
     for name in names:
         s = shot(name)
         estimates.append(s.resynthesis[s.pixels]), truths.append(s.photo[s.pixels]), whites.append(s.white)
-    factors = gauge_factors(estimates, truths, whites)
+    factors = gauge_factors(estimates, truths, whites, below_white=True)
     return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
 
 

@@ -141,9 +141,8 @@ def _view(title: str, scored: dict) -> list[str]:
 def _normals(found: dict | None, order: list[str]) -> Table | None:
     if not found:
         return None
-    rows = [
-        [n, *(number(e[k][q], 2) + "°" for q in ("median_deg", "p90_deg") for k in ("estimate", "null"))] for n, e in _ordered(found, order)
-    ]
+    columns = [(q, k) for q in ("median_deg", "p90_deg") for k in ("estimate", "null")]
+    rows = [[name, *(number(e[k][q], 2) + "°" for q, k in columns)] for name, e in _ordered(found, order)]
     head = ["", "found|median", "null|median", "found|90th percentile", "null|90th percentile"]
     return Table("normals", "Normals against the truth", CAPTIONS["normals"], head, rows)
 

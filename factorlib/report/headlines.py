@@ -10,6 +10,7 @@ from factorlib.report.text import number, percent
 LOW_IOU = 0.85
 MANY_CLIPPED = 0.1
 MANY_UNCOVERED = 0.15
+MANY_UNUSED = 0.3
 FEW_PIXELS = 200
 MEANINGS = {
     "psnr": "How close the recovered materials in the recovered light come to the photos: mean over photos, nothing rescaled, after "
@@ -83,6 +84,10 @@ def _of_photos(run: Artifacts, metrics: dict) -> list[str]:
             found.append(f"{name}: {percent(errors['clipped'] / total)} of its pixels are clipped; highlights there are only bounds.")
         if errors["uncovered"] / total > MANY_UNCOVERED:
             found.append(f"{name}: {percent(errors['uncovered'] / total)} of the masked pixels are not explained by the mesh.")
+        if errors["unused"] / max(1, errors["pixels"]) > MANY_UNUSED:
+            found.append(
+                f"{name}: the solve left out {percent(errors['unused'] / errors['pixels'])} of the pixels, whose normals it does not trust."
+            )
         if errors["gauges"]["none"]["estimate"]["psnr_tonemapped_db"] < errors["gauges"]["none"]["null"]["psnr_tonemapped_db"]:
             found.append(f"{name}: flat colours would fit this photo better than its re-synthesis does.")
     return found

@@ -6,7 +6,6 @@ import msgspec
 
 from factorlib.report.appearance import Cell
 from factorlib.report.artifacts import Artifacts
-from factorlib.report.photos import colour_of
 from factorlib.report.text import css_colour, number, significant
 
 
@@ -32,21 +31,21 @@ class MaterialRow(msgspec.Struct, frozen=True):
     photos: int
 
 
-def material_rows(run: Artifacts, cells: list[list[Cell]]) -> list[MaterialRow]:
+def material_rows(run: Artifacts, cells: list[list[Cell]], tags: dict[str, str]) -> list[MaterialRow]:
     """In the order of the set; a material that was not solved has no row."""
     solved = (run.json("solve", "materials.json") or {}).get("materials", {})
     counts = {m: {p: f.get("pixels", {}).get(m, 0) for p, f in run.photo_facts().items()} for m in run.set.materials}
-    named = list(zip(run.set.materials, cells, strict=True))
-    return [_row(name, k, solved[name], counts[name], row) for k, (name, row) in enumerate(named) if name in solved]
+    named = zip(run.set.materials, cells, strict=True)
+    return [_row(name, tags[name], solved[name], counts[name], row) for name, row in named if name in solved]
 
 
-def _row(name: str, index: int, found: dict, counts: dict[str, int], cells: list[Cell]) -> MaterialRow:
+def _row(name: str, tag: str, found: dict, counts: dict[str, int], cells: list[Cell]) -> MaterialRow:
     stderr = found.get("stderr") or {}
     roughness, error = found["roughness"], stderr.get("roughness")
     span = (max(0.0, roughness - (error or 0)), min(1.0, roughness + (error or 0)))
     shown = max((c for c in cells if c.uri), key=lambda c: counts.get(c.photo, 0), default=None)
     return MaterialRow(
-        name=name, tag=colour_of(index), ball=shown, diffuse=_colour(found["diffuse"], stderr.get("diffuse")),
+        name=name, tag=tag, ball=shown, diffuse=_colour(found["diffuse"], stderr.get("diffuse")),
         specular=_colour(found["specular"], stderr.get("specular")), roughness=roughness, roughness_text=number(roughness, 3),
         roughness_error=None if error is None else significant(error, 2),
         roughness_span=(100 * span[0], max(0.5, 100 * (span[1] - span[0]))),

@@ -22,15 +22,17 @@ Pixels = UInt8[np.ndarray, "h w 3"]
 def overview(run: Artifacts, rows: Sequence[PhotoRow]) -> bytes:
     """A PNG of the first eight photos at most, on white."""
     exposure = exposures(run)
-    columns = [_column(run, row, exposure[row.name]) for row in rows[:MOST_PHOTOS]]
+    shown = rows[:MOST_PHOTOS]
+    height = min(COLUMN * 3 // 2, max(round(COLUMN * p.pixels.shape[0] / p.pixels.shape[1]) for row in shown for p in row.panels))
+    columns = [_column(run, row, exposure[row.name], height) for row in shown]
     tallest = max(len(c) for c in columns)
     even = [np.pad(c, ((0, tallest - len(c)), (0, GAP), (0, 0)), constant_values=255) for c in columns]
     return png_bytes(np.concatenate(even, axis=1)[:, :-GAP])
 
 
-def _column(run: Artifacts, row: PhotoRow, exposure: float) -> Pixels:
+def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixels:
     panels = {panel.title: panel.pixels for panel in row.panels}
-    cells = [_fitted(panels[t], COLUMN, COLUMN) for t in ("photo", "re-synthesis") if t in panels]
+    cells = [_fitted(panels[t], height, COLUMN) for t in ("photo", "re-synthesis") if t in panels]
     light = run.illumination(row.illumination)
     if light is not None:
         cells.append(_fitted(picture(light, exposure_of(light, percentile=95.0)), COLUMN // 2, COLUMN))

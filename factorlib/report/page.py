@@ -15,7 +15,7 @@ from factorlib.report.cost import cost_of
 from factorlib.report.errors import error_tables
 from factorlib.report.headlines import cautions, headlines
 from factorlib.report.materials import material_rows
-from factorlib.report.photos import AMPLIFICATION, PhotoRow, colour_of
+from factorlib.report.photos import AMPLIFICATION, PhotoRow
 from factorlib.report.plot import Series, line_plot
 from factorlib.report.poses import pose_rows
 from factorlib.report.training import training_of
@@ -36,14 +36,14 @@ CONTENTS = {
 }
 
 
-def page(run: Artifacts, rows: list[PhotoRow]) -> str:
-    """The page as HTML, from the artifacts and the photos' rows."""
+def page(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> str:
+    """The page as HTML, from the artifacts, the photos' rows and the materials' colours."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     environment.filters |= {name: getattr(text, name) for name in ("number", "significant", "percent", "duration")}
     folder = files("factorlib.report") / "templates"
     environment.loader = jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
     environment.globals["grouped"] = _grouped
-    return environment.get_template("index.html").render(_context(run, rows))
+    return environment.get_template("index.html").render(_context(run, rows, tags))
 
 
 def _grouped(head: list[str]) -> list[tuple[str, int]]:
@@ -52,7 +52,7 @@ def _grouped(head: list[str]) -> list[tuple[str, int]]:
     return [(name, len(list(run))) for name, run in groupby(groups)]
 
 
-def _context(run: Artifacts, rows: list[PhotoRow]) -> dict[str, Any]:
+def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict[str, Any]:
     metrics = run.json("evaluate", "metrics.json")
     exposure, seen = exposures(run), {p: [m for m, n in f["pixels"].items() if n > 0] for p, f in run.photo_facts().items()}
     cells = balls(run, seen, exposure)
@@ -66,8 +66,8 @@ def _context(run: Artifacts, rows: list[PhotoRow]) -> dict[str, Any]:
         "cautions": cautions(run, metrics),
         "rows": rows,
         "amplification": AMPLIFICATION,
-        "tags": {m: colour_of(k) for k, m in enumerate(run.set.materials)},
-        "materials": material_rows(run, cells),
+        "tags": tags,
+        "materials": material_rows(run, cells, tags),
         "cells": cells,
         "maps": [(p, reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         "lights": [r for n, p in run.illuminations().items() if (r := light_row(run, n, p, errors_of_light.get(n)))],

@@ -6,14 +6,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.picture import picture
 from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts, Channels
 from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
-from factorlib.urm.extract import observed_pixels
 
 AMPLIFICATION = 4
-PALETTE = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#44bb99", "#bbcc33", "#999933")
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
 DISAGREES = np.array([0.93, 0.2, 0.55])
 
@@ -34,24 +33,23 @@ class PhotoRow(msgspec.Struct, frozen=True):
     errors: dict | None
 
 
-def colour_of(index: int) -> str:
-    """The colour that stands for the index-th material in masks."""
-    return PALETTE[index % len(PALETTE)]
-
-
 def longest_side(photos: int) -> int:
     """Pixels of a panel's longer side: smaller where there are many photos, so that the page stays light."""
     return 440 if photos <= 12 else 300
 
 
-def photo_row(run: Artifacts, name: str, errors: dict | None) -> PhotoRow:
+def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: dict | None) -> PhotoRow:
+    """`tags`: the colour of each material in masks; `errors`: the photo's entry of the metrics."""
     masks, geometry, resynthesis = run.masks(name), run.geometry(name), run.resynthesis(name)
     shown = np.rint(masks["label"]) > 0
     box, longest = box_of(shown), longest_side(len(run.set.photos))
     cut = [{k: v[box] for k, v in channels.items()} for channels in (masks, geometry)]
     exposure = errors["exposure"] if errors else 1.0
     photo = np.nan_to_num(np.stack([cut[0][c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
-    panels = [_panel("photo", _display(photo, exposure), longest), _panel("materials", _labels(*cut, photo, exposure), longest)]
+    panels = [
+        _panel("photo", _display(photo, exposure), longest),
+        _panel("materials", _labels(*cut, photo * exposure, [tags[m] for m in run.set.materials]), longest),
+    ]
     if resynthesis is not None:
         found = np.nan_to_num(resynthesis[box], posinf=0, neginf=0)
         panels.append(_panel("re-synthesis", _cut_out(_display(found, exposure), cut[0]), longest))
@@ -73,11 +71,11 @@ def _cut_out(display: Float[np.ndarray, "h w 3"], masks: Channels) -> Float[np.n
     return np.concatenate([display, (masks["label"] > 0.5)[..., None]], axis=-1)
 
 
-def _labels(masks: Channels, geometry: Channels, photo: np.ndarray, exposure: float) -> Float[np.ndarray, "h w 3"]:
-    """Materials tinted on a grey photo; where mesh and mask name different materials, pink."""
-    grey = srgb_encode(np.clip(photo.mean(axis=-1) * exposure, 0, 1))[..., None] * np.ones(3)
+def _labels(masks: Channels, geometry: Channels, photo: np.ndarray, tags: list[str]) -> Float[np.ndarray, "h w 3"]:
+    """Materials tinted on a grey photo (already exposed); where mesh and mask name different materials, pink."""
+    grey = srgb_encode(np.clip(photo.mean(axis=-1), 0, 1))[..., None] * np.ones(3)
     label = np.rint(masks["label"]).astype(int)
-    colours = np.array([[0.0, 0, 0], *([int(colour_of(k)[i : i + 2], 16) / 255 for i in (1, 3, 5)] for k in range(label.max()))])
+    colours = np.array([[0.0, 0, 0], *([int(tag[i : i + 2], 16) / 255 for i in (1, 3, 5)] for tag in tags)])
     shown = np.where((label > 0)[..., None], 0.45 * grey + 0.55 * colours[label], 0.3 + 0.5 * grey)
     shown[(np.rint(geometry["label"]) != label) & (masks.get("left_out", 0 * label) < 0.5)] = DISAGREES
     return shown
@@ -87,7 +85,7 @@ def _difference(photo, found, exposure: float, masks: Channels, geometry: Channe
     """Grey where equal, brighter where the re-synthesis is too bright, in display values; uncounted pixels violet."""
     shown = 0.5 + AMPLIFICATION * (_display(found, exposure) - _display(photo, exposure))
     clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
-    shown[~observed_pixels(masks, geometry) | clipped] = UNCOUNTED
+    shown[~agreeing_pixels(masks, geometry) | clipped] = UNCOUNTED
     return _cut_out(np.clip(shown, 0, 1), masks)
 
 

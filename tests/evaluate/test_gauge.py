@@ -49,3 +49,11 @@ def test_components_do_not_depend_on_order():
     found = connected_components(pairs)
     assert found == {"v": 0, "z": 0, "w": 1, "x": 1, "y": 1}
     assert connected_components({k: pairs[k][::-1] for k in reversed(pairs)}) == found
+
+
+def test_one_wrong_highlight_does_not_decide_a_pictures_factor():
+    truth = TRUTHS[0].copy()
+    estimate = truth / 2
+    truth[0], estimate[0] = 50.0, 500.0
+    whole, below = (gauge_factors([estimate], [truth], [1.0], below_white=b)["channel_per_photo"] for b in (False, True))
+    assert below == pytest.approx(np.full((1, 3), 2.0)) and whole.max() < 0.2

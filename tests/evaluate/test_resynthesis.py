@@ -29,8 +29,9 @@ def test_what_is_left_out_is_counted(channels):
     photo["clipped.R"][0, :4] = 1
     photo["valid"][1, :3] = 0
     geometry["label"][2, :2] = 0
+    geometry["confidence"][3, :7] = 0
     shot = shot_of(photo, geometry, picture(photo))
-    assert shot.counts == {"pixels": 600 - 9, "clipped": 4, "invalid": 3, "uncovered": 2}
+    assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
 
 
 def test_clipped_pixels_are_bounds(channels):
