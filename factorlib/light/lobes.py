@@ -18,7 +18,9 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 
-FRAME = "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
+FRAME = (
+    "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
+)
 COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
 SMALL_SHARPNESS = 1e-3
 
@@ -61,7 +63,7 @@ def squared_distances(directions: Float[np.ndarray, "n 3"], axes: Float[np.ndarr
     return sum((directions[:, None, k] - axes[None, :, k]) ** 2 for k in range(3))
 
 
-def lobe_integral(sharpness: Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
+def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> float | Float[np.ndarray, "*p"]:
     """∫ exp(λ(ω·z − 1)) dω over the sphere, steradian.
 
     >>> (lobe_integral(np.array([0.0, 1e-12, 1e6])) / np.pi).round(9).tolist()

@@ -2,12 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.light.latlong import lat_long_of_lobes, map_energy, sampled, turned_map
 from factorlib.light.lobes import Lobes
-from scipy.spatial.transform import Rotation
 
-AXES = {"side": (0.7, -0.3, 0.6), "top": (0.0, -1.0, 0.0), "near the bottom": (0.003, 1.0, -0.004), "seam": (0.001, 0.2, 1.0)}  # camera frame
+AXES = {
+    "side": (0.7, -0.3, 0.6),
+    "top": (0.0, -1.0, 0.0),
+    "near the bottom": (0.003, 1.0, -0.004),
+    "seam": (0.001, 0.2, 1.0),
+}  # camera frame
 
 
 def lobe(axis, sharpness: float) -> Lobes:
@@ -29,7 +35,9 @@ def test_texels_are_means_of_much_finer_point_samples(axis):
     weight = lat_long_solid_angles(height * finer, 2 * height * finer)
     directions = lat_long_directions(height * finer, 2 * height * finer).reshape(-1, 3)
     point = light.turned(YUP_FROM_CAMERA).radiance(directions).reshape(height, finer, 2 * height, finer, 3)
-    expected = np.einsum("ha,hawbc->hwc", weight.reshape(height, finer), point) / finer / weight.reshape(height, finer).sum(1)[:, None, None]
+    expected = (
+        np.einsum("ha,hawbc->hwc", weight.reshape(height, finer), point) / finer / weight.reshape(height, finer).sum(1)[:, None, None]
+    )
     np.testing.assert_allclose(lat_long_of_lobes(light, height, 2 * height), expected, atol=1e-4)
 
 
@@ -56,4 +64,4 @@ def test_turning_the_lobes_turns_the_map():
 def test_sampling_at_texel_centres_gives_the_texels_also_beyond_the_poles():
     lat_long = np.random.default_rng(0).uniform(size=(6, 12, 3))
     np.testing.assert_allclose(sampled(lat_long, lat_long_directions(6, 12)), lat_long, atol=1e-9)
-    np.testing.assert_allclose(sampled(lat_long, np.array([1e-9, 1.0, 0.0])), lat_long[0, [2, 3, 8, 9]].mean(0), atol=1e-6)
+    np.testing.assert_allclose(sampled(lat_long, np.array([[1e-9, 1.0, 0.0]])), lat_long[None, 0, [2, 3, 8, 9]].mean(1), atol=1e-6)

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from factorlib.errors import InputError
-from factorlib.light.lobes import Lobes, lobe_integral, no_lobes, read_lobes, write_lobes
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
+
+from factorlib.errors import InputError
+from factorlib.light.lobes import Lobes, lobe_integral, no_lobes, read_lobes, write_lobes
 
 
 def some_lobes(count: int = 6, seed: int = 0) -> Lobes:
@@ -23,7 +24,9 @@ def test_integral_is_the_quadrature_over_the_cosine(sharpness):
 def test_turning_light_and_direction_together_changes_nothing():
     rotation = Rotation.random(random_state=1).as_matrix()
     directions = some_lobes(9, 3).axis
-    np.testing.assert_allclose(some_lobes().turned(rotation).radiance(directions @ rotation.T), some_lobes().radiance(directions), rtol=1e-9)
+    np.testing.assert_allclose(
+        some_lobes().turned(rotation).radiance(directions @ rotation.T), some_lobes().radiance(directions), rtol=1e-9
+    )
 
 
 def test_radiance_at_the_axis_of_a_very_sharp_lobe_is_its_weight():

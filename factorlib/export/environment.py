@@ -1,0 +1,41 @@
+"""The map that Mitsuba is handed.
+
+Its `envmap` interpolates bilinearly between nodes at row i/(H−1), column (j+½)/W, so the exported map, a table of
+area means, would sit up to half a texel off.  Instead the lobes are evaluated at Mitsuba's nodes.  Interpolation widens a
+lobe by a triangle of the node spacing h, of variance h²/6 along each axis; a lobe of sharpness λ has variance 1/λ.  So
+the lobes are first sharpened by as much, at the same energy: what Mitsuba interpolates has their energy and width.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.light.lobes import Lobes, lobe_integral
+
+NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: narrower ones would fall between them
+ROWS_AT_ONCE = 16
+
+
+def sharpened(lobes: Lobes, spacing: float) -> Lobes:
+    """Lobes that, interpolated linearly between nodes `spacing` radians apart, are as wide as `lobes`; energy kept."""
+    variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
+    kept = lobe_integral(lobes.sharpness) / lobe_integral(1 / variance)
+    return Lobes(lobes.axis, 1 / variance, lobes.weight * kept[:, None])
+
+
+def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
+    """Directions of the nodes of Mitsuba's `envmap`, in its own (y-up) frame."""
+    theta = np.arange(height) / (height - 1) * np.pi
+    phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
+    sin = np.sin(theta)[:, None]
+    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
+
+
+def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
+    """Node values for Mitsuba of a light given in the lobes' own frame; the map is in its y-up turn."""
+    at_nodes = sharpened(lobes, np.pi / (height - 1)).turned(YUP_FROM_CAMERA)
+    directions = node_directions(height, width)
+    parts = [at_nodes.radiance(directions[i : i + ROWS_AT_ONCE].reshape(-1, 3)) for i in range(0, height, ROWS_AT_ONCE)]
+    return np.concatenate(parts).reshape(height, width, 3)

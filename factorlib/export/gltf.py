@@ -1,0 +1,58 @@
+"""Meshes as binary glTF with their materials.
+
+glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has
+F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  So
+
+    specularFactor = max k_s,  specularColor = k_s / (0.04 max k_s),  baseColor = k_d / (1 − max k_s),  metallic 0
+
+gives a reflectance at normal incidence of k_d and k_s exactly, and no Fresnel where k_s is grey.  Viewers without the extension
+show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+from factorlib.export.materials import Material
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import submesh
+
+DIELECTRIC = 0.04
+EXTENSION = "KHR_materials_specular"
+
+
+def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Material]) -> None:
+    """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1]."""
+    scene = trimesh.Scene()
+    for label in mesh.labels:
+        part, name = submesh(mesh, label), names[label - 1]
+        visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
+        geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
+        scene.add_geometry(geometry, geom_name=name, node_name=name)
+    data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=lambda tree: _set_materials(tree, materials))
+    Path(path).write_bytes(data)
+
+
+def _set_materials(tree: dict[str, Any], materials: Mapping[str, Material]) -> None:
+    """Exact numbers, which the mesh library would round to eight bits."""
+    for entry in tree["materials"]:
+        entry.update(gltf_material(materials[entry["name"]]))
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), EXTENSION})
+
+
+def gltf_material(material: Material) -> dict[str, Any]:
+    """The part of a glTF material that says how it reflects."""
+    brightest = max(material.specular)
+    base = np.array(material.diffuse) / (1 - brightest)
+    colour = np.array(material.specular) / (DIELECTRIC * brightest) if brightest > 0 else np.ones(3)
+    return {
+        "pbrMetallicRoughness": {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness},
+        "extensions": {EXTENSION: {"specularFactor": brightest, "specularColorFactor": colour.tolist()}},
+    }

@@ -1,0 +1,48 @@
+"""Balls seen from the front, orthographically: every normal that faces the viewer, once.  The same picture is a reflectance map.
+
+Frame: the photo's camera (x right, y down, z forward), view (0, 0, −1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_closing
+
+from factorlib.conventions import FRONT
+from factorlib.render.reflect import Reflector
+
+GAP = 6  # cells: the widest gap between observed normals that counts as observed
+
+
+def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
+    """Normals of the pixels whose centres lie on a ball that fills the picture, and those pixels.
+
+    >>> ball_normals(1)[0].tolist()
+    [[0.0, 0.0, -1.0]]
+    """
+    at = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(at, at)
+    inside = x * x + y * y < 1
+    x, y = x[inside], y[inside]
+    return np.stack([x, y, -np.sqrt(1 - x * x - y * y)], axis=-1), inside
+
+
+def ball(reflector: Reflector, material, size: int) -> Float[np.ndarray, "size size 3"]:
+    """Radiance; zero beside the ball."""
+    normals, inside = ball_normals(size)
+    picture = np.zeros((size, size, 3))
+    picture[inside] = reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
+    return picture
+
+
+def observed_cells(normals: Float[np.ndarray, "n 3"], size: int) -> Bool[np.ndarray, "size size"]:
+    """Pixels of a ball where a normal was seen; gaps as wide as the spacing of so few normals are closed."""
+    cells = np.zeros((size, size), bool)
+    if len(normals) == 0:
+        return cells
+    column, row = (np.clip(((normals[:, k] + 1) / 2 * size).astype(int), 0, size - 1) for k in (0, 1))
+    cells[row, column] = True
+    gap = int(np.clip(np.ceil(size / np.sqrt(len(normals))), 1, GAP))
+    closed = binary_closing(np.pad(cells, gap), np.ones((3, 3)), iterations=gap)[gap:-gap, gap:-gap]
+    return closed & ball_normals(size)[1]

@@ -1,0 +1,143 @@
+"""What was solved, in the forms that other programs read.
+
+Writes illumination/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
+scenes/<photo>.xml with their meshes and lights, materials.mtlx and <mesh>.glb.
+"""
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import OpenImageIO as oiio
+
+from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
+from factorlib.export.environment import mitsuba_map
+from factorlib.export.gltf import write_glb
+from factorlib.export.materials import headroom_factor, materials_of_table, table_in_gauge
+from factorlib.export.materialx import write_materialx
+from factorlib.export.mitsuba import Environment, Shape, View, write_scene
+from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.jsonfile import read_json, write_json
+from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.lobes import Lobes, no_lobes, read_lobes, write_lobes
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.stage import Inputs, Progress
+
+log = logging.getLogger("factorlib.export")
+Rows = Annotated[int, msgspec.Meta(ge=8, le=4096)]
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """height: of the exported maps, twice as wide;  mitsuba_height: of the copies in the scenes;  crease_deg: as in align."""
+
+    height: Rows = 128
+    mitsuba_height: Rows = 256
+    crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    names: list[str] = inputs.facts["dataset.materials"]
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
+    progress(0, 4, "materials")
+    table, lobes = _in_gauge(inputs["solve"], {light.illumination for light in lights.values()})
+    exposures = read_json(inputs["solve"] / "exposures.json")
+    write_json(out / "materials.json", table)
+    write_json(out / "exposures.json", exposures)
+    write_lobes(out / "lobes.parquet", lobes)
+    materials = materials_of_table(table)
+    write_materialx(out / "materials.mtlx", materials)
+    progress(1, 4, "lights")
+    _write_lights(out, lobes, params)
+    progress(2, 4, "meshes")
+    files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
+    for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
+        write_glb(out / f"{name}.glb", files.mesh(name, mesh, {}), names, materials)
+    progress(3, 4, "scenes")
+    poses = read_json(inputs["align"] / "poses.json")
+    for photo, light in lights.items():
+        view = _view(inputs["align"] / f"{photo}.exr", poses[photo]["camera"])
+        shapes = [
+            shape for thing in objects[photo].objects for shape in files.shapes(thing, objects[photo].meshes, poses[photo]["objects"])
+        ]
+        environment = _environment(out, photo, light, lobes[light.illumination], np.array(exposures.get(photo, [1.0] * 3)), params)
+        write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment)
+    progress(4, 4)
+
+
+def _in_gauge(solved: Path, illuminations: set[str]) -> tuple[dict, dict[str, Lobes]]:
+    """materials.json and the lobes of every illumination; the factor that leaves the one enters the other."""
+    table = read_json(solved / "materials.json")
+    factor = headroom_factor(materials_of_table(table))
+    found = read_lobes(solved / "lobes.parquet")
+    for name in sorted(illuminations - set(found)):
+        log.warning("illumination '%s' was not solved for, because no pixel in it was observed: it is written as black", name)
+    return table_in_gauge(table, factor), {name: found.get(name, no_lobes()).scaled(1 / factor) for name in sorted(illuminations)}
+
+
+def _write_lights(out: Path, lobes: dict[str, Lobes], params: Params) -> None:
+    for folder in ("illumination", "scenes/light", "scenes/meshes"):
+        (out / folder).mkdir(parents=True)
+    for name, light in lobes.items():
+        write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long_of_lobes(light, params.height, 2 * params.height), LAT_LONG)
+        write_rgb_exr(out / "scenes" / "light" / f"{name}.exr", _mitsuba_map(light, params), LAT_LONG)
+
+
+def _mitsuba_map(light: Lobes, params: Params) -> np.ndarray:
+    return mitsuba_map(light, params.mitsuba_height, 2 * params.mitsuba_height)
+
+
+def _environment(out: Path, photo: str, light: LightSlice, lobes: Lobes, exposure: np.ndarray, params: Params) -> Environment:
+    """A grey exposure is the scale of the illumination's map; a coloured one needs a map of the photo's own."""
+    camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T
+    if np.ptp(exposure) == 0:
+        return Environment(f"light/{light.illumination}.exr", float(exposure[0]), camera_from_light)
+    file = f"light/{photo}.exposed.exr"  # a dot is in no illumination's name
+    write_rgb_exr(out / "scenes" / file, _mitsuba_map(lobes.scaled(exposure), params), LAT_LONG)
+    return Environment(file, 1.0, camera_from_light)
+
+
+def _view(aligned: Path, camera: dict) -> View:
+    """The photo's camera; its size from the header of align's maps."""
+    spec = oiio.ImageInput.open(str(aligned)).spec()
+    return View(spec.width, spec.height, camera["focal_px"], tuple(camera["principal_point"]))
+
+
+class MeshFiles:
+    """Meshes read once and written once, split by material, per choice of materials for their parts."""
+
+    def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
+        self.inputs, self.scenes, self.materials, self.crease_deg = inputs, scenes, materials, crease_deg
+        self._meshes: dict[tuple, Mesh] = {}
+        self._stems: dict[tuple, str] = {}
+
+    def mesh(self, name: str, entry: MeshEntry, overrides: dict[str, str]) -> Mesh:
+        key = (name, *sorted(overrides.items()))
+        if key not in self._meshes:
+            file = self.inputs.file(entry.file)
+            self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg)
+        return self._meshes[key]
+
+    def shapes(self, thing: ObjectEntry, meshes: dict[str, MeshEntry], poses: dict) -> list[Shape]:
+        """One per material of the object."""
+        mesh, stem = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials), self._written(thing, meshes)
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = poses[thing.name]["rotation"], poses[thing.name]["translation"]
+        used = [self.materials[label - 1] for label in mesh.labels]
+        return [Shape(f"{thing.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
+
+    def _written(self, thing: ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
+        """What the files are called before the material, relative to the scenes; a second choice of materials is <mesh>.2."""
+        key = (thing.mesh, *sorted(thing.materials.items()))
+        if key not in self._stems:
+            number = 1 + sum(other[0] == thing.mesh for other in self._stems)
+            stem = f"meshes/{thing.mesh}" + (f".{number}" if number > 1 else "")
+            mesh = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials)
+            for label in mesh.labels:
+                write_ply(self.scenes / f"{stem}.{self.materials[label - 1]}.ply", submesh(mesh, label))
+            self._stems[key] = stem
+        return self._stems[key]

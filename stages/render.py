@@ -1,0 +1,97 @@
+"""What was solved, as pictures: the photo synthesised again, and every material in the photo's light.
+
+Writes resynthesis/<photo>, materials/<photo>/<material> (balls) and reflectance_maps/<photo>/<material> (channel
+`observed`: 1 where the photo shows that normal), each as linear EXR and as PNG at the photo's own exposure.
+"""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from scipy.ndimage import binary_erosion
+
+from factorlib.dataset.schema import LightSlice
+from factorlib.export.materials import Material, read_materials
+from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
+from factorlib.images.picture import exposure_of, picture, write_png
+from factorlib.jsonfile import read_json
+from factorlib.light.lobes import Lobes, read_lobes
+from factorlib.reflection import reflection_operator
+from factorlib.render.ball import ball, ball_normals, observed_cells
+from factorlib.render.reflect import TAIL, Reflector
+from factorlib.render.resynthesis import resynthesised
+from factorlib.stage import Inputs, Progress
+from factorlib.urm.extract import observed_pixels
+
+log = logging.getLogger("factorlib.render")
+Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
+RING = (255, 255, 255)
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """tail: share of a pixel's radiance, of its faintest highlights, that is left to the closed form (0: none)."""
+
+    operator: Literal["network", "closed_form", "reference"] = "network"
+    tail: Annotated[float, msgspec.Meta(ge=0, le=0.1)] = TAIL
+    ball_size: Size = 128
+    map_size: Size = 64
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    name, names = inputs.photo, inputs.facts["dataset.materials"]
+    table = read_materials(inputs["export"] / "materials.json")
+    materials = [table[material] for material in names]
+    photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
+    reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light_of_photo(inputs), params.tail)
+    exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
+    total = 10 + len(names)
+
+    def report(done: float, pixels: float) -> None:
+        progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
+
+    _write(out / "resynthesis" / name, resynthesised(reflector, materials, photo, geometry, report), exposure)
+    seen = observed_pixels(photo, geometry)
+    for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
+        progress(9 + k, total, f"{name}: {label}")
+        pixels = seen & (np.rint(photo["label"]) == k)
+        normals = np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1)
+        _write(out / "materials" / name / label, ball(reflector, material, params.ball_size), exposure, disc=True)
+        _write_map(out / "reflectance_maps" / name / label, reflector, material, normals, exposure, params.map_size)
+    progress(total, total, name)
+
+
+def light_of_photo(inputs: Inputs) -> Lobes:
+    """The photo's light in its own camera frame, exposure included."""
+    slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
+    lobes = read_lobes(inputs["export"] / "lobes.parquet")[slice_.illumination]
+    if len(lobes) == 0:
+        log.warning("%s: nothing is known of its light: its pictures are black", inputs.photo)
+    if slice_.world_from_camera is not None:
+        lobes = lobes.turned(np.array(slice_.world_from_camera).T)
+    return lobes.scaled(np.array(read_json(inputs["export"] / "exposures.json").get(inputs.photo, 1.0)))
+
+
+def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False) -> None:
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
+    pixels = picture(radiance, exposure)
+    write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels) if disc else pixels)
+
+
+def _write_map(stem: Path, reflector: Reflector, material: Material, normals: np.ndarray, exposure: float, size: int) -> None:
+    """Radiance by normal, and which normals the photo shows: ringed in the PNG."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    radiance, observed = ball(reflector, material, size), observed_cells(normals, size)
+    channels = {c: radiance[..., k] for k, c in enumerate("RGB")}
+    write_exr(stem.with_name(stem.name + ".exr"), {**channels, "observed": observed})
+    pixels = picture(radiance, exposure)
+    pixels[observed & ~binary_erosion(observed)] = RING
+    write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels))
+
+
+def _on_disc(pixels: np.ndarray) -> np.ndarray:
+    """Transparent beside the ball."""
+    _, inside = ball_normals(len(pixels))
+    return np.concatenate([pixels, 255 * inside[..., None].astype(np.uint8)], axis=-1)

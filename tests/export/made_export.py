@@ -1,0 +1,123 @@
+"""Small inputs of `export` and `render`, made by hand: two objects in two photos, a light of coloured lobes, and solved numbers.
+
+The first photo shows a ball, principal point off centre; the second an ellipsoid of two materials far off the
+axis, turned, in a light fixed to the world.  The meshes are fine enough that their facets do not show.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.raster import rasterise
+from factorlib.images.exr import write_exr
+from factorlib.jsonfile import write_json
+from factorlib.light.lobes import Lobes, write_lobes
+from factorlib.meshes.read import read_mesh
+from factorlib.reflection.network import SHIPPED
+from factorlib.stage import Inputs
+
+NAMES = ["red", "brass", "unseen"]
+MATERIALS = {
+    "red": {"diffuse": [0.7, 0.2, 0.1], "specular": [0.3, 0.35, 0.4], "roughness": 0.35},  # max + max > 1
+    "brass": {"diffuse": [0.0, 0.0, 0.0], "specular": [0.8, 0.6, 0.2], "roughness": 0.5},
+    "unseen": {"diffuse": [0.1, 0.2, 0.5], "specular": [0.0, 0.0, 0.0], "roughness": 0.9},
+}
+WIDTH, HEIGHT = 64, 56
+CAMERAS = {"front": Camera(WIDTH, HEIGHT, 95.0, (38.0, 25.0)), "side": Camera(WIDTH, HEIGHT, 85.0, (9.0, 42.0))}
+POSES = {
+    "front": Pose(np.eye(3), np.array([-0.2, 0.15, 4.0])),
+    "side": Pose(Rotation.from_euler("xyz", [30, -50, 70], degrees=True).as_matrix(), np.array([1.1, -0.7, 4.0])),
+}
+MESHES = {"front": "ball", "side": "egg"}
+WORLD_FROM_CAMERA = {"front": None, "side": Rotation.from_euler("xyz", [-25, 60, 15], degrees=True).as_matrix()}
+EXPOSURES = {"front": [1.0] * 3, "side": [0.5] * 3}
+
+
+def light(seed: int) -> Lobes:
+    """A sky, a window off the axis and a small lamp, of different colours, in front of the objects mostly."""
+    rng = np.random.default_rng(seed)
+    axis = np.array([[0.2, -0.9, -0.3], [-0.8, -0.3, -0.5], [0.6, 0.1, -0.8]]) + 0.1 * rng.normal(size=(3, 3))
+    weight = np.array([[0.4, 0.6, 1.0], [2.0, 1.5, 1.0], [30.0, 10.0, 20.0]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.5, 12.0, 300.0]), weight)
+
+
+def lights() -> dict[str, Lobes]:
+    """By illumination, each in its own frame."""
+    return {"front": light(0), "room": light(1).turned(WORLD_FROM_CAMERA["side"])}
+
+
+def write_obj(path: Path, radii: tuple[float, float, float], rows: int = 48) -> None:
+    """An ellipsoid of two parts, `upper` and `lower`."""
+    theta, phi = np.linspace(0, np.pi, rows + 1), np.arange(2 * rows) / rows * np.pi
+    t, p = (a.reshape(-1) for a in np.meshgrid(theta, phi, indexing="ij"))
+    points = np.stack([np.sin(t) * np.cos(p), np.cos(t), np.sin(t) * np.sin(p)], axis=-1) * radii
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in points]
+    for half, name in ((0, "upper"), (1, "lower")):
+        lines.append(f"g {name}")
+        for i in range(half * rows // 2, (half + 1) * rows // 2):
+            for j in range(2 * rows):
+                a, b = (1 + i * 2 * rows + k for k in (j, (j + 1) % (2 * rows)))
+                c, d = a + 2 * rows, b + 2 * rows
+                lines += [f"f {a} {b} {d}", f"f {a} {d} {c}"]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def make(folder: Path) -> Inputs:
+    """Write what `align`, `masks` and `solve` would, and return the inputs of `export`."""
+    for stage in ("align", "masks", "solve", "meshes"):
+        (folder / stage).mkdir(parents=True)
+    files = {"ball.obj": folder / "meshes" / "ball.obj", "egg.obj": folder / "meshes" / "egg.obj"}
+    write_obj(files["ball.obj"], (1, 1, 1))
+    write_obj(files["egg.obj"], (0.8, 1.1, 0.6))
+    parts = {"ball": {"upper": "red", "lower": "red"}, "egg": {"upper": "red", "lower": "brass"}}
+    meshes = {name: {"file": f"{name}.obj", "parts": parts[name], "material": None} for name in parts}
+    for photo, name in MESHES.items():
+        _write_photo(folder, photo, rasterise(read_mesh(files[f"{name}.obj"], NAMES, parts[name]), CAMERAS[photo], POSES[photo]))
+    write_json(folder / "align" / "poses.json", {photo: _pose_entry(photo) for photo in MESHES})
+    stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
+    table = {n: {**m, "alpha": m["roughness"] ** 2, "stderr": stderr} for n, m in MATERIALS.items()}
+    write_json(folder / "solve" / "materials.json", {"materials": table, "gauge": {"rule": "by hand"}, "model": {}})
+    write_json(folder / "solve" / "exposures.json", EXPOSURES)
+    write_lobes(folder / "solve" / "lobes.parquet", lights())
+    facts = {
+        "dataset.materials": NAMES,
+        "dataset.light": {p: _light_facts(p) for p in MESHES},
+        "dataset.objects": {
+            p: {"camera": {}, "objects": [{"name": "thing", "mesh": m}], "meshes": {m: meshes[m]}} for p, m in MESHES.items()
+        },
+    }
+    return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
+
+
+def of_photo(inputs: Inputs, exported: Path, photo: str) -> Inputs:
+    """The inputs of `render` for one photo; the networks are the shipped ones."""
+
+    facts = {**inputs.facts, "dataset.light": inputs.facts["dataset.light"][photo]}
+    return Inputs({**inputs.folders, "export": exported, "train": SHIPPED}, facts, inputs.files, photo)
+
+
+def _light_facts(photo: str) -> dict:
+    world = WORLD_FROM_CAMERA[photo]
+    return {"illumination": "front" if world is None else "room", "world_from_camera": None if world is None else world.tolist()}
+
+
+def _pose_entry(photo: str) -> dict:
+    camera, pose = CAMERAS[photo], POSES[photo]
+    return {
+        "camera": {"focal_px": camera.focal, "principal_point": list(camera.centre)},
+        "objects": {"thing": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}},
+    }
+
+
+def _write_photo(folder: Path, photo: str, maps) -> None:
+    inside = maps.label > 0
+    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
+    channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
+    channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": inside}
+    write_exr(folder / "align" / f"{photo}.exr", channels)
+    grey = {c: 0.3 * inside for c in "RGB"}
+    write_exr(folder / "masks" / f"{photo}.exr", {**grey, "label": maps.label, "valid": inside, "left_out": 0 * inside})

@@ -1,0 +1,84 @@
+"""The stage `export`: gauge, files, and bytes."""
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from factorlib.conventions import FRONT
+from factorlib.export.materials import materials_of_table, read_materials
+from factorlib.images.exr import read_rgb_exr
+from factorlib.jsonfile import read_json, write_json
+from factorlib.light.latlong import map_energy
+from factorlib.light.lobes import read_lobes, write_lobes
+from factorlib.reflection import reflection_operator
+from factorlib.stage import silent
+from stages import export
+from tests.export import made_export
+
+SMALL = export.Params(height=32, mitsuba_height=32)
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    return made_export.make(tmp_path)
+
+
+def run(inputs, out, params=SMALL):
+    out.mkdir()
+    export.main(params, inputs, out, silent)
+    return out
+
+
+def files_of(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_path):
+    out, operator = run(inputs, tmp_path / "out"), reflection_operator("closed_form", dtype="float64")
+    solved = materials_of_table(read_json(inputs["solve"] / "materials.json"))
+    found, lobes = read_materials(out / "materials.json"), read_lobes(out / "lobes.parquet")
+    normal = torch.tensor(FRONT[None])
+    for name, light in made_export.lights().items():
+        for material in solved:
+            expected, exported = operator(light, solved[material], normal, normal), operator(lobes[name], found[material], normal, normal)
+            np.testing.assert_allclose(exported, expected, rtol=1e-6)
+        np.testing.assert_allclose(map_energy(read_rgb_exr(out / "illumination" / f"{name}.exr")), lobes[name].energy, rtol=1e-4)
+    assert max(m.total for m in found.values()) <= 1 - 1e-5 + 1e-12
+    assert read_json(out / "materials.json")["gauge"]["export_factor"] == pytest.approx((1 - 1e-5) / 1.1)
+
+
+def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
+    first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
+    expected = {"materials.json", "exposures.json", "lobes.parquet", "materials.mtlx", "ball.glb", "egg.glb"}
+    expected |= {f"illumination/{name}.exr" for name in ("front", "room")} | {f"scenes/{name}.xml" for name in ("front", "side")}
+    expected |= {f"scenes/light/{name}.exr" for name in ("front", "room")}
+    expected |= {f"scenes/meshes/{name}.ply" for name in ("ball.red", "egg.red", "egg.brass")}
+    assert set(first) == expected
+    assert first == second
+
+
+def test_another_choice_of_materials_for_a_mesh_gets_its_own_files(inputs, tmp_path):
+    facts = msgspec.to_builtins(inputs.facts)
+    facts["dataset.objects"]["front"] = facts["dataset.objects"]["side"] | {
+        "objects": [{"name": "thing", "mesh": "egg", "materials": {"upper": "unseen", "lower": "unseen"}}]
+    }
+    out = run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
+    assert {p.name for p in (out / "scenes" / "meshes").iterdir()} == {"egg.unseen.ply", "egg.2.red.ply", "egg.2.brass.ply"}
+    assert "egg.unseen.ply" in (out / "scenes" / "front.xml").read_text()
+    assert "egg.2.red.ply" in (out / "scenes" / "side.xml").read_text()
+
+
+def test_a_coloured_exposure_has_a_map_of_its_own(inputs, tmp_path):
+    write_json(inputs["solve"] / "exposures.json", {"front": [1, 1, 1], "side": [2.0, 1.0, 0.5]})
+    out = run(inputs, tmp_path / "out")
+    own, shared = (read_rgb_exr(out / "scenes" / "light" / name) for name in ("side.exposed.exr", "room.exr"))
+    np.testing.assert_allclose(own, shared * [2.0, 1.0, 0.5], rtol=1e-5)
+    assert "side.exposed.exr" in (out / "scenes" / "side.xml").read_text()
+
+
+def test_a_light_that_was_not_solved_for_is_black_and_said(inputs, tmp_path, caplog):
+    write_lobes(inputs["solve"] / "lobes.parquet", {"front": made_export.light(0)})
+    out = run(inputs, tmp_path / "out")
+    assert "'room' was not solved for" in caplog.text
+    assert not read_rgb_exr(out / "illumination" / "room.exr").any()

@@ -1,0 +1,89 @@
+"""Materials in the gauge of other programs, and as MaterialX and glTF."""
+
+import json
+import struct
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+import trimesh
+
+from factorlib.export.gltf import write_glb
+from factorlib.export.materials import Material, headroom_factor, table_in_gauge
+from factorlib.export.materialx import write_materialx
+from factorlib.meshes.mesh import Mesh
+
+BRIGHT = Material((0.9, 0.3, 0.2), (0.1, 0.2, 0.3), 0.5)
+CASES = {"bright": BRIGHT.scaled(0.8), "matte": Material((0.2, 0.3, 0.4), (0, 0, 0), 0.9), "metal": Material((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
+         "black": Material((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.8, 1.0, 30.0])
+def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
+    materials = {"a": BRIGHT.scaled(scale), "b": BRIGHT.scaled(0.01)}
+    factor = headroom_factor(materials)
+    assert max(m.scaled(factor).total for m in materials.values()) <= 1 - 1e-5 + 1e-15
+    assert factor == 1.0 if BRIGHT.scaled(scale).total < 1 - 1e-5 else factor < 1
+
+
+def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
+    entry = {"diffuse": [0.8] * 3, "specular": [0.4] * 3, "roughness": 0.3, "alpha": 0.09}
+    table = {
+        "materials": {"a": {**entry, "stderr": {"diffuse": [0.1] * 3, "specular": [0.2] * 3, "roughness": 0.05}}},
+        "gauge": {"rule": "x"},
+    }
+    found = table_in_gauge(table, 0.5)
+    assert found["materials"]["a"] == {"diffuse": [0.4] * 3, "specular": [0.2] * 3, "roughness": 0.3, "alpha": 0.09,
+                                       "stderr": {"diffuse": [0.05] * 3, "specular": [0.1] * 3, "roughness": 0.05}}  # fmt: skip
+    assert found["gauge"]["rule"] == "x" and found["gauge"]["export_factor"] == 0.5
+    assert table["materials"]["a"]["diffuse"] == [0.8] * 3
+
+
+def test_materialx_mixes_to_the_solved_reflectances(tmp_path):
+    write_materialx(tmp_path / "m.mtlx", CASES)
+    root = ET.parse(tmp_path / "m.mtlx").getroot()
+    for name, material in CASES.items():
+        value = {(n.get("name"), i.get("name")): i.get("value") for n in root for i in n}
+        weight = float(value[f"m_{name}_bsdf", "mix"])
+        diffuse, specular = (numbers(value[key]) for key in ((f"m_{name}_diffuse", "color"), (f"m_{name}_specular", "color0")))
+        np.testing.assert_allclose((1 - weight) * diffuse, material.diffuse, atol=1e-12)
+        np.testing.assert_allclose(weight * specular, material.specular, atol=1e-12)
+        assert numbers(value[f"m_{name}_specular", "roughness"]).tolist() == [material.alpha] * 2
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.array([float(word) for word in text.split(",")])
+
+
+def test_materialx_is_valid_where_its_library_is_there(tmp_path):
+    library = pytest.importorskip("MaterialX", reason="the MaterialX library is not installed")
+    write_materialx(tmp_path / "m.mtlx", CASES)
+    document, standard = library.createDocument(), library.createDocument()
+    library.loadLibraries(library.getDefaultDataLibraryFolders(), library.getDefaultDataSearchPath(), standard)
+    document.importLibrary(standard)
+    library.readFromXmlFile(document, str(tmp_path / "m.mtlx"))
+    assert document.validate() == (True, "")
+
+
+def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    mesh = Mesh(square, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0.0, 0, 1], (4, 1)), np.array([1, 3], np.int16), open=True)
+    write_glb(tmp_path / "m.glb", mesh, ["bright", "unused", "metal"], CASES)
+    write_glb(tmp_path / "n.glb", mesh, ["bright", "unused", "metal"], CASES)
+    assert (tmp_path / "m.glb").read_bytes() == (tmp_path / "n.glb").read_bytes()
+    found = trimesh.load(tmp_path / "m.glb")
+    assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
+    tree = _gltf(tmp_path / "m.glb")
+    for entry in tree["materials"]:
+        material, core, more = CASES[entry["name"]], entry["pbrMetallicRoughness"], entry["extensions"]["KHR_materials_specular"]
+        f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
+        np.testing.assert_allclose(f0, material.specular, atol=1e-12)
+        np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
+        assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
+
+
+def _gltf(path) -> dict:
+    """The JSON chunk of a GLB."""
+    data = path.read_bytes()
+    length = struct.unpack("<I", data[12:16])[0]
+    return json.loads(data[20 : 20 + length])

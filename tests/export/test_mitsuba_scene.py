@@ -1,0 +1,173 @@
+"""Exported scenes, rendered by Mitsuba, are the pipeline's own pictures: camera, poses, materials, light and every frame."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.export.environment import mitsuba_map, node_directions, sharpened
+from factorlib.export.materials import Material, read_materials
+from factorlib.export.mitsuba import Environment, Shape, View, write_scene
+from factorlib.generate.mitsuba_variant import mitsuba
+from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
+from factorlib.light.lobes import Lobes
+from factorlib.meshes.ply import write_ply
+from factorlib.meshes.read import read_mesh
+from factorlib.reflection.reference import Reference
+from factorlib.render.reflect import Reflector
+from factorlib.render.resynthesis import resynthesised
+from factorlib.stage import silent
+from stages import export, render
+from tests.export import made_export
+
+SPP = 1024
+
+
+def rendered(path, **options) -> np.ndarray:
+    module = mitsuba()
+    return np.array(module.render(module.load_file(str(path), **options)))
+
+
+def block_means(picture: np.ndarray, pixels: np.ndarray, side: int = 8) -> np.ndarray:
+    """Means over the `pixels` in blocks of side × side that hold at least a third of them, [blocks, 3]."""
+    height, width = pixels.shape
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        return values.reshape(height // side, side, width // side, side, -1).sum(axis=(1, 3))
+
+    count = sums(pixels[..., None].astype(float))
+    full = count[..., 0] > side**2 / 3
+    return sums(picture * pixels[..., None])[full] / count[full]
+
+
+def whole_pixels(label: np.ndarray) -> np.ndarray:
+    """Pixels that show one material only: those whose neighbours are of the same."""
+    return np.any([binary_erosion(label == k, np.ones((3, 3))) for k in np.unique(label[label > 0])], axis=0)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export")
+    inputs = made_export.make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(), inputs, folder / "export", silent)
+    return inputs, folder / "export"
+
+
+@pytest.mark.parametrize("photo", ["front", "side"])
+def test_scene_equals_resynthesis(exported, photo):
+    inputs, out = exported
+    geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))
+    light = render.light_of_photo(made_export.of_photo(inputs, out, photo))
+    table = read_materials(out / "materials.json")
+    pixels = whole_pixels(geometry["label"])
+    reflector = Reflector(Reference(tolerance=1e-3), light)
+    expected = resynthesised(reflector, [table[n] for n in made_export.NAMES], {"label": masks["label"] * pixels}, geometry)
+    found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
+    error = block_means(found, pixels) / block_means(expected, pixels) - 1
+    assert len(error) >= 15
+    assert np.abs(error).max() < 0.01
+    assert not found[binary_erosion(geometry["label"] == 0, np.ones((3, 3)))].any()  # the light itself is not shown
+
+
+# one texel, one side ------------------------------------------------------------------------------------------------
+
+SIDES = {"right": (1, 0, 0), "left": (-1, 0, 0), "above": (0, -1, 0), "below": (0, 1, 0), "viewer": (0, 0, -1)}  # camera frame
+
+
+def ball_scene(folder, material: Material, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
+    """A ball in front of a square camera, through a scene file and a mesh file."""
+    if not (folder / "ball.red.ply").exists():
+        made_export.write_obj(folder / "ball.obj", (1, 1, 1))
+        mesh = read_mesh(folder / "ball.obj", ["red"], None, "red")
+        write_ply(folder / "ball.red.ply", mesh)
+    write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
+    place = np.eye(4)
+    place[2, 3] = 5.0
+    shape = Shape("ball", "ball.red.ply", "red", place, two_sided)
+    write_scene(
+        folder / "scene.xml", View(32, 32, 70.0, (16.0, 16.0)), [shape], {"red": material}, Environment("light.exr", 1.0, camera_from_light)
+    )
+    return folder / "scene.xml"
+
+
+def one_lobe(axis, sharpness=3000.0) -> Lobes:
+    return Lobes(np.array([axis], float), np.array([sharpness]), np.array([[1000.0] * 3]))
+
+
+def centroid(picture: np.ndarray) -> np.ndarray:
+    """Column and row of the light's centre, from −1 to 1."""
+    at = (np.arange(32) + 0.5) / 16 - 1
+    shade = picture[..., 0] / picture[..., 0].sum()
+    return np.array([(shade * at).sum(), (shade * at[:, None]).sum()])
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_light_of_one_texel_comes_back_from_its_side(tmp_path, side):
+    matte = Material((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    path = ball_scene(tmp_path, matte, one_lobe(SIDES[side]))
+    np.testing.assert_allclose(np.sign(np.round(centroid(rendered(path, spp=32)), 1)), SIDES[side][:2])
+
+
+def test_light_fixed_to_the_world_turns_with_the_camera(tmp_path):
+    turn = made_export.WORLD_FROM_CAMERA["side"]
+    matte = Material((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    still = rendered(ball_scene(tmp_path, matte, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
+    turned = rendered(ball_scene(tmp_path, matte, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64)
+    np.testing.assert_allclose(centroid(turned), centroid(still), atol=0.01)
+    assert turned.mean() == pytest.approx(still.mean(), rel=0.01)
+
+
+# materials -----------------------------------------------------------------------------------------------------------
+
+CASES = {
+    "diffuse": Material((0.9, 0.5, 0.1), (0, 0, 0), 0.5),
+    "specular": Material((0, 0, 0), (0.9, 0.5, 0.1), 0.5),
+    "black": Material((0, 0, 0), (0, 0, 0), 0.5),
+    "all of it": Material((0.5, 0.2, 0.3), (0.1, 0.49999, 0.2), 0.4),
+}
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_each_kind_of_material_loads_and_reflects_as_solved(tmp_path, case, two_sided):
+    constant = Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.1]), np.ones((1, 3)))
+    picture = rendered(ball_scene(tmp_path, CASES[case], constant, two_sided), spp=400)[14:18, 14:18].mean((0, 1))
+    middle = np.array([[0.0, 0.0, -1.0]])
+    expected = Reflector(Reference(tolerance=1e-3), constant)(CASES[case], middle, middle)[0]
+    np.testing.assert_allclose(picture, expected, rtol=0.02)  # the ball's middle against its very centre
+    assert (picture > 0).all() == (case != "black")
+
+
+# the map ---------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def interpolation_nodes(height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions and solid angles of the nodes: what a sum over them weighs."""
+    tall = np.pi / (height - 1)
+    theta = np.arange(height) * tall
+    edges = np.cos(np.clip(np.stack([theta - tall / 2, theta + tall / 2]), 0, np.pi))
+    return node_directions(height, 2 * height), (edges[0] - edges[1]) * np.pi / height
+
+
+@pytest.mark.parametrize("sharpness", [0.1, 30.0, 2000.0, 1e5])
+def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
+    axis = np.array([0.48, -0.36, 0.8])
+    lobe = Lobes(axis[None], np.array([sharpness]), np.ones((1, 3)))
+    directions, area = interpolation_nodes(256)
+    values = mitsuba_map(lobe, 256, 512)[..., 0] * area[:, None]
+    assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
+    mean = np.einsum("hw,hwk->k", values, directions)
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
+
+
+def test_sharpening_undoes_what_interpolation_widens():
+    lobe, spacing = one_lobe((0, 0, 1), 2000.0), 0.0125
+    x = np.linspace(-0.2, 0.2, 20001)
+    nodes = np.arange(-20, 21) * spacing
+    exponent = -0.5 * sharpened(lobe, spacing).sharpness[0]
+    interpolated = np.interp(x, nodes, np.exp(exponent * nodes**2))
+    assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)

@@ -1,0 +1,101 @@
+"""Reflectors: the same radiance as quadrature over the exported map, and as the operator without short cuts."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.export.materials import Material
+from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.lobes import Lobes, no_lobes
+from factorlib.reflection import reflection_operator
+from factorlib.reflection.reference import Reference
+from factorlib.render.reflect import Reflector
+
+GLOSSY = Material((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
+
+
+def unit(count: int, seed: int) -> np.ndarray:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def light(count: int = 5) -> Lobes:
+    return Lobes(
+        unit(count, 0),
+        np.geomspace(1, 150, count),
+        np.random.default_rng(1).uniform(0.2, 2, (count, 3)) * np.geomspace(1, 20, count)[:, None],
+    )
+
+
+def points(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normals and views that see the surface."""
+    normals, views = unit(count, 2), unit(count, 3)
+    return normals, views * np.sign((normals * views).sum(1, keepdims=True))
+
+
+def by_quadrature(lat_long: np.ndarray, material: Material, normals: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Lambert + GGX over every texel of an exported map; normals and views in the camera frame."""
+    height, width = lat_long.shape[:2]
+    i = lat_long_directions(height, width).reshape(-1, 3)
+    n, o = normals @ YUP_FROM_CAMERA.T, views @ YUP_FROM_CAMERA.T
+    a2 = material.alpha**2
+
+    def g1(c):
+        return 2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2))
+
+    half = i[None] + o[:, None]
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    ni, no, nh = np.maximum(n @ i.T, 1e-12), (n * o).sum(1)[:, None], np.einsum("pc,ptc->pt", n, half)
+    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
+    specular = np.where(n @ i.T > 0, d * g1(ni) * g1(no) / (4 * no), 0)
+    incoming = lat_long.reshape(-1, 3) * np.repeat(lat_long_solid_angles(height, width), width)[:, None]
+    return np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming) + np.array(material.specular) * (specular @ incoming)
+
+
+def test_radiance_is_the_integral_over_the_exported_map():
+    normals, views = points(12)
+    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
+    np.testing.assert_allclose(found, by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, normals, views), rtol=2e-3)
+
+
+def test_short_cuts_keep_to_the_operator():
+    many, (normals, views) = light(40), points(300)
+    operator = reflection_operator("network")
+    expected = operator(many, GLOSSY, torch.as_tensor(normals), torch.as_tensor(views)).numpy()
+    np.testing.assert_allclose(Reflector(operator, many, tail=0.0)(GLOSSY, normals, views), expected, rtol=1e-3)
+    error = np.abs(Reflector(operator, many)(GLOSSY, normals, views) / expected - 1)
+    assert np.median(error) < 1e-3 and error.max() < 0.02
+
+
+def test_turning_light_and_object_together_changes_nothing():
+    rotation, (normals, views) = Rotation.random(random_state=4).as_matrix(), points(50)
+    operator = reflection_operator("closed_form", dtype="float64")
+    turned = Reflector(operator, light().turned(rotation))(GLOSSY, normals @ rotation.T, views @ rotation.T)
+    np.testing.assert_allclose(turned, Reflector(operator, light())(GLOSSY, normals, views), rtol=1e-6)
+
+
+def test_scaling_a_channel_of_the_light_scales_the_channel():
+    operator, factor = reflection_operator("closed_form", dtype="float64"), np.array([2.0, 0.5, 3.0])
+    scaled = Reflector(operator, light().scaled(factor))(GLOSSY, *points(50))
+    np.testing.assert_allclose(scaled, Reflector(operator, light())(GLOSSY, *points(50)) * factor, rtol=1e-9)
+
+
+def test_chunks_do_not_show(monkeypatch):
+    operator, seen = reflection_operator("closed_form"), []
+    whole = Reflector(operator, light())(GLOSSY, *points(50))
+    monkeypatch.setattr("factorlib.render.reflect.PAIRS_AT_ONCE", 35)
+    parts = Reflector(operator, light())(GLOSSY, *points(50), report=lambda done, total: seen.append((done, total)))
+    np.testing.assert_allclose(parts, whole, rtol=1e-6)
+    assert seen[0] == (7, 50) and seen[-1] == (50, 50)
+
+
+@pytest.mark.parametrize("dark", [no_lobes(), light().scaled(0.0)])
+def test_darkness_is_black(dark):
+    assert not Reflector(reflection_operator("closed_form"), dark)(GLOSSY, *points(5)).any()
+
+
+def test_surfaces_that_face_away_are_black():
+    normals, views = points(20)
+    assert not Reflector(reflection_operator("closed_form"), light())(GLOSSY, normals, -views).any()

@@ -1,0 +1,81 @@
+"""The stage `render`: its files, masks, frames and bytes."""
+
+import numpy as np
+import pytest
+import torch
+
+from factorlib.conventions import FRONT
+from factorlib.export.materials import materials_of_table
+from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.jsonfile import read_json
+from factorlib.light.lobes import no_lobes, write_lobes
+from factorlib.reflection import reflection_operator
+from factorlib.stage import silent
+from stages import export, render
+from tests.export import made_export
+
+FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    inputs = made_export.make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
+    return inputs, folder / "export"
+
+
+def run(made, photo, out):
+    out.mkdir()
+    render.main(FAST, made_export.of_photo(*made, photo), out, silent)
+    return out
+
+
+def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
+    first, second = (
+        {str(p.relative_to(o)): p.read_bytes() for p in o.rglob("*.*")} for o in (run(made, "side", tmp_path / n) for n in "ab")
+    )
+    stems = ["resynthesis/side"] + [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
+    assert set(first) == {f"{stem}.{suffix}" for stem in stems for suffix in ("exr", "png")}
+    assert first == second
+
+
+@pytest.mark.parametrize("photo", ["front", "side"])
+def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(made, tmp_path, photo):
+    inputs, _ = made
+    world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()["front" if photo == "front" else "room"]
+    normal = torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])  # in the light's own frame
+    solved = materials_of_table(read_json(inputs["solve"] / "materials.json"))
+    out = run(made, photo, tmp_path / "out")
+    for name in made_export.NAMES:
+        expected = reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
+        np.testing.assert_allclose(read_rgb_exr(out / "materials" / photo / f"{name}.exr")[16, 16], expected, rtol=2e-3)
+
+
+def test_resynthesis_is_black_outside_the_mask_and_lit_inside(made, tmp_path):
+    picture = read_rgb_exr(run(made, "front", tmp_path / "out") / "resynthesis" / "front.exr")
+    inside = read_exr(made[0]["masks"] / "front.exr")["label"] > 0
+    assert picture.shape == (made_export.HEIGHT, made_export.WIDTH, 3)
+    np.testing.assert_array_equal(picture.max(-1) > 0, inside)
+
+
+def test_observed_normals_are_those_of_the_photo(made, tmp_path):
+    folder = run(made, "front", tmp_path / "out") / "reflectance_maps" / "front"
+    disc = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, 32)] * 2)) < 0.9
+    assert read_exr(folder / "red.exr")["observed"][disc].mean() > 0.95  # the photo shows a whole ball of it
+    assert not read_exr(folder / "brass.exr")["observed"].any()
+    assert read_rgb_exr(folder / "brass.exr")[16, 16].min() > 0  # and yet it is synthesised
+
+
+def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
+    inputs, exported = made
+    lobes = exported / "lobes.parquet"
+    before = lobes.read_bytes()
+    try:
+        write_lobes(lobes, {"front": no_lobes()})
+        out = run(made, "front", tmp_path / "out")
+    finally:
+        lobes.write_bytes(before)
+    assert "nothing is known of its light" in caplog.text
+    assert not read_rgb_exr(out / "resynthesis" / "front.exr").any()
