@@ -44,7 +44,13 @@ def _write(set_, out: Path, seed: int, lights: Path | None) -> None:
         rmtree(fresh, ignore_errors=True)
         with Progress() as bar:
             task = bar.add_task(f"{out}", total=1)
-            set_.generate(fresh, seed, maps, set_.Parameters(), lambda done, total, text: bar.update(task, completed=done, total=total, description=text))
+            set_.generate(
+                fresh,
+                seed,
+                maps,
+                set_.Parameters(),
+                lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+            )
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None
@@ -55,7 +61,9 @@ def _write(set_, out: Path, seed: int, lights: Path | None) -> None:
 
 def _check_replaceable(out: Path) -> None:
     if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
-        raise InputError("this folder holds something else than a data set", file=out, cure="name an empty folder, or a data set to replace")
+        raise InputError(
+            "this folder holds something else than a data set", file=out, cure="name an empty folder, or a data set to replace"
+        )
 
 
 if __name__ == "__main__":

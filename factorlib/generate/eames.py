@@ -80,7 +80,9 @@ CLIPPED = 0.02  # of the chairs' pixels
 APART = 0.42  # half the distance between two chairs, metres
 
 
-def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SHOTS) -> None:
+def generate(
+    out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SHOTS
+) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
@@ -131,13 +133,15 @@ def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.
     return Scene(shot, things, camera, rigid(look(-down, yaw), place), chairs)
 
 
-def surroundings(shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters) -> Things:
+def surroundings(
+    shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
+) -> Things:
     """A sky, a room, or a user's map over a grey ground; nothing stands between camera and chairs."""
     if lat_longs:
         light = lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
         return {"light": envmap(light), "ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
     if shot.sun:
-        return lights.daylight(rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity)
+        return lights.daylight(rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows)
     return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180)
 
 

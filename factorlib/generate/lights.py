@@ -14,14 +14,15 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
+from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.generate.tracing import envmap, light_seen, rgb, transform
 from factorlib.images.photo import read_photo
-from factorlib.light.latlong import turned_map
 
-SKY_ROWS = 256
 EYE = 1.2  # height of the origin over the ground
+# sunsky's zenith is its +z; its sun_direction is the world's
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 Things = dict[str, Any]
-TURNS = {"+x": (0, 90, 0), "-x": (0, -90, 0), "+z": (0, 0, 0), "-z": (0, 180, 0), "+y": (-90, 0, 0), "-y": (90, 0, 0)}
+TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}  # about x, about y, of +z
 
 
 def daylight(
@@ -32,11 +33,12 @@ def daylight(
     sun_scale: float = 0.12,
     sun_aperture_deg: float = 3.0,
     ground=(0.32, 0.3, 0.26),
+    rows: int = 256,
 ) -> Things:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
     The sun is veiled: wider and weaker than the real one, whose 0.5° nothing but a mirror would tell.  The sky is handed
-    on as a map, which Mitsuba samples with less noise than the model itself.
+    on as a map of some rows, which Mitsuba samples with less noise than the model itself.
     """
     up, turn = np.radians([elevation_deg, azimuth_deg])
     sun = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
@@ -44,7 +46,7 @@ def daylight(
         "type": "sunsky", "turbidity": turbidity, "sun_scale": sun_scale, "sun_aperture": sun_aperture_deg,
         "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
     }  # fmt: skip
-    seen = light_seen({"sky": sky}, (0, 0, 0), np.eye(3), SKY_ROWS, 4, 0, max_depth=2)
+    seen = light_seen({"sky": sky}, (0, 0, 0), np.eye(3), rows, 4, 0, max_depth=2)
     things = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), ground)}
     return things | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
 
@@ -55,10 +57,6 @@ def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> Things:
     size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
     place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
     return block(place, size, np.degrees(angle), vivid(rng))
-
-
-Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # sunsky's zenith is its +z; its sun_direction is the world's
-
 
 
 def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0) -> Things:
@@ -73,15 +71,26 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
         things[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), rise=0.25)
-        things[f"picture{side}"] = wall(side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5))
+        things[f"picture{side}"] = wall(
+            side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
+        )
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
         things[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, rng.uniform(-1, 1), 0.45, glow=day)
     for k in range(lamps):
-        place = [rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]), rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1])]
+        place = [
+            rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]),
+            rng.uniform(0.4, 1.2),
+            rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1]),
+        ]
         warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
-        things[f"lamp_{k}"] = {"type": "sphere", "center": place, "radius": rng.uniform(0.12, 0.18), "emitter": {"type": "area", "radiance": rgb(warm)}}
+        things[f"lamp_{k}"] = {
+            "type": "sphere",
+            "center": place,
+            "radius": rng.uniform(0.12, 0.18),
+            "emitter": {"type": "area", "radiance": rgb(warm)},
+        }
     for k in range(4):
         angle = np.radians(clear_deg + rng.uniform(75, 285))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
@@ -102,25 +111,17 @@ def vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 def wall(side: str, distance: float, half, colour, along: float = 0.0, rise: float = 0.0, glow=None) -> Things:
     """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin."""
-    mi = _transforms()
-    turn = mi().translate([0, 0, distance])
-    pitch, yaw, _ = TURNS[side]
-    to_world = mi().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch) @ turn.translate([along, rise, 0]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
+    pitch, yaw = TURNS[side]
+    to_world = mitsuba().ScalarTransform4f().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch)
+    to_world = to_world.translate([along, rise, distance]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
     thing = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
     return thing if glow is None else thing | {"emitter": {"type": "area", "radiance": rgb(glow)}}
 
 
 def block(place, half, turn_deg: float, colour) -> Things:
     """A box of half sizes `half` about `place`, turned about y."""
-    mi = _transforms()
-    to_world = mi().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
+    to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
-
-
-def _transforms():
-    from factorlib.generate.mitsuba_variant import mitsuba
-
-    return mitsuba().ScalarTransform4f
 
 
 def map_of(things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place=(0, 0, 0)):

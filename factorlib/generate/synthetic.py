@@ -114,20 +114,24 @@ def _rounded(values) -> tuple[float, ...]:
     return tuple(round(float(v), 4) for v in values)
 
 
-def light_of(number: int, world_from_camera, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters) -> Float[np.ndarray, "h w 3"]:
+def light_of(
+    number: int, world_from_camera, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
+) -> Float[np.ndarray, "h w 3"]:
     """The light of photo `number`, in the camera's y-up frame: daylight for the first, rooms for the others."""
     if lat_longs:
         return lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
     seed = int(rng.integers(1 << 24))
     turn = world_from_camera @ YUP_FROM_CAMERA
-    return lights.map_of(surroundings(number, world_from_camera, rng), turn, parameters.light_rows, parameters.light_spp, seed)
+    return lights.map_of(
+        surroundings(number, world_from_camera, rng, 2 * parameters.light_rows), turn, parameters.light_rows, parameters.light_spp, seed
+    )
 
 
-def surroundings(number: int, world_from_camera, rng: np.random.Generator) -> Things:
+def surroundings(number: int, world_from_camera, rng: np.random.Generator, sky_rows: int) -> Things:
     if number:
         return lights.room(rng, windows=2, lamps=number)
     forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-    return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70))
+    return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70), rows=sky_rows)
 
 
 def placements(shot: Shot, world_from_camera, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
@@ -144,11 +148,16 @@ def name_of(placed: Placed) -> str:
     return f"{placed.material}_{placed.shape}"
 
 
-def write_shot(out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh], poses: dict[str, Pose], parameters: Parameters, seed: int) -> dict:
+def write_shot(
+    out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh], poses: dict[str, Pose], parameters: Parameters, seed: int
+) -> dict:
     """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry."""
     camera = Camera(parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2))
     order = list(materials)
-    labelled = [msgspec.structs.replace(meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16)) for p in shot.placed]
+    labelled = [
+        msgspec.structs.replace(meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16))
+        for p in shot.placed
+    ]
     labels = folder.labels_of(labelled, camera, list(poses.values()))
     radiance = composed(shot, light, materials, meshes, poses, camera, parameters.spp, seed)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT), shot)
@@ -159,7 +168,9 @@ def write_shot(out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh],
     return entry(shot, poses, parameters)
 
 
-def composed(shot: Shot, light, materials, meshes, poses: dict[str, Pose], camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
+def composed(
+    shot: Shot, light, materials, meshes, poses: dict[str, Pose], camera: Camera, spp: int, seed: int
+) -> Float[np.ndarray, "h w 3"]:
     """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
     radiance = np.zeros((camera.height, camera.width, 3))
     world = rigid(YUP_FROM_CAMERA, np.zeros(3))

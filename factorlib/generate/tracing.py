@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.camera import Camera
-from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.light.latlong import sampled
 from factorlib.meshes.mesh import Mesh
@@ -90,7 +90,11 @@ def traced(things: dict[str, Any], camera: Camera, world_from_camera, spp: int, 
     """Radiance of a scene; max_depth 2 is direct light alone, −1 all bounces."""
     mi = mitsuba()
     integrator = {"type": "path", "max_depth": max_depth}
-    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor(camera, world_from_camera, spp), **things})
+    # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
+    loaded = {name: mi.load_dict(thing, parallel=False) if isinstance(thing, dict) else thing for name, thing in things.items()}
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": sensor(camera, world_from_camera, spp), **loaded}, parallel=False
+    )
     return np.array(mi.render(scene, seed=seed, spp=spp), dtype=np.float64)
 
 
@@ -106,7 +110,9 @@ def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> d
     return {"type": "envmap", "bitmap": bitmap}
 
 
-def light_seen(things: dict[str, Any], place, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, max_depth: int = -1):
+def light_seen(
+    things: dict[str, Any], place, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, max_depth: int = -1
+):
     """The radiance that arrives at `place`, [height, 2·height, 3], a lat-long map in the light frame (y-up).
 
     Six square views of 90° along the light frame's axes, then means over 8 × 8 directions a texel.

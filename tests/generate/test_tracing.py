@@ -23,7 +23,9 @@ def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
     light = np.zeros((16, 32, 3))
     light[texel] = 100.0
     toward = lat_long_directions(16, 32)[texel] @ YUP_FROM_CAMERA  # camera frame
-    ball = tracing.shape(sphere(1.0), {"type": "diffuse", "reflectance": tracing.rgb(0.8)}, tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0]))
+    ball = tracing.shape(
+        sphere(1.0), {"type": "diffuse", "reflectance": tracing.rgb(0.8)}, tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0])
+    )
     image = tracing.traced({"ball": ball, "light": tracing.envmap(light)}, CAMERA, AT_ORIGIN, 64, 1, 2)[..., 0]
     normal = ball_normal(CAMERA, 4.0)
     inside = np.nan_to_num(np.sum(normal * -CAMERA.rays(), axis=-1)) > 0.5
