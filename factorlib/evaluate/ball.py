@@ -16,7 +16,7 @@ Mirror    L(2(n·o)n − o)                           averaged over the solid an
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 VIEW = np.array([0.0, 0.0, 1.0])
 
 
+@runtime_checkable
 class Material(Protocol):
     """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
 

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-Samples = Float[np.ndarray, "n 3"]
+Samples = Float[np.ndarray, "_ 3"]
 GAUGES = ("none", "scalar_per_set", "channel_per_photo")
 
 

@@ -67,7 +67,7 @@ def pose_error(estimate, truth) -> PoseError:
     """Of two cam_from_object, each with `rotation` 3×3 and `translation` 3 (`Pose` of the dataset's schema)."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
-    return PoseError(rotation_angle_deg(estimate.rotation, truth.rotation), float(moved) / distance)
+    return PoseError(rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float)), float(moved) / distance)
 
 
 def _summary(a: np.ndarray, b: np.ndarray) -> AngleError:

@@ -37,7 +37,7 @@ SPHERES = ("mirror", "glossy", "matte")
 MAPS = ("all", "mirrored", "unmirrored")
 COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
 
-Samples = Float[np.ndarray, "n 3"]
+Samples = Float[np.ndarray, "_ 3"]
 
 
 class LightError(msgspec.Struct, frozen=True):

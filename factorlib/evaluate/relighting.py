@@ -27,7 +27,7 @@ KINDS = ("in_true_light", "in_estimated_light", "null_grey", "null_mean_colour")
 GREY = 0.5
 
 Kinds = dict[str, PictureError]  # kind -> error
-Samples = Float[np.ndarray, "n 3"]
+Samples = Float[np.ndarray, "_ 3"]
 
 
 class RelitBall(msgspec.Struct, frozen=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ Channels = dict[str, Float[np.ndarray, "h w"]]
 Picture = Float[np.ndarray, "h w 3"]
 
 
+@runtime_checkable
 class PhotoSet(Protocol):
     """The set as a whole (`SetSlice` of the dataset's schema), in the order of dataset.yaml."""
 

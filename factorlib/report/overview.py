@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from factorlib.images.picture import exposure_of, picture
 from factorlib.report.appearance import disc, exposures
@@ -16,7 +16,7 @@ from factorlib.report.png import png_bytes, reduced
 COLUMN, GAP = 200, 8  # pixels
 MOST_PHOTOS = 8
 
-Pixels = UInt8[np.ndarray, "h w 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 def overview(run: Artifacts, rows: Sequence[PhotoRow]) -> bytes:
@@ -44,9 +44,9 @@ def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixe
     return np.concatenate([np.pad(c, ((0, GAP), (0, 0), (0, 0)), constant_values=255) for c in cells], axis=0)[:-GAP]
 
 
-def _fitted(pixels: UInt8[np.ndarray, "h w c"], height: int, width: int) -> Pixels:
+def _fitted(pixels: UInt8[np.ndarray, "_ _ _"], height: int, width: int) -> Pixels:
     """In the middle of a white cell, as large as fits; what is smaller than the cell is enlarged by whole pixels."""
-    shown: Float[np.ndarray, "h w 3"] = on_white(pixels).astype(np.float32)
+    shown = on_white(pixels).astype(np.float32)
     times = -(-max(height, width) // min(shown.shape[:2]))
     shown = np.repeat(np.repeat(shown, times, axis=0), times, axis=1) if times > 1 else shown
     scale = min(height / shown.shape[0], width / shown.shape[1])

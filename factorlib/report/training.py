@@ -2,38 +2,62 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+
 import msgspec
 
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.plot import Series, line_plot
 from factorlib.report.text import significant
 
+MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}
+
+
+class Line(msgspec.Struct, frozen=True):
+    """A line of the table: level 0 is a network, 1 a quantity, 2 a bin of it; cells are empty where nothing is measured."""
+
+    level: int
+    name: str
+    cells: list[str]
+
 
 class Training(msgspec.Struct, frozen=True):
-    """rows: (what was measured, its numbers by name);  columns: all such names;  curve: an SVG (or empty) and its lines."""
+    """columns: names of the measures that occur;  curve: an SVG (or empty) and its lines."""
 
     columns: list[str]
-    rows: list[tuple[str, dict[str, str]]]
+    lines: list[Line]
     curve: tuple[str, list[str]]
 
 
 def training_of(run: Artifacts) -> Training | None:
+    """accuracy.json is {network: {measure: number, quantity: {bin: {measure: number}}}}."""
     accuracy = run.json("train", "accuracy.json")
     if accuracy is None:
         return None
-    rows = list(_leaves(accuracy, ()))
-    columns = list(dict.fromkeys(name for _, numbers in rows for name in numbers))
-    return Training(columns, rows, _curve(run.training()))
+    text = str(accuracy)
+    columns = [key for key in MEASURES if f"'{key}'" in text]
+    lines = [line for part, found in sorted(accuracy.items(), reverse=True) for line in _lines(part, found, columns, 0)]
+    return Training([MEASURES[key] for key in columns], lines, _curve(run.training()))
 
 
-def _leaves(value: dict, path: tuple[str, ...]):
-    """Every dictionary that holds numbers, by its path."""
-    numbers = {k: significant(v) for k, v in value.items() if isinstance(v, int | float) and not isinstance(v, bool)}
-    if numbers:
-        yield " · ".join(path) or "all", numbers
-    for key, inner in value.items():
-        if isinstance(inner, dict):
-            yield from _leaves(inner, (*path, key))
+def _lines(name: str, found: dict, columns: list[str], level: int) -> Iterator[Line]:
+    yield Line(level, name, [_cell(key, found.get(key)) for key in columns])
+    inner = [(key, value) for key, value in found.items() if isinstance(value, dict)]
+    for key, value in sorted(inner, key=lambda item: (_leading_number(item[0]), item[0])):
+        yield from _lines(key, value, columns, level + 1)
+
+
+def _cell(key: str, value: float | None) -> str:
+    if value is None:
+        return ""
+    return str(value) if key == "samples" else f"{significant(100 * value, 2)} %"
+
+
+def _leading_number(name: str) -> float:
+    """So that bins stand in the order of what they hold: "3 to 30" before "30 to 300"."""
+    found = re.match(r"[-+]?[\d.]+(e[-+]?\d+)?", name)
+    return float(found[0]) if found else 0.0
 
 
 def _curve(table: dict[str, list]) -> tuple[str, list[str]]:

@@ -120,6 +120,12 @@ def test_the_numbers_are_those_of_the_metrics(made):
     assert f"{metrics['materials']['mean_roughness']:.3f}" in made[2]
 
 
+def test_bins_of_the_networks_error_stand_in_order(made):
+    section = made[2].split('id="training"')[1]
+    order = [section.index(f">{name}</th>") for name in ("specular", "sharpness", "0.3 to 3", "3 to 30", "30 to 300", "diffuse")]
+    assert order == sorted(order) and "0.20 %" in section
+
+
 def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
     _, inputs, html = made
     again = page_of(msgspec.structs.replace(inputs, log=None), tmp_path / "again")
