@@ -36,7 +36,7 @@ def diffuse_remainder(orders: int = 8, powers: int = 5) -> tuple[np.ndarray, flo
     return found.reshape(orders, powers).numpy() @ even[:, ::2], float(error.max())
 
 
-def ggx_as_gaussians(count: int = 6) -> tuple[np.ndarray, np.ndarray]:
+def ggx_as_gaussians(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """Rates τ and weights w of 1/(1 + x)² ≈ Σ w exp(−τ x), in relative error, the tail beyond x = 100 less."""
     x = np.concatenate([[0.0], np.logspace(-2.5, 3.0, 300)])
     importance = np.where(x == 0, 30, 1) / (1 + x / 100)

@@ -31,13 +31,13 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 262_144
     held_out: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
     tolerance: Annotated[float, Meta(gt=0, le=0.1)] = 1e-3
-    steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 16_000
+    steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 20_000
     batch: Annotated[int, Meta(ge=64, le=1 << 16)] = 2048
-    rate: Annotated[float, Meta(gt=0, le=0.1)] = 4e-3
-    width: Annotated[int, Meta(ge=4, le=1024)] = 64
+    rate: Annotated[float, Meta(gt=0, le=0.1)] = 6e-3
+    width: Annotated[int, Meta(ge=4, le=1024)] = 32
     depth: Annotated[int, Meta(ge=1, le=16)] = 3
     diffuse_samples: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
-    diffuse_steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 2000
+    diffuse_steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 3000
     diffuse_width: Annotated[int, Meta(ge=4, le=1024)] = 16
     diffuse_depth: Annotated[int, Meta(ge=1, le=16)] = 2
     seed: Annotated[int, Meta(ge=0)] = 0

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.reflection.lobe import lobe_integral, lobe_moments
+from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 
 # `python -m benchmarks.operator_fit` fits these
 REMAINDER = torch.tensor(
@@ -36,28 +36,34 @@ REMAINDER = torch.tensor(
 
 def normal_mean_cosine(sharpness: Tensor, nz: Tensor) -> Tensor:
     """Equation (1)."""
-    mean, along, across = lobe_moments(sharpness)
-    c = nz.clamp(-1, 1)
+    return _normal(*lobe_moments(sharpness), nz.clamp(-1, 1))
+
+
+def _normal(mean: Tensor, along: Tensor, across: Tensor, c: Tensor) -> Tensor:
     m = mean * c
-    deviation = torch.sqrt(across * (1 - c**2) + along * c**2 + 1e-30)
+    deviation = torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
     u = m / deviation
-    return 0.5 * m * torch.special.erfc(-u / math.sqrt(2)) + deviation * torch.exp(-0.5 * u**2) / math.sqrt(2 * math.pi)
+    return 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5)) + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
 
 
-def remainder_powers(mean: Tensor) -> list[Tensor]:
-    """Coefficients of c⁰, c², c⁴, … at a mean t̄."""
-    x, table = 2 * mean - 1, REMAINDER.to(mean)
-    chebyshev = [torch.ones_like(x), x]
-    for _ in range(len(table) - 2):
+def _remainder(mean: Tensor, c: Tensor) -> Tensor:
+    """(1 − t̄)² Σ a_ij T_i(2t̄ − 1) c^2j."""
+    x, square = 2 * mean - 1, c * c
+    chebyshev = [1.0, x]
+    for _ in range(len(REMAINDER) - 2):
         chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])
-    scale = (1 - mean) ** 2
-    return [scale * sum(a * t for a, t in zip(column, chebyshev, strict=True)) for column in table.T]
+    value = 0.0
+    for column in reversed(REMAINDER.T.tolist()):
+        value = value * square + sum(t * a for a, t in zip(column, chebyshev, strict=True))
+    return (1 - mean) * (1 - mean) * value
+
+
+def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> Tensor:
+    """`diffuse`, from λ' and the lobe's moments."""
+    c = nz.clamp(-1, 1)
+    return 2 / lam * (_normal(mean, along, across, c) + _remainder(mean, c)).clamp_min(0)
 
 
 def diffuse(sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
     """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
-    square, value = nz.clamp(-1, 1) ** 2, 0
-    for coefficient in reversed(remainder_powers(lobe_moments(sharpness)[0])):
-        value = value * square + coefficient
-    mean_cosine = (normal_mean_cosine(sharpness, nz) + value).clamp_min(0)
-    return lobe_integral(sharpness) / math.pi * mean_cosine
+    return diffuse_of_moments(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)

@@ -30,12 +30,14 @@ from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 
 # (τ, w) of 1/(1 + x)² ≈ Σ w e^{−τx}: `python -m benchmarks.operator_fit` fits these
 GAUSSIANS = (
-    (0.00370478348, 2.76179309e-05),
-    (0.0196104062, 0.000547760716),
-    (0.0761014876, 0.0068956554),
-    (0.26432913, 0.0651432807),
-    (0.872885721, 0.374531075),
-    (2.79042235, 0.552530467),
+    (0.0024845254, 1.13437788e-05),
+    (0.0105940139, 0.000135391374),
+    (0.0326024309, 0.00108677292),
+    (0.0901947617, 0.00733593392),
+    (0.237218396, 0.0422063235),
+    (0.607146685, 0.186882868),
+    (1.52835431, 0.464628301),
+    (3.83363341, 0.297674865),
 )
 LOGISTIC = 1.702  # the logistic law of this scale is within .01 of the normal one
 PEAK = 3.0  # −∂²/∂p² of the logarithm of D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
@@ -61,12 +63,16 @@ class Filtered(msgspec.Struct):
 
 def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
     """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over n·i > 0, from tensors of one shape."""
+    return filtered(alpha, sharpness, gaussian_sharpness(sharpness), lobe_moments(sharpness)[1], no, nz, oz)
+
+
+def filtered(alpha: Tensor, sharpness: Tensor, lam: Tensor, along_lobe: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
+    """`filtered_specular`, given λ' and the lobe's variance along its axis too."""
     alpha, no = alpha.clamp(LEAST_ALPHA, 1), no.clamp(LEAST_COSINE, 1)
     so = torch.sqrt((1 - no * no).clamp_min(1e-8))
     zx = (oz - no * nz) / so
     zy = torch.sqrt((1 - nz * nz - zx * zx).clamp_min(1e-8))
     k = (1 - alpha * alpha) / (alpha * alpha)
-    lam = gaussian_sharpness(sharpness)
     geometry = so, no, zx, zy, nz
     px, py = _blend(k, lam, oz, *geometry)
     px, py = _mode(k, lam, px, py, *geometry)
@@ -76,7 +82,7 @@ def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, 
     density, spread = _student(k, lam, xx, yy, xy, det, cx, cy, sharpness / lam, misfit)
     curvature = _curvature(k, px, py) / lam
     variance = (nix * nix * (yy + curvature) + niy * niy * (xx + curvature) - 2 * nix * niy * xy) / _plus(xx, yy, det, curvature)
-    deviation = torch.sqrt(variance / lam + lobe_moments(sharpness)[1] * ni * ni + 1e-8)
+    deviation = torch.sqrt(variance / lam + along_lobe * ni * ni + 1e-8)
     u = LOGISTIC * (ni / deviation).clamp_min(-20)
     lit = torch.sigmoid(u)
     cosine = deviation * softplus(u) / (LOGISTIC * lit)

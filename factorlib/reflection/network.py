@@ -20,10 +20,11 @@ from torch import Tensor
 from torch.nn.functional import silu
 
 from factorlib.errors import InputError
+from factorlib.jsonfile import json_text
 from factorlib.reflection import diffuse as diffuse_form
 from factorlib.reflection.filtering import Filtered, filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
-from factorlib.reflection.operator import Operator
+from factorlib.reflection.operator import Operator, Response
 
 SHIPPED = Path(__file__).parent / "weights"
 LARGEST = 4.0  # of the logarithm of the correction
@@ -48,18 +49,26 @@ class Layers(msgspec.Struct, frozen=True):
         return Layers(self.mean.to(dtype), self.scale.to(dtype), [w.to(dtype) for w in self.weights], [b.to(dtype) for b in self.biases])
 
 
+def fading(sharpness: Tensor) -> Tensor:
+    """What is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
+    return torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
+
+
 def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
     """Logarithm of the factor on the formula."""
-    fade = torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
-    return fade * LARGEST * torch.tanh(layers(features) / LARGEST)
+    return fading(sharpness) * LARGEST * torch.tanh(layers(features) / LARGEST)
 
 
 def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> Float[Tensor, "*b features"]:
-    """Bounded, smooth, and of the order of one; see `Filtered` for what they are made of."""
+    return torch.stack(torch.broadcast_tensors(*specular_columns(alpha, no, nz, oz, form)), -1)
+
+
+def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> tuple[Tensor, ...]:
+    """Features: bounded, smooth, and of the order of one; see `Filtered` for what they are made of."""
     alpha = alpha.clamp(0.005, 1)
     log_width = torch.log(form.sharpness.clamp_max(2e4))
     u = form.ni / form.deviation
-    columns = (
+    return (
         torch.log(alpha),
         log_width,
         form.ratio,
@@ -81,23 +90,36 @@ def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: F
         form.lit,
         no / (no + alpha),
     )
-    return torch.stack(torch.broadcast_tensors(*columns), -1)
 
 
 def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "*b features"]:
-    mean, along, across = lobe_moments(sharpness)
-    u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
-    columns = mean, torch.log(gaussian_sharpness(sharpness).clamp_max(2e4)), nz, nz * nz, u * torch.rsqrt(1 + u * u), u * torch.rsqrt(8 + u * u)
+    columns = diffuse_columns(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)
     return torch.stack(torch.broadcast_tensors(*columns), -1)
+
+
+def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
+    u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
+    widths = mean, torch.log(lam.clamp_max(2e4)), across
+    return *widths, nz, nz * nz, mean * nz, u * torch.rsqrt(1 + u * u), u * torch.rsqrt(8 + u * u)
 
 
 class Network(Operator):
     """weights: folder with diffuse.safetensors and specular.safetensors; None takes the shipped ones."""
 
     def __init__(self, weights: str | Path | None = None, dtype: torch.dtype = torch.float32):
+        from factorlib.reflection.fused import fused
+
         super().__init__(dtype)
         folder = Path(weights) if weights is not None else SHIPPED
         self.layers = {part: read_layers(folder / f"{part}.safetensors").to(dtype) for part in ("diffuse", "specular")}
+        self.fused = {part: fused(part, layers) for part, layers in self.layers.items()} if dtype == torch.float32 else {}
+
+    def response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
+        """As of every operator; in float32 by compiled code, where there is a compiler."""
+        if not all(self.fused.values()) or not self.fused or nz.device.type != "cpu":
+            return super().response(roughness, sharpness, no, nz, oz)
+        diffuse, _, diffuse_by_log_sharpness, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
+        return Response(diffuse, diffuse_by_log_sharpness, diffuse_by_nz, *self.fused["specular"](float(roughness), sharpness, no, nz, oz))
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         nz = nz.clamp(-1, 1)
@@ -115,8 +137,9 @@ def write_layers(path: Path, layers: Layers, **metadata: str) -> None:
     for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
         tensors |= {f"layer.{k}.weight": weight, f"layer.{k}.bias": bias}
     sizes = [layers.weights[0].shape[1], *(len(b) for b in layers.biases)]
-    about = {"architecture": "standardise, linear, SiLU, …, linear", "sizes": " ".join(map(str, sizes)), **metadata}
-    save_file({name: t.detach().float().contiguous() for name, t in tensors.items()}, path, metadata=about)
+    about = {"architecture": "standardise, linear, SiLU, …, linear", "sizes": sizes, **metadata}
+    one_key = {"factorlib": json_text(about)}  # safetensors writes several in an order that changes from run to run
+    save_file({name: t.detach().float().contiguous() for name, t in tensors.items()}, path, metadata=one_key)
     path.chmod(0o644)
 
 

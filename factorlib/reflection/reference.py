@@ -56,14 +56,15 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
     with torch.no_grad():
         floor = FLOOR * lobe_integral(sharpness)
         todo = torch.arange(len(alpha))
-        for k, nodes in enumerate(LEVELS):
+        first = 1 if tolerance < 1e-4 else 0  # the coarsest two may agree by chance
+        for k, nodes in enumerate(LEVELS[first:], first):
             if not len(todo):
                 break
             previous = value[todo]
             value[todo] = finer = in_chunks(nodes, *(t[todo] for t in scalars))
             level[todo] = k
             agrees = (finer - previous).abs() <= tolerance * (finer + floor[todo])
-            todo = todo[~agrees] if k else todo
+            todo = todo[~agrees] if k > first else todo
     if not any(t.requires_grad for t in scalars):
         return value
     pieces = [(torch.nonzero(level == k)[:, 0], LEVELS[k]) for k in range(len(LEVELS))]

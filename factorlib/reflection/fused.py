@@ -1,0 +1,158 @@
+"""The reflection networks' values and gradients as C functions, compiled on first use.
+
+The formulas stay where they are, in torch: they are run once on a `Tape`, which knows their derivatives and writes both
+as C into kernel.c.  The network's derivative by its features comes between: with t = tanh(net/s) the result is
+R = formula · exp(fade · s · t), so that BACKWARD is seeded by ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
+
+Without a C compiler (`cc`, or what CC says) torch computes the same, an order of magnitude slower.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from factorlib.reflection.diffuse import diffuse_of_moments
+from factorlib.reflection.filtering import filtered
+from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
+from factorlib.reflection.network import LARGEST, Layers, diffuse_columns, fading, specular_columns
+from factorlib.reflection.tape import Tape, Value
+
+log = logging.getLogger("factorlib.reflection")
+FLAGS = "-std=gnu11 -O3 -march=native -fPIC -shared -fno-math-errno -fno-trapping-math -fno-signed-zeros -ffinite-math-only -fassociative-math -freciprocal-math"
+MOMENTS = ("sharpness", "lam", "mean", "along", "across")  # of a lobe; all but the first are functions of it
+PLACES = {name: f"lobe[{k}][l]" for k, name in enumerate([*MOMENTS, *(f"d{m}" for m in MOMENTS)])}
+PLACES |= {name: f"{name}[l]" for name in ("no", "nz", "oz", "net")} | {"alpha": "alpha"}
+
+
+class Fused:
+    """The compiled function with a network's weights."""
+
+    def __init__(self, part: str, layers: Layers):
+        self.function = compiled(part, layers.weights[0].shape[1], layers.weights[0].shape[0], len(layers.weights) - 1)
+        first = layers.weights[0] * layers.scale
+        weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
+        self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
+
+    def __call__(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
+        """Value and derivatives by roughness, log λ, n·z, o·z; [n, p], float32."""
+        no, nz, oz = (t.detach().float().contiguous() for t in (no, nz, oz))
+        out = [torch.empty_like(nz) for _ in range(5)]
+        pointers = (ctypes.c_void_p * 5)(*(t.data_ptr() for t in out))
+        lobes = _lobe_table(sharpness)
+        arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
+        self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
+        out[1] *= 2 * roughness
+        return out
+
+
+def _flat(tensors: list[Tensor]) -> Tensor:
+    return torch.cat([t.detach().float().reshape(-1) for t in tensors]).contiguous()
+
+
+def _lobe_table(sharpness: Tensor) -> Tensor:
+    """MOMENTS and their derivatives by log λ, [10, p]."""
+    with torch.enable_grad():
+        log_sharpness = sharpness.detach().double().log().requires_grad_()
+        sharpness = log_sharpness.exp()
+        moments = [sharpness, gaussian_sharpness(sharpness), *lobe_moments(sharpness)]
+        slopes = [torch.autograd.grad(t.sum(), log_sharpness, retain_graph=True)[0] for t in moments]
+    return torch.stack([*(t.detach() for t in moments), *slopes]).float().contiguous()
+
+
+def specular_on(tape: Tape) -> tuple[Value, tuple]:
+    """The formula and the features, of inputs named as in PLACES."""
+    names = ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")
+    alpha, _, _, _, no, nz, oz = inputs = [tape.input(name) for name in names]
+    form = filtered(*inputs)
+    return form.value, specular_columns(alpha, no, nz, oz, form)
+
+
+def diffuse_on(tape: Tape) -> tuple[Value, tuple]:
+    inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
+    return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
+
+
+def source(part: str, features: int, width: int, depth: int) -> str:
+    """kernel.c with the formulas of `part` written in."""
+    tape = Tape()
+    formula, columns = {"specular": specular_on, "diffuse": diffuse_on}[part](tape)
+    fade = fading(tape.input("sharpness"))
+    forward = tape.c_code({f"feature[{k}][l]": c for k, c in enumerate(columns)} | {"formula[l]": formula}, PLACES)
+    t = torch.tanh(tape.input("net") / LARGEST)
+    grown = torch.exp(fade * LARGEST * t)
+    result = formula * grown
+    by_net = result * fade * (1 - t * t)
+    seeds = [(formula, grown), (fade, result * LARGEST * t), *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns))]
+    by_alpha, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "nz", "oz", *MOMENTS)])
+    by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
+    results = (result, by_alpha, by_log_sharpness, by_nz, by_oz)
+    places = PLACES | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
+    backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
+    text = (Path(__file__).parent / "kernel.c").read_text()
+    before, after = text.split("      FORWARD\n")
+    middle, end = after.split("      BACKWARD\n")
+    sizes = f"#define FEATURES {features}\n#define WIDTH {width}\n#define DEPTH {depth}\n#define MOMENTS {len(MOMENTS)}\n"
+    for name in ("expf", "logf", "log1pf", "erfcf"):
+        forward, backward = ([line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward))
+    return sizes + before + "\n".join(forward) + "\n" + middle + "\n".join(backward) + "\n" + end
+
+
+@lru_cache(maxsize=8)
+def compiled(part: str, features: int, width: int, depth: int):
+    """The C function; kept in the user's cache by what it was made of."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    text = source(part, features, width, depth)
+    version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
+    key = hashlib.sha256("\0".join([text, FLAGS, version, _machine()]).encode()).hexdigest()[:24]
+    library = _cache() / f"{part}-{key}.so"
+    if not library.exists():
+        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+            made = Path(folder) / "kernel.so"
+            (Path(folder) / "kernel.c").write_text(text)
+            subprocess.run([*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"], check=True, capture_output=True, text=True)
+            os.replace(made, library)
+    function = ctypes.CDLL(str(library)).response
+    function.restype = None
+    function.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_float, *[ctypes.c_void_p] * 7, ctypes.c_void_p * 5]
+    return function
+
+
+def _machine() -> str:
+    """What -march=native depends on."""
+    try:
+        return next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        return platform.machine() + platform.processor()
+
+
+def _cache() -> Path:
+    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "factorlib"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def fused(part: str, layers: Layers) -> Fused | None:
+    """The compiled network, or None, with a message, where there is no compiler."""
+    if os.environ.get("FACTORLIB_FUSED") == "0" or layers.weights[0].shape[0] % 4 or layers.weights[0].shape[1] % 4:
+        return None
+    if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]) is None:
+        log.info("no C compiler: the reflection network runs in torch, about ten times slower")
+        return None
+    try:
+        return Fused(part, layers)
+    except (OSError, subprocess.SubprocessError) as error:
+        log.warning("the reflection network runs in torch, about ten times slower, since its C code did not compile: %s", getattr(error, "stderr", error))
+        return None

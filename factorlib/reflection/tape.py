@@ -1,0 +1,140 @@
+"""Derivatives and C code of an elementwise function that is written in torch.
+
+A `Value` stands for a tensor while the function runs once; what it computes is recorded on a `Tape`, each distinct
+operation once.  `Tape.gradient` walks back over it and records the derivatives in the same way (reverse mode), and
+`Tape.c_code` says the operations that some result needs as C statements on floats, one expression per line.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+
+import torch
+
+# operation -> C, {0} and {1} its arguments
+C = {
+    "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "sqrt": "sqrtf({0})", "exp": "expf({0})", "log": "logf({0})",
+    "log1p": "log1pf({0})", "max": "fmaxf({0}, {1})", "min": "fminf({0}, {1})", "above": "({0} > {1} ? 1.0f : 0.0f)", "erfc": "erfcf({0})",
+}  # fmt: skip
+
+
+class Tape:
+    """Operations in the order they were first needed: operation k is `ops[k]` = (name, arguments), arguments being k or float."""
+
+    def __init__(self):
+        self.ops: list[tuple[str, tuple]] = []
+        self.known: dict[tuple, int] = {}
+
+    def input(self, name: str) -> Value:
+        return self._record("input", (name,))
+
+    def apply(self, name: str, *arguments) -> Value | float:
+        arguments = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
+        plain = _simplified(name, arguments)
+        if plain is not None:
+            return plain if isinstance(plain, float) else Value(self, plain[0])
+        return self._record(name, arguments)
+
+    def _record(self, name: str, arguments: tuple) -> Value:
+        key = name, tuple((type(a), a) for a in arguments)
+        if key not in self.known:
+            self.known[key] = len(self.ops)
+            self.ops.append((name, arguments))
+        return Value(self, self.known[key])
+
+    def gradient(self, results: list[tuple[Value, Value | float]], inputs: list[Value]) -> list[Value | float]:
+        """Σ seed · ∂result/∂input over the (result, seed) given, for each input."""
+        slope: dict[int, Value | float] = {}
+        for result, seed in results:
+            slope[result.index] = slope.get(result.index, 0.0) + seed
+        for index in range(len(self.ops) - 1, -1, -1):
+            name, arguments = self.ops[index]
+            if index in slope and name != "input":
+                for argument, part in zip(arguments, self._slopes(name, arguments, Value(self, index)), strict=True):
+                    if not isinstance(argument, float) and part is not None:
+                        slope[argument] = slope.get(argument, 0.0) + slope[index] * part
+        return [slope.get(v.index, 0.0) for v in inputs]
+
+    def _slopes(self, name: str, arguments: tuple, y: Value) -> tuple:
+        a, b = (*(v if isinstance(v, float) else Value(self, v) for v in arguments), None)[:2]
+        if name in ("max", "min"):
+            second = self.apply("above", b, a) if name == "max" else self.apply("above", a, b)
+            return 1.0 - second, second  # on the limit as inside it, as torch has it
+        if name == "above":
+            return None, None
+        return {
+            "add": lambda: (1.0, 1.0), "sub": lambda: (1.0, -1.0), "mul": lambda: (b, a), "div": lambda: (1.0 / b, -y / b), "sqrt": lambda: (0.5 / y,),
+            "exp": lambda: (y,), "erfc": lambda: (self.apply("exp", -(a * a)) * (-2 / math.sqrt(math.pi)),), "log": lambda: (1.0 / a,), "log1p": lambda: (1.0 / (1.0 + a),),
+        }[name]()  # fmt: skip
+
+    def c_code(self, results: dict[str, Value | float], inputs: dict[str, str]) -> list[str]:
+        """Statements that compute `results` (C lvalue -> value); inputs: name -> C expression."""
+        needed, todo = set(), [v.index for v in results.values() if isinstance(v, Value)]
+        while todo:
+            if (index := todo.pop()) not in needed:
+                needed.add(index)
+                todo += [a for a in self.ops[index][1] if isinstance(a, int)]
+        lines = []
+        for index in sorted(needed):
+            name, arguments = self.ops[index]
+            right = inputs[arguments[0]] if name == "input" else C[name].format(*map(_c, arguments))
+            lines.append(f"const float v{index} = {right};")
+        return lines + [f"{target} = {_c(v.index if isinstance(v, Value) else v)};" for target, v in results.items()]
+
+
+def _c(argument: int | float) -> str:
+    return f"v{argument}" if isinstance(argument, int) else f"{argument!r}f"
+
+
+def _simplified(name: str, arguments: tuple) -> float | tuple[int] | None:
+    """A number, or (index,) of an operation that is there already, or None."""
+    a, b = (*arguments, None)[:2]
+    numbers = [v if isinstance(v, float) else None for v in (a, b)]  # an index is not a number
+    if None not in numbers and name in ("add", "sub", "mul", "div"):
+        return {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}[name](a, b)
+    if name == "mul" and 0.0 in numbers:
+        return 0.0
+    if numbers[1] == {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(name):
+        return (a,) if numbers[1] is not None else None
+    if numbers[0] is not None and numbers[0] == {"add": 0.0, "mul": 1.0}.get(name):
+        return (b,)
+    return None
+
+
+class Value:
+    """A number on a tape; understands the arithmetic and the torch functions that the formulas use."""
+
+    def __init__(self, tape: Tape, index: int):
+        self.tape, self.index = tape, index
+
+    def _(name, swap=False):  # noqa: N805
+        return (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
+
+    __add__, __radd__, __sub__, __rsub__ = _("add"), _("add", True), _("sub"), _("sub", True)
+    __mul__, __rmul__, __truediv__, __rtruediv__ = _("mul"), _("mul", True), _("div"), _("div", True)
+    clamp_min, clamp_max = _("max"), _("min")
+
+    def __neg__(self):
+        return 0.0 - self
+
+    def __pow__(self, exponent: int):
+        return self * self if exponent == 2 else NotImplemented
+
+    def clamp(self, low: float, high: float):
+        return self.clamp_min(low).clamp_max(high)
+
+    def sqrt(self):
+        return self.tape.apply("sqrt", self)
+
+    @classmethod
+    def __torch_function__(cls, function, types, arguments=(), keywords=None):
+        x = arguments[0]
+        compound = {
+            torch.rsqrt: lambda: 1.0 / x.sqrt(), torch.sigmoid: lambda: 1.0 / (1.0 + x.tape.apply("exp", -x)),
+            torch.nn.functional.softplus: lambda: x.clamp_min(0.0) + x.tape.apply("log1p", x.tape.apply("exp", -x.tape.apply("max", x, -x))),
+            torch.tanh: lambda: 1.0 - 2.0 / (x.tape.apply("exp", 2.0 * x) + 1.0),
+        }  # fmt: skip
+        if function in compound:
+            return compound[function]()
+        return x.tape.apply(function.__name__.removeprefix("special_"), x)

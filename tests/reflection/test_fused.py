@@ -1,0 +1,82 @@
+"""The compiled networks are the ones in torch; the tape's derivatives are autograd's."""
+
+import os
+import shutil
+
+import pytest
+import torch
+from tests.reflection.test_operators import grid
+
+from factorlib.reflection import reflection_operator
+from factorlib.reflection.operator import Operator
+from factorlib.reflection.tape import Tape
+
+compiler = pytest.mark.skipif(shutil.which(os.environ.get("CC", "cc")) is None, reason="no C compiler")
+
+
+@compiler
+@pytest.mark.parametrize("roughness", [0.1, 0.4, 1.0])
+def test_compiled_response_is_that_of_torch(roughness):
+    operator = reflection_operator("network")
+    assert all(operator.fused.values())
+    point = grid(roughness, torch.float32, rows=331)
+    compiled, plain = operator.response(*point), Operator.response(operator, *point)
+    for field in compiled.__struct_fields__:
+        a, b = getattr(compiled, field), getattr(plain, field)
+        scale = b.abs() + (plain.diffuse if field.startswith("diffuse") else plain.specular) + 0.01 / point[1]
+        error = (a - b).abs() / scale
+        assert error.quantile(0.99) < 1e-4, field
+        assert error.max() < 1e-2, field
+
+
+@compiler
+def test_without_lobes_or_points_there_is_nothing():
+    operator = reflection_operator("network")
+    none = operator.response(torch.tensor(0.5), torch.ones(0), torch.ones(3), torch.ones(3, 0), torch.ones(3, 0))
+    assert none.specular.shape == (3, 0)
+    assert operator.response(torch.tensor(0.5), torch.ones(2), torch.ones(0), torch.ones(0, 2), torch.ones(0, 2)).diffuse.shape == (0, 2)
+
+
+def test_without_a_compiler_torch_computes_the_same(monkeypatch):
+    monkeypatch.setenv("FACTORLIB_FUSED", "0")
+    operator = reflection_operator("network")
+    assert not any(operator.fused.values())
+    assert operator.response(*grid(0.5, torch.float32)).specular.isfinite().all()
+
+
+def formula(x, y):
+    a = torch.sqrt(x * x + 2 * y) - torch.exp(-x) / (1 + y)
+    b = torch.log1p(y) * torch.sigmoid(x) + torch.nn.functional.softplus(-x) * torch.tanh(y)
+    return a * b + torch.special.erfc(x).clamp_min(0.1) * torch.rsqrt(y + 3).clamp(0.0, 0.52) + torch.log(y + 1.5) ** 2
+
+
+def test_derivatives_on_a_tape_are_those_of_autograd():
+    tape = Tape()
+    x, y = tape.input("x"), tape.input("y")
+    result = formula(x, y)
+    lines = tape.c_code(dict(zip(("r", "dx", "dy"), (result, *tape.gradient([(result, 1.0)], [x, y])), strict=True)), {"x": "x", "y": "y"})
+    functions = {"sqrtf": torch.sqrt, "expf": torch.exp, "logf": torch.log, "log1pf": torch.log1p, "erfcf": torch.special.erfc, "fmaxf": max, "fminf": min}
+    for p, q in ((0.3, 0.7), (-1.2, 0.1), (2.0, 3.0)):
+        leaves = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (p, q)]
+        value = formula(*leaves)
+        expected = [value, *torch.autograd.grad(value, leaves)]
+        scope = dict(functions, x=leaves[0].detach(), y=leaves[1].detach())
+        for line in lines:
+            exec(as_python(line), scope)
+        assert [float(scope[k]) for k in ("r", "dx", "dy")] == pytest.approx([float(e) for e in expected], rel=1e-9)
+
+
+def as_python(line: str) -> str:
+    """The C statement of one line, as Python."""
+    import re
+
+    line = re.sub(r"(?<=[0-9.])f\b", "", line.removeprefix("const float ").rstrip(";"))
+    return re.sub(r"\((\S+) > (\S+) \? 1.0 : 0.0\)", r"float(\1 > \2)", line)
+
+
+def test_the_same_operation_is_recorded_once():
+    tape = Tape()
+    x, y = tape.input("x"), tape.input("y")
+    before = (x * y + 1.0).index
+    assert (x * y + 1.0).index == before
+    assert (x * 0.0, (x * 1.0).index, (y + 0.0).index) == (0.0, x.index, y.index)

@@ -1,0 +1,111 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from tests.reflection.independent import brute_force
+
+from factorlib.reflection import reflection_operator
+from factorlib.reflection.brdf import ggx, smith, specular
+from factorlib.reflection.lobe import lobe_integral
+from factorlib.reflection.reference import LEVELS, about_half_vector, about_lobe, converged, in_chunks
+from factorlib.reflection.samples import specular_inputs, specular_samples
+
+R = reflection_operator("reference")
+
+
+def scalars(*values):
+    return tuple(torch.tensor([v], dtype=torch.float64) for v in values)
+
+
+@pytest.mark.parametrize(
+    ("roughness", "sharpness", "no", "nz", "oz"),
+    [
+        (1.0, 0.1, 0.7, 0.5, 0.4),
+        (0.6, 3.0, 0.3, 0.2, -0.6),
+        (0.4, 40.0, 0.9, -0.1, -0.2),
+        (0.5, 200.0, 0.15, 0.1, -0.9),
+        (0.3, 20.0, 1.0, 0.95, 0.95),
+    ],
+)
+def test_equals_an_independent_integrator(roughness, sharpness, no, nz, oz):
+    diffuse, glossy = brute_force(roughness, sharpness, no, nz, oz)
+    r, lam, no, nz, oz = scalars(roughness, sharpness, no, nz, oz)
+    assert R.diffuse(lam, nz[:, None]).item() == pytest.approx(diffuse, rel=2e-5)
+    assert R.specular(r[0], lam, no, nz[:, None], oz[:, None]).item() == pytest.approx(glossy, rel=2e-5)
+
+
+def test_levels_converge_to_one_part_in_a_hundred_thousand():
+    inputs = specular_inputs(256, 3, sharpness=(0.1, 5000.0))
+    value = converged(*inputs, tolerance=1e-7)
+    finer = in_chunks(LEVELS[-3], *inputs)
+    floor = 1e-3 * lobe_integral(inputs[1])
+    assert ((value - finer).abs() <= 1e-5 * (finer + floor)).all()
+
+
+def test_both_quadratures_agree():
+    inputs = specular_inputs(64, 4, alpha=(0.15, 1.0), sharpness=(0.3, 60.0), least_no=0.1)
+    a, b = (rule(135, *inputs) for rule in (about_lobe, about_half_vector))
+    assert ((a - b).abs() <= 1e-5 * (a + 1e-3 * lobe_integral(inputs[1]))).all()
+
+
+def test_constant_light_reflects_its_radiance_from_a_lambertian():
+    lam = torch.tensor([1e-9], dtype=torch.float64)
+    assert R.diffuse(lam, torch.tensor([[0.3]], dtype=torch.float64)).item() == pytest.approx(1.0, rel=1e-8)
+
+
+def test_constant_light_reflects_the_directional_albedo():
+    """∫ D G1(i) G1(o) / (4 n·o) di by sampling GGX's half vectors on a grid: E[G1(i) G1(o) (o·h) / ((n·o) (n·h))]."""
+    alpha, no = 0.3, 0.6
+    u = (np.arange(2000) + 0.5) / 2000
+    tan2 = alpha**2 * u / (1 - u)
+    nh = 1 / np.sqrt(1 + tan2)
+    phi = (np.arange(400) + 0.5) / 400 * 2 * np.pi
+    oh = no * nh[:, None] + np.sqrt(1 - no**2) * np.sqrt(1 - nh**2)[:, None] * np.cos(phi)
+    ni = torch.from_numpy(2 * oh * nh[:, None] - no)
+    a = torch.tensor(alpha, dtype=torch.float64)
+    weight = smith(a, ni) * smith(a, torch.tensor(no, dtype=torch.float64)) / (no * torch.from_numpy(nh)[:, None])
+    albedo = (weight * torch.from_numpy(np.maximum(oh, 0))).mean().item()
+    value = converged(*scalars(alpha, 1e-9, no, 0.2, 0.1), tolerance=1e-9).item()
+    assert value == pytest.approx(albedo, rel=1e-3)
+    assert 0.5 < value < 1
+
+
+def test_a_point_light_reflects_the_brdf():
+    alpha, lam, no, nz, oz = scalars(0.5, 1e6, 0.6, 0.7, 0.2)
+    nh = (no + nz) / torch.sqrt(2 + 2 * oz)
+    expected = lobe_integral(lam) * specular(alpha, nz, no, nh)
+    assert converged(alpha, lam, no, nz, oz, tolerance=1e-9).item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_a_mirror_reflects_the_light_behind_it():
+    """α → 0: the lobe's value in the mirror direction, whose n·i = n·o is lit fully."""
+    lam, no, nz, oz = scalars(30.0, 0.6, 0.7, 0.2)
+    mirrored = torch.exp(lam * (2 * no * nz - oz - 1)).item()
+    value = converged(torch.full_like(no, 2e-3), lam, no, nz, oz, tolerance=1e-8).item()
+    assert value == pytest.approx(mirrored, rel=1e-3)
+
+
+def test_ggx_is_normalised():
+    c = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000
+    for alpha in (0.05, 0.5, 1.0):
+        assert 2 * math.pi * (ggx(torch.tensor(alpha, dtype=torch.float64), c) * c).mean().item() == pytest.approx(1, rel=1e-5)
+
+
+def test_gradients_are_finite_differences():
+    inputs = specular_inputs(24, 9, alpha=(0.05, 1.0), sharpness=(0.3, 500.0), least_no=0.1)
+    step, tolerance = 1e-4, 1e-10
+    leaves = [t.clone().requires_grad_() for t in inputs]
+    gradients = torch.autograd.grad(converged(*leaves, tolerance=tolerance).sum(), leaves)
+    for k, gradient in enumerate(gradients):
+        size = step * (inputs[k] if k < 2 else torch.ones_like(inputs[k]))
+        plus, minus = (converged(*[t + s * size * (j == k) for j, t in enumerate(inputs)], tolerance=tolerance) for s in (1, -1))
+        expected = (plus - minus) / (2 * size)
+        scale = gradient.abs() + converged(*inputs, tolerance=1e-6) / (inputs[k] if k < 2 else 1)
+        assert ((gradient - expected).abs() / scale).quantile(0.8) < 1e-4
+
+
+def test_samples_are_repeated_by_their_seed():
+    a, b, c = (specular_samples(64, seed, tolerance=1e-3) for seed in (1, 1, 2))
+    assert torch.equal(a.value, b.value)
+    assert not torch.equal(a.value, c.value)

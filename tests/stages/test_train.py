@@ -1,0 +1,58 @@
+"""The stage `train`: repeatable, and its short runs are already of use."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+from safetensors import safe_open
+
+from factorlib.reflection import reflection_operator
+from factorlib.reflection.network import SHIPPED
+from factorlib.stage import Inputs, silent
+from stages import train
+
+BRIEF = train.Params(samples=8192, held_out=2048, steps=160, diffuse_steps=120, rate=0.01)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folders = [tmp_path_factory.mktemp(name) for name in ("first", "second")]
+    for folder in folders:
+        train.main(BRIEF, Inputs({}), folder, silent)
+    return folders
+
+
+def test_files_are_those_of_the_stage(trained):
+    assert sorted(p.name for p in trained[0].iterdir()) == ["accuracy.json", "diffuse.safetensors", "specular.safetensors", "training.parquet"]
+
+
+def test_the_same_parameters_give_the_same_bytes(trained):
+    for path in trained[0].iterdir():
+        assert path.read_bytes() == (trained[1] / path.name).read_bytes(), path.name
+
+
+def test_a_brief_training_already_beats_the_formula(trained):
+    accuracy = json.loads((trained[0] / "accuracy.json").read_text())["specular"]
+    assert accuracy["median"] < 0.013  # the formula's own, see tests/reflection
+    assert set(accuracy) >= {"roughness", "sharpness", "cosine of the view", "degrees from the mirror direction"}
+
+
+def test_the_curve_falls(trained):
+    curve = pq.read_table(trained[0] / "training.parquet").to_pydict()
+    specular = [e for e, part in zip(curve["held_out_p95_error"], curve["part"], strict=True) if part == "specular"]
+    assert specular[-1] < 0.7 * specular[0]
+
+
+def test_the_weights_say_their_architecture_and_can_be_used(trained):
+    with safe_open(trained[0] / "specular.safetensors", framework="pt") as file:
+        assert json.loads(file.metadata()["factorlib"])["sizes"] == [20, 32, 32, 32, 1]
+    assert reflection_operator("network", weights=trained[0]).layers["specular"].weights[0].shape == (32, 20)
+
+
+def test_shipped_weights_are_of_this_stage_and_within_the_bounds():
+    """`make train` makes the shipped weights again; these are the errors that it must reach, and that the shipped ones did."""
+    accuracy = json.loads((SHIPPED / "accuracy.json").read_text())
+    assert accuracy["specular"]["samples"] == train.Params().held_out
+    assert accuracy["specular"]["median"] < 0.003
+    assert accuracy["specular"]["p95"] < 0.02
+    assert accuracy["diffuse"]["p95"] < 0.005
