@@ -33,7 +33,7 @@ setup: .venv/ready
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache
 	@.venv/bin/lint-imports --no-cache
-	@PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
+	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
 
 data: .venv/ready
 	@$(PY) -m factorlib.generate

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
-from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
+from factorlib.runner.worker import limit_threads
 
 
 class Pools:
@@ -42,7 +42,7 @@ class Pools:
         if threads not in self._pools:
             self._pools[threads] = _pool(max(1, self.cores // threads), threads)
         try:
-            with _Environment(threads):
+            with _FixedHashes():
                 return self._pools[threads].submit(function, *arguments)
         except BrokenProcessPool:  # a worker was killed earlier: its step has failed, the others get a new pool
             self._pools.pop(threads).shutdown(wait=False)
@@ -68,19 +68,17 @@ def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
     )
 
 
-class _Environment:
-    """What a worker must find in its environment when its interpreter starts."""
-
-    def __init__(self, threads: int):
-        self.wanted = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONHASHSEED": "0"}
+class _FixedHashes:
+    """Workers that start meanwhile walk their sets in the same order every time."""
 
     def __enter__(self) -> None:
-        self.before = {name: os.environ.get(name) for name in self.wanted}
-        os.environ.update(self.wanted)
+        self.before = os.environ.get("PYTHONHASHSEED")
+        os.environ["PYTHONHASHSEED"] = "0"
 
     def __exit__(self, *exception) -> None:
-        for name, value in self.before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        del os.environ["PYTHONHASHSEED"]
+        if self.before is not None:
+            os.environ["PYTHONHASHSEED"] = self.before
 
 
 def _start(threads: int, parent: int) -> None:

@@ -95,7 +95,7 @@ class Run:
         stages = dict.fromkeys(p.step.stage for p in self.planned if p.status != "current")
         checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].params]
         futures = [self.pools.submit(code.threads, check_params, code) for code in checks]
-        outcomes = [future.result() for future in futures]
+        outcomes = [_outcome_of(future) for future in futures]
         for future in futures:
             self.pools.done(future)
         for code, outcome in zip(checks, outcomes, strict=True):

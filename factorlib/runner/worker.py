@@ -132,7 +132,7 @@ def _made(task: Task, events: Events) -> str:
 
 def _check_files_still(task: Task) -> None:
     for name, before in task.hashes.items():
-        if hash_of_file(task.files[name]) != before:
+        if not task.files[name].is_file() or hash_of_file(task.files[name]) != before:
             raise InputError("the file changed while it was being read", file=task.files[name], cure="run again")
 
 

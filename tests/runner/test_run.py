@@ -255,16 +255,36 @@ def wait_until(true, seconds=20):
         time.sleep(0.02)
 
 
+def children_of(parent):
+    return [int(stat.parent.name) for stat in Path("/proc").glob("[0-9]*/stat") if fields_of(stat)[1:2] == [str(parent)]]
+
+
+def is_alive(pid):
+    return fields_of(Path(f"/proc/{pid}/stat"))[:1] not in ([], ["Z"])
+
+
+def fields_of(stat):
+    """State, parent, … of a process; nothing of one that is gone."""
+    try:
+        return stat.read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
+
+
 def sleepers(project):
     return list((project.build / "store" / "tmp").glob("run-*/upper-*/a.txt"))
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_killed_run_leaves_nothing_half_made_and_resumes(project):
     process = background(project, "upper.sleep=30")
     wait_until(lambda: sleepers(project))
+    workers = children_of(process.pid)
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
+    assert workers
+    wait_until(lambda: not any(is_alive(pid) for pid in workers))
     assert state(project, settings=("upper.sleep=30",))["upper/a"] == "to run"
     assert set(state(project).values()) == {"current"}
     collect(project)  # sweeps what the dead run left
@@ -315,10 +335,11 @@ def test_plan_why_and_graph_show_the_same_plan(project, capsys):
     assert "upper --> count" in capsys.readouterr().out
 
 
-def test_threads_are_those_of_the_stage_whatever_the_machine(tmp_path):
+@pytest.mark.parametrize("name, value", [("OMP_NUM_THREADS", "3"), ("PYTHONHASHSEED", "0")])
+def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machine(tmp_path, name, value):
     project = make_project(tmp_path)
-    text = toy.TABLE.replace("json.dumps(params.scale)", "__import__('os').environ['OMP_NUM_THREADS']")
+    text = toy.TABLE.replace("json.dumps(params.scale)", f"__import__('os').environ['{name}']")
     write(tmp_path / "stages" / "table.py", text)
     write(tmp_path / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {threads: 3}"))
     assert make(project, targets=["table"]) == 0
-    assert Path(project.build / "set" / "table" / "table.json").read_text() == "3"
+    assert (project.build / "set" / "table" / "table.json").read_text() == value
