@@ -178,8 +178,9 @@ def composed(
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses.values(), strict=True)):
         thing = shape(meshes[placed.shape], bsdf(materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
-        alone = traced({"thing": thing, "light": envmap(light)}, camera, world, spp, 100 * seed + number, max_depth=2)
-        radiance[nearest == number] = alone[nearest == number]
+        third = slice(edges[number], edges[number + 1])
+        things = {"thing": thing, "light": envmap(light)}
+        radiance[:, third] = traced(things, camera, world, spp, 100 * seed + number, max_depth=2, columns=third)
     return radiance
 
 

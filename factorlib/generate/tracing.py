@@ -24,6 +24,7 @@ from factorlib.light.latlong import sampled
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 
+SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
@@ -73,29 +74,44 @@ def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndar
         return mitsuba().load_dict({"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material})
 
 
-def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int) -> dict[str, Any]:
-    """The pinhole camera; its principal point must be the image's centre."""
+def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice) -> dict[str, Any]:
+    """The pinhole camera, of whose image some columns are taken; its principal point must be the image's centre."""
+    left, right, _ = columns.indices(camera.width)
+    crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal))),
         "near_clip": 1e-3,
         "to_world": transform(world_from_camera @ MITSUBA_FROM_CAMERA),
-        "sampler": {"type": "independent", "sample_count": spp},
-        "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "sampler": {"type": SAMPLER},
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            **crop,
+        },
     }
 
 
-def traced(things: dict[str, Any], camera: Camera, world_from_camera, spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
-    """Radiance of a scene; max_depth 2 is direct light alone, −1 all bounces."""
+def traced(
+    things: dict[str, Any], camera: Camera, world_from_camera, spp: int, seed: int, max_depth: int, columns: slice = slice(None)
+) -> Float[np.ndarray, "h w 3"]:
+    """Radiance of a scene, or of some columns of its image; max_depth 2 is direct light alone, −1 all bounces.
+
+    Many samples are taken in passes of stratified ones, so that no pass needs much memory.
+    """
     mi = mitsuba()
-    integrator = {"type": "path", "max_depth": max_depth}
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
     loaded = {name: mi.load_dict(thing, parallel=False) if isinstance(thing, dict) else thing for name, thing in things.items()}
-    scene = mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": sensor(camera, world_from_camera, spp), **loaded}, parallel=False
-    )
-    return np.array(mi.render(scene, seed=seed, spp=spp), dtype=np.float64)
+    integrator = {"type": "path", "max_depth": max_depth}
+    view = sensor(camera, world_from_camera, columns)
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
+    passes = -(-spp * camera.height * len(range(camera.width)[columns]) // SAMPLES_PER_PASS)
+    images = [mi.render(scene, seed=passes * seed + k, spp=-(-spp // passes)) for k in range(passes)]
+    return np.mean([np.array(image, dtype=np.float64) for image in images], axis=0)
 
 
 def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
