@@ -18,8 +18,6 @@ product's mode.  There the spread of n·i says how much of the light is above th
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import torch
 from torch import Tensor

@@ -114,18 +114,29 @@ class Network(Operator):
         self.layers = {part: read_layers(folder / f"{part}.safetensors").to(dtype) for part in ("diffuse", "specular")}
         self.fused = {part: fused(part, layers) for part, layers in self.layers.items()} if dtype == torch.float32 else {}
 
+    def _compiled(self, sharpness: Tensor, *others: Tensor) -> bool:
+        """Whether compiled code can answer: it is there, a lobe a column, on the CPU, and autograd does not listen."""
+        if not self.fused or not all(self.fused.values()) or sharpness.ndim != 1:
+            return False
+        listening = torch.is_grad_enabled() and any(t.requires_grad for t in (sharpness, *others))
+        return not listening and all(t.device.type == "cpu" for t in (sharpness, *others))
+
     def response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
         """As of every operator; in float32 by compiled code, where there is a compiler."""
-        if not all(self.fused.values()) or not self.fused or nz.device.type != "cpu":
+        if not self._compiled(sharpness.detach(), nz.detach()):
             return super().response(roughness, sharpness, no, nz, oz)
         diffuse, _, diffuse_by_log_sharpness, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
         return Response(diffuse, diffuse_by_log_sharpness, diffuse_by_nz, *self.fused["specular"](float(roughness), sharpness, no, nz, oz))
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        if self._compiled(sharpness, nz):
+            return self.fused["diffuse"](0.0, sharpness, nz.new_ones(len(nz)), nz, nz)[0]
         nz = nz.clamp(-1, 1)
         return diffuse_form.diffuse(sharpness, nz) * torch.exp(correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        if roughness.ndim == 0 and self._compiled(sharpness, no, nz, oz, roughness):
+            return self.fused["specular"](float(roughness), sharpness, no, nz, oz)[0]
         alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, no[:, None], nz, oz)
         form = filtered_specular(alpha, sharpness, no, nz, oz)
         return form.value * torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))

@@ -94,7 +94,13 @@ def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor
 def sharper_is_the_normal(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
     """D is narrower than the lobe, whose axis is not so far from the mirror direction that it does not see D's peak."""
     deviation = 1 / torch.sqrt(sharpness)
-    return (2 * alpha * torch.sqrt(no) < deviation) & (mirror_angle(no, nz, oz) < (REACH + 0.5) * deviation)
+    return (2 * alpha * torch.sqrt(no) < deviation) & (mirror_angle(no, nz, oz) < reach_of(sharpness) + 0.5 * deviation)
+
+
+def reach_of(sharpness: Tensor) -> Tensor:
+    """Angle from its axis at which a lobe is cut."""
+    half = REACH / 2 / torch.sqrt(sharpness)
+    return torch.where(half < 0.999, 2 * torch.arcsin(half.clamp(max=0.999)), torch.full_like(half, math.pi))
 
 
 def mirror_angle(no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
@@ -110,7 +116,7 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     oy = root(1 - oz**2 - ox**2)
     tilt = torch.atan2(sz, nz)
     a, b = (math.pi / 2 - tilt).abs(), math.pi - (math.pi / 2 - tilt).abs()
-    reach = (REACH / torch.sqrt(sharpness)).clamp(max=math.pi)
+    reach = reach_of(sharpness)
     above, zero = nz > 0, torch.zeros_like(a)
     full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
 
@@ -136,7 +142,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     zx = (oz - no * nz) / so  # z along the direction from n to o
     zy = root(1 - nz**2 - zx**2)
     tilt = torch.atan2(so, no)
-    least = (mirror_angle(no, nz, oz) - REACH / torch.sqrt(sharpness)).clamp_min(0) / 2
+    least = (mirror_angle(no, nz, oz) - reach_of(sharpness)).clamp_min(0) / 2
     y_least, y_a, y_b = (torch.asinh(t / alpha) for t in (least, (math.pi / 2 - tilt) / 2, (math.pi / 2 + tilt) / 2))
 
     def integrand(y: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
@@ -178,7 +184,7 @@ def diffuse_quadrature(sharpness: Tensor, nz: Tensor, nodes: int = 48) -> Tensor
     lam, c = sharpness[..., None], nz.clamp(-1, 1)[..., None]
     s = root(1 - c**2)
     a = (math.pi / 2 - torch.atan2(s, c)).abs()
-    reach = (REACH / torch.sqrt(lam)).clamp(max=math.pi)
+    reach = reach_of(lam)
     low = torch.zeros_like(a)
     x, w = gauss(nodes, c.dtype)
     total = 0

@@ -108,7 +108,7 @@ class Value:
     def __init__(self, tape: Tape, index: int):
         self.tape, self.index = tape, index
 
-    def _(name, swap=False):  # noqa: N805
+    def _(name, swap=False):
         return (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
 
     __add__, __radd__, __sub__, __rsub__ = _("add"), _("add", True), _("sub"), _("sub", True)

@@ -5,11 +5,11 @@ import shutil
 
 import pytest
 import torch
-from tests.reflection.test_operators import grid
 
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
 from factorlib.reflection.tape import Tape
+from tests.reflection.test_operators import grid
 
 compiler = pytest.mark.skipif(shutil.which(os.environ.get("CC", "cc")) is None, reason="no C compiler")
 
