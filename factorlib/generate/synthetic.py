@@ -178,9 +178,11 @@ def composed(
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses.values(), strict=True)):
         thing = shape(meshes[placed.shape], bsdf(materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
-        third = slice(edges[number], edges[number + 1])
+        own = nearest == number
+        columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
         things = {"thing": thing, "light": envmap(light)}
-        radiance[:, third] = traced(things, camera, world, spp, 100 * seed + number, max_depth=2, columns=third)
+        alone = traced(things, camera, world, spp, 100 * seed + number, max_depth=2, columns=columns)
+        radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
     return radiance
 
 
