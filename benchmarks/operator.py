@@ -18,7 +18,13 @@ from factorlib.reflection.accuracy import quantiles, specular_table
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import diffuse_samples, specular_inputs, specular_samples
 
-OPERATORS = (("closed_form", "float32"), ("closed_form", "float64"), ("network", "float32"), ("network", "float64"), ("reference", "float64"))
+OPERATORS = (
+    ("closed_form", "float32"),
+    ("closed_form", "float64"),
+    ("network", "float32"),
+    ("network", "float64"),
+    ("reference", "float64"),
+)
 SLOPES = ("roughness", "log_sharpness", "nz", "oz")
 
 
@@ -60,14 +66,20 @@ def microseconds(operator, rows: int, lobes: int = 64) -> float:
 
 def main(samples: Annotated[int, typer.Option(help="of the reference")] = 16384) -> None:
     torch.set_num_threads(1)
-    specular, diffuse, reference = specular_samples(samples, 99, tolerance=1e-6), diffuse_samples(samples, 98), reflection_operator("reference")
+    specular, diffuse, reference = (
+        specular_samples(samples, 99, tolerance=1e-6),
+        diffuse_samples(samples, 98),
+        reflection_operator("reference"),
+    )
     table = {}
     for name, dtype in OPERATORS:
         operator = reflection_operator(name, dtype=dtype)
         row = table[f"{name} {dtype}"] = {"microseconds": microseconds(operator, 8 if name == "reference" else 2048)}
         if name != "reference":
             with torch.no_grad():
-                value = operator.diffuse(diffuse.sharpness[:, None].to(operator.dtype), diffuse.nz[:, None].to(operator.dtype))[:, 0].double()
+                value = operator.diffuse(diffuse.sharpness[:, None].to(operator.dtype), diffuse.nz[:, None].to(operator.dtype))[
+                    :, 0
+                ].double()
             row |= {"specular": errors(operator, specular), "gradients": gradient_errors(operator, reference)}
             row["diffuse"] = quantiles((value - diffuse.value) / diffuse.scale())
     print(json_text(table), end="")

@@ -32,7 +32,9 @@ def diffuse_remainder(orders: int = 8, powers: int = 5) -> tuple[np.ndarray, flo
         error = (matrix @ found - target).abs()
         weight = weight * torch.sqrt(1 + error / error.max())
         weight = weight / weight.mean()
-    even = np.array([np.polynomial.chebyshev.cheb2poly([0.0] * (2 * j) + [1.0]).tolist() + [0.0] * (2 * (powers - 1 - j)) for j in range(powers)])
+    even = np.array(
+        [np.polynomial.chebyshev.cheb2poly([0.0] * (2 * j) + [1.0]).tolist() + [0.0] * (2 * (powers - 1 - j)) for j in range(powers)]
+    )
     return found.reshape(orders, powers).numpy() @ even[:, ::2], float(error.max())
 
 

@@ -81,7 +81,9 @@ def _diffuse(params: Params, out: Path, progress: Progress) -> tuple[dict, list[
 
 def _report(progress: Progress, part: str, steps: int):
     def report(point: Step) -> None:
-        progress(point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)")
+        progress(
+            point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)"
+        )
 
     return report
 

@@ -1,8 +1,8 @@
 """Lambert + GGX, as Mitsuba's `diffuse` and `roughconductor` (material none, separable Smith) evaluate them.
 
-    f = k_d/π + k_s D(h) G1(n·i) G1(n·o) / (4 (n·i)(n·o)),     no Fresnel (Wang et al. 2017)
-    D = α² / (π ((n·h)² (α² − 1) + 1)²)                         Trowbridge and Reitz 1975, Walter et al. 2007
-    G1(c) = 2c / (c + √(α² + (1 − α²) c²))                      Smith, as in Walter et al. 2007, eq. 34
+f = k_d/π + k_s D(h) G1(n·i) G1(n·o) / (4 (n·i)(n·o)),     no Fresnel (Wang et al. 2017)
+D = α² / (π ((n·h)² (α² − 1) + 1)²)                         Trowbridge and Reitz 1975, Walter et al. 2007
+G1(c) = 2c / (c + √(α² + (1 − α²) c²))                      Smith, as in Walter et al. 2007, eq. 34
 """
 
 from __future__ import annotations

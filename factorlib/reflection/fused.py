@@ -116,13 +116,15 @@ def compiled(part: str, features: int, width: int, depth: int):
     compiler = shlex.split(os.environ.get("CC", "cc"))
     text = source(part, features, width, depth)
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
-    key = hashlib.sha256("\0".join([text, FLAGS, version, _machine()]).encode()).hexdigest()[:24]
+    key = hashlib.sha256(f"{text}\0{FLAGS}\0{version}\0{_machine()}".encode()).hexdigest()[:24]
     library = _cache() / f"{part}-{key}.so"
     if not library.exists():
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
             made = Path(folder) / "kernel.so"
             (Path(folder) / "kernel.c").write_text(text)
-            subprocess.run([*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"], check=True, capture_output=True, text=True)
+            subprocess.run(
+                [*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"], check=True, capture_output=True, text=True
+            )
             os.replace(made, library)
     function = ctypes.CDLL(str(library)).response
     function.restype = None
@@ -154,5 +156,8 @@ def fused(part: str, layers: Layers) -> Fused | None:
     try:
         return Fused(part, layers)
     except (OSError, subprocess.SubprocessError) as error:
-        log.warning("the reflection network runs in torch, about ten times slower, since its C code did not compile: %s", getattr(error, "stderr", error))
+        log.warning(
+            "the reflection network runs in torch, about ten times slower, since its C code did not compile: %s",
+            getattr(error, "stderr", error),
+        )
         return None

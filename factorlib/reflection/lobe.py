@@ -1,8 +1,8 @@
 """Moments of a light lobe exp(λ(ω·z − 1)) on the sphere, stable in float32 for every sharpness λ ≥ 0.
 
-    integral    E = 2π (1 − e^{−2λ}) / λ            4π at λ = 0
-    mean        t̄ = E[ω·z] = coth λ − 1/λ           0 at λ = 0, 1 as λ → ∞
-    variance    v∥ = 1 − t̄² − 2 t̄/λ along z, v⊥ = (1 − E[(ω·z)²])/2 = t̄/λ in each direction across
+integral    E = 2π (1 − e^{−2λ}) / λ            4π at λ = 0
+mean        t̄ = E[ω·z] = coth λ − 1/λ           0 at λ = 0, 1 as λ → ∞
+variance    v∥ = 1 − t̄² − 2 t̄/λ along z, v⊥ = (1 − E[(ω·z)²])/2 = t̄/λ in each direction across
 """
 
 from __future__ import annotations

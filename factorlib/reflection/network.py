@@ -132,7 +132,9 @@ class Network(Operator):
         if self._compiled(sharpness, nz):
             return self.fused["diffuse"](0.0, sharpness, nz.new_ones(len(nz)), nz, nz)[0]
         nz = nz.clamp(-1, 1)
-        return diffuse_form.diffuse(sharpness, nz) * torch.exp(correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness))
+        return diffuse_form.diffuse(sharpness, nz) * torch.exp(
+            correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness)
+        )
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
         if roughness.ndim == 0 and self._compiled(sharpness, no, nz, oz, roughness):

@@ -61,7 +61,9 @@ class Operator:
     ) -> Response:
         """Values and derivatives together; nothing is left on torch's graph."""
         rows = max(1, CHUNK // max(nz.shape[1], 1))
-        parts = [self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows]) for i in range(0, len(nz), rows)]
+        parts = [
+            self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows]) for i in range(0, len(nz), rows)
+        ]
         if len(parts) == 1:
             return parts[0]
         return Response(*(torch.cat([getattr(part, field) for part in parts]) for field in Response.__struct_fields__))

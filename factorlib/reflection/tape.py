@@ -109,7 +109,9 @@ class Value:
         self.tape, self.index = tape, index
 
     def _(name, swap=False):
-        return (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
+        return (
+            (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
+        )
 
     __add__, __radd__, __sub__, __rsub__ = _("add"), _("add", True), _("sub"), _("sub", True)
     __mul__, __rmul__, __truediv__, __rtruediv__ = _("mul"), _("mul", True), _("div"), _("div", True)

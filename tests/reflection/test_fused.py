@@ -55,7 +55,15 @@ def test_derivatives_on_a_tape_are_those_of_autograd():
     x, y = tape.input("x"), tape.input("y")
     result = formula(x, y)
     lines = tape.c_code(dict(zip(("r", "dx", "dy"), (result, *tape.gradient([(result, 1.0)], [x, y])), strict=True)), {"x": "x", "y": "y"})
-    functions = {"sqrtf": torch.sqrt, "expf": torch.exp, "logf": torch.log, "log1pf": torch.log1p, "erfcf": torch.special.erfc, "fmaxf": max, "fminf": min}
+    functions = {
+        "sqrtf": torch.sqrt,
+        "expf": torch.exp,
+        "logf": torch.log,
+        "log1pf": torch.log1p,
+        "erfcf": torch.special.erfc,
+        "fmaxf": max,
+        "fminf": min,
+    }
     for p, q in ((0.3, 0.7), (-1.2, 0.1), (2.0, 3.0)):
         leaves = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (p, q)]
         value = formula(*leaves)

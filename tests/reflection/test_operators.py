@@ -32,7 +32,9 @@ def scene(seed=0, points=40, lobes=5):
         axis=unit(g, lobes), sharpness=torch.logspace(0, 2.5, lobes, dtype=torch.float64), weight=torch.rand(lobes, 3, generator=g).double()
     )
     material = SimpleNamespace(
-        diffuse=torch.tensor([0.3, 0.2, 0.1]).double(), specular=torch.tensor([0.2, 0.3, 0.4]).double(), roughness=torch.tensor(0.5).double()
+        diffuse=torch.tensor([0.3, 0.2, 0.1]).double(),
+        specular=torch.tensor([0.2, 0.3, 0.4]).double(),
+        roughness=torch.tensor(0.5).double(),
     )
     normals = unit(g, points)
     views = normals + 0.8 * unit(g, points)
@@ -49,7 +51,9 @@ def test_radiance_is_not_negative_and_linear_in_light_and_reflectance(operator):
     radiance = operator(light, material, normals, views)
     assert (radiance >= 0).all() and radiance.shape == (40, 3)
     torch.testing.assert_close(operator(changed(light, weight=3 * light.weight), material, normals, views), 3 * radiance)
-    torch.testing.assert_close(operator(light, changed(material, diffuse=2 * material.diffuse, specular=2 * material.specular), normals, views), 2 * radiance)
+    torch.testing.assert_close(
+        operator(light, changed(material, diffuse=2 * material.diffuse, specular=2 * material.specular), normals, views), 2 * radiance
+    )
 
 
 @every
@@ -71,9 +75,16 @@ def test_surfaces_that_face_away_reflect_nothing(operator):
 def test_no_more_is_reflected_than_arrives(operator):
     """Constant light of radiance 1 from all sides: k_d + k_s ≤ 1 reflects at most 1."""
     _, material, normals, views = scene()
-    light = SimpleNamespace(axis=torch.tensor([[0.0, 0, 1]]).double(), sharpness=torch.tensor([1e-4]).double(), weight=torch.ones(1, 3).double())
+    light = SimpleNamespace(
+        axis=torch.tensor([[0.0, 0, 1]]).double(), sharpness=torch.tensor([1e-4]).double(), weight=torch.ones(1, 3).double()
+    )
     for roughness in (0.1, 0.5, 1.0):
-        white = changed(material, diffuse=torch.full((3,), 0.4).double(), specular=torch.full((3,), 0.6).double(), roughness=torch.tensor(roughness).double())
+        white = changed(
+            material,
+            diffuse=torch.full((3,), 0.4).double(),
+            specular=torch.full((3,), 0.6).double(),
+            roughness=torch.tensor(roughness).double(),
+        )
         radiance = operator(light, white, normals, views)
         most = 1.3 if type(operator).__name__ == "ClosedForm" else 1.02
         assert (radiance <= most).all() and (radiance >= 0.4).all()
@@ -110,7 +121,13 @@ def test_values_and_gradients_are_finite_everywhere(operator, roughness, log_sha
 @pytest.mark.parametrize("place", ["normal", "opposite the normal", "mirror", "view", "opposite the view"])
 @pytest.mark.parametrize("no", [1e-4, 0.02, 0.5, 1.0])
 def test_special_directions_are_finite(operator, place, no):
-    nz, oz = {"normal": (1, no), "opposite the normal": (-1, -no), "mirror": (no, 2 * no**2 - 1), "view": (no, 1), "opposite the view": (-no, -1)}[place]
+    nz, oz = {
+        "normal": (1, no),
+        "opposite the normal": (-1, -no),
+        "mirror": (no, 2 * no**2 - 1),
+        "view": (no, 1),
+        "opposite the view": (-no, -1),
+    }[place]
     d = operator.dtype
     for roughness in (0.03, 0.1, 1.0):
         lam = torch.tensor([1e-4, 1.0, 1e3, 1e6], dtype=d)

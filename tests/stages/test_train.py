@@ -23,7 +23,12 @@ def trained(tmp_path_factory):
 
 
 def test_files_are_those_of_the_stage(trained):
-    assert sorted(p.name for p in trained[0].iterdir()) == ["accuracy.json", "diffuse.safetensors", "specular.safetensors", "training.parquet"]
+    assert sorted(p.name for p in trained[0].iterdir()) == [
+        "accuracy.json",
+        "diffuse.safetensors",
+        "specular.safetensors",
+        "training.parquet",
+    ]
 
 
 def test_the_same_parameters_give_the_same_bytes(trained):
