@@ -33,17 +33,19 @@ Meta = msgspec.Meta
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """operator: how a lobe's reflection is computed;  merge_degrees: observations this near are merged before solving.
 
-    lobes: most lobes an illumination may get (held-out pixels may stop earlier);  prior: weight of the paper's tint
+    lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
+    illumination that choose the lobes, before all of them polish the answer;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
     operator: Literal["network", "closed_form", "reference"] = "network"
     merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
-    lobes: Annotated[int, Meta(ge=1, le=1024)] = 64
-    insert: Annotated[int, Meta(ge=1, le=64)] = 10
+    lobes: Annotated[int, Meta(ge=1, le=1024)] = 48
+    insert: Annotated[int, Meta(ge=1, le=64)] = 12
     rounds: Annotated[int, Meta(ge=1, le=100)] = 12
-    iterations: Annotated[int, Meta(ge=1, le=1000)] = 15
-    polish: Annotated[int, Meta(ge=0, le=1000)] = 30
+    iterations: Annotated[int, Meta(ge=1, le=1000)] = 12
+    polish: Annotated[int, Meta(ge=0, le=1000)] = 20
+    sample: Annotated[int, Meta(ge=50)] = 1500
     tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
@@ -75,7 +77,7 @@ def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def _bundle(params: Params) -> Bundle:
-    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "tolerance", "least_gain", "seed")}
+    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "seed")}
     return Bundle(loss=Loss(prior=params.prior), **same)
 
 

@@ -2,6 +2,7 @@
 
     round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
             descend on everything (descent), prune, fix the gauge
+            (all on a sample of the observations, which finds the lobes as well as all of them do)
     stop:   when a round lowers the held-out loss by less than `least_gain`, at `lobes` lobes per light, or after
             `rounds`; the best round by held-out loss is kept and polished on all observations.
 """
@@ -17,19 +18,20 @@ from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.gauge import in_gauge
 from factorlib.solve.insertion import lobes_inserted, pruned
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
-from factorlib.solve.problem import Block
+from factorlib.solve.problem import Block, of_rows, sampled
 from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.weights import refitted_weights
 
 
 class Bundle(msgspec.Struct, frozen=True):
-    """How the joint problem is solved; lobes are counted per illumination."""
+    """How the joint problem is solved; `lobes` and `sample` (observations that rounds use) are counted per illumination."""
 
-    lobes: int = 64
-    insert: int = 10
+    lobes: int = 48
+    insert: int = 12
     rounds: int = 12
-    iterations: int = 8
-    polish: int = 30
+    iterations: int = 12
+    polish: int = 20
+    sample: int = 1500
     tolerance: float = 1e-4
     least_gain: float = 0.01
     start_roughness: float = 0.4
@@ -61,6 +63,7 @@ class Joint(msgspec.Struct, frozen=True):
 
 def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
     """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
+    everything, blocks = blocks, [sampled(block, bundle.sample, bundle.seed) for block in blocks]
     history: list[Event] = []
 
     def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
@@ -85,7 +88,7 @@ def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map
             best, best_held = current, held
         if gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
             break
-    everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
+    blocks = everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in everything]
     best = evaluated(everything, best.materials, best.lights, operator, loss, map_)
     best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
     best = _tidied(everything, best, operator, loss, map_)
@@ -96,15 +99,10 @@ def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequenc
     """Mean robust loss per held-out channel value."""
     total, count = 0.0, 0
     for block, light in zip(blocks, lights, strict=True):
-        held = _only(block, block.held_out)
+        held = of_rows(block, block.held_out)
         total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
         count += 3 * len(held)
     return total / max(count, 1)
-
-
-def _only(block: Block, rows: np.ndarray) -> Block:
-    fields = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
-    return msgspec.structs.replace(block, **{f: getattr(block, f)[rows] for f in fields})
 
 
 def _descent(bundle: Bundle, iterations: int) -> Descent:

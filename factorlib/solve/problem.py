@@ -101,6 +101,22 @@ def _in_frame(vectors: np.ndarray, seen: Observations, rotations: Mapping) -> Fl
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
+def of_rows(block: Block, rows: np.ndarray) -> Block:
+    """The observations `rows` (indices or a mask) alone."""
+    fields = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
+    return msgspec.structs.replace(block, **{name: getattr(block, name)[rows] for name in fields})
+
+
+def sampled(block: Block, count: int, seed: int) -> Block:
+    """At most `count` fitted and `count`/3 held-out observations, each material with its share, order kept."""
+    random = np.random.default_rng(seed)
+    kept = [
+        random.permutation(rows)[:most]
+        for rows, most in ((np.flatnonzero(~block.held_out), count), (np.flatnonzero(block.held_out), count // 3))
+    ]
+    return of_rows(block, np.sort(np.concatenate(kept)))
+
+
 def connected_components(blocks: Sequence[Block], materials: int) -> list[tuple[tuple[int, ...], tuple[str, ...]]]:
     """Components of the material × illumination matrix: (material indices, illumination names) of each, in order.
 
