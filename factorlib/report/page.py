@@ -71,6 +71,7 @@ def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict
         "cells": cells,
         "maps": [(p, reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         "lights": [r for n, p in run.illuminations().items() if (r := light_row(run, n, p, errors_of_light.get(n)))],
+        "missing": _by_reason(metrics["reasons"]),
         "errors": error_tables(metrics, run.set.photos, run.set.materials),
         "gauge": solved.get("gauge", {}),
         "model": solved.get("model", {}),
@@ -80,6 +81,10 @@ def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict
         "training": training_of(run),
         "cost": cost_of(run.events(), STAGES),
     }
+
+
+def _by_reason(reasons: dict[str, str]) -> dict[str, list[str]]:
+    return {reason: sorted(s for s, why in reasons.items() if why == reason) for reason in sorted(set(reasons.values()))}
 
 
 def _shared_exposures(run: Artifacts) -> dict[str, list[float]]:

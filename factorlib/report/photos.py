@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.picture import picture
@@ -14,7 +14,7 @@ from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
 
 AMPLIFICATION = 4
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
-DISAGREES = np.array([0.93, 0.2, 0.55])
+DISAGREES = np.array([0.92, 1.0, 0.0])
 
 
 class Panel(msgspec.Struct, frozen=True):
@@ -52,7 +52,7 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: dict | No
     ]
     if resynthesis is not None:
         found = np.nan_to_num(resynthesis[box], posinf=0, neginf=0)
-        panels.append(_panel("re-synthesis", _cut_out(_display(found, exposure), cut[0]), longest))
+        panels.append(_panel("re-synthesis", _cut_out(_display(found, exposure), _explained(*cut)), longest))
         panels.append(_panel("difference", _difference(photo, found, exposure, *cut), longest))
     return PhotoRow(name, run.illumination_of(name), panels, run.photo_facts().get(name, {}), errors)
 
@@ -66,13 +66,17 @@ def _panel(title: str, display: Float[np.ndarray, "h w c"], longest: int) -> Pan
     return Panel(title, data_uri(pixels), pixels)
 
 
-def _cut_out(display: Float[np.ndarray, "h w 3"], masks: Channels) -> Float[np.ndarray, "h w 4"]:
+def _cut_out(display: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 4"]:
     """Transparent outside the mask."""
-    return np.concatenate([display, (masks["label"] > 0.5)[..., None]], axis=-1)
+    return np.concatenate([display, mask[..., None]], axis=-1)
+
+
+def _explained(masks: Channels, geometry: Channels) -> Bool[np.ndarray, "h w"]:
+    return (masks["label"] > 0.5) & (np.rint(masks["label"]) == np.rint(geometry["label"]))
 
 
 def _labels(masks: Channels, geometry: Channels, photo: np.ndarray, tags: list[str]) -> Float[np.ndarray, "h w 3"]:
-    """Materials tinted on a grey photo (already exposed); where mesh and mask name different materials, pink."""
+    """Materials tinted on a grey photo (already exposed); yellow where mesh and mask name different ones."""
     grey = srgb_encode(np.clip(photo.mean(axis=-1), 0, 1))[..., None] * np.ones(3)
     label = np.rint(masks["label"]).astype(int)
     colours = np.array([[0.0, 0, 0], *([int(tag[i : i + 2], 16) / 255 for i in (1, 3, 5)] for tag in tags)])
@@ -86,7 +90,7 @@ def _difference(photo, found, exposure: float, masks: Channels, geometry: Channe
     shown = 0.5 + AMPLIFICATION * (_display(found, exposure) - _display(photo, exposure))
     clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
     shown[~agreeing_pixels(masks, geometry) | clipped] = UNCOUNTED
-    return _cut_out(np.clip(shown, 0, 1), masks)
+    return _cut_out(np.clip(shown, 0, 1), masks["label"] > 0.5)
 
 
 def ringed(display: Float[np.ndarray, "h w 3"], mask: np.ndarray) -> Float[np.ndarray, "h w 3"]:

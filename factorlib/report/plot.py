@@ -53,7 +53,8 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Logarithms of round values between 10^low and 10^high: decades, and 2 and 5 where these are few.
+    """Logarithms of round values between 10^low and 10^high: decades, and 2 and 5 where these
+    are few, or what a linear axis would have.
 
     >>> [round(10**t, 3) for t in log_ticks(-1.2, 0.1)]
     [0.1, 0.2, 0.5, 1.0]
@@ -61,6 +62,8 @@ def log_ticks(low: float, high: float) -> list[float]:
     mantissas = (1, 2, 5) if high - low < 2.5 else (1,)
     every = [k + math.log10(m) for k in range(math.floor(low), math.ceil(high) + 1) for m in mantissas]
     inside = [t for t in every if low - 1e-9 <= t <= high + 1e-9]
+    if len(inside) < 2:
+        return [math.log10(t) for t in ticks(10**low, 10**high, 4)]
     return inside[:: max(1, -(-len(inside) // 8))]
 
 
