@@ -36,7 +36,8 @@ test: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
 
 data: .venv/ready
-	@$(PY) -m factorlib.generate
+	@$(PY) -m factorlib.generate synthetic
+	@$(PY) -m factorlib.generate eames
 
 help:
 	@echo 'make all DATASET=eames               the whole pipeline; DATASET is a name in data/ or a path to a folder'

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec import structs
+
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
 
@@ -56,11 +58,21 @@ def mermaid_lines(pipeline: Pipeline) -> list[str]:
 
 
 def _alike(planned: list[Planned]) -> list[list[Planned]]:
+    """Steps of a stage with the same status and reasons, the photo's own name aside."""
     groups: dict[tuple, list[Planned]] = {}
     for p in planned:
-        own = [reason.replace(f"/{p.step.photo}", "/<photo>") if p.step.photo else reason for reason in p.reasons]
-        groups.setdefault((p.step.stage, p.status, tuple(own)), []).append(p)
+        reasons = [_of_any_photo(reason, p.step) for reason in p.reasons]
+        groups.setdefault((p.step.stage, p.status, tuple(reasons)), []).append(structs.replace(p, reasons=reasons))
     return list(groups.values())
+
+
+def _of_any_photo(reason: str, step: Step) -> str:
+    """`masks/kitchen` is `masks` to the step of the kitchen.
+
+    >>> _of_any_photo("if masks/kitchen, train comes out different", Step("align", "kitchen"))
+    'if masks, train comes out different'
+    """
+    return reason.replace(f"/{step.photo}", "") if step.photo and reason.startswith(("if ", "result of ")) else reason
 
 
 def _photos(group: list[Planned]) -> str:
