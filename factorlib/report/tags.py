@@ -36,7 +36,7 @@ def nearest_tags(names: list[str], reflectance: Float[np.ndarray, "m 3"]) -> dic
     return tags
 
 
-def _distance(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+def _distance(a: Float[np.ndarray, "m 1 3"], b: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "m p"]:
     """Squared, of display values: colourfulness counts ten times as much as brightness."""
     difference = a - b
     brightness = difference.mean(axis=-1, keepdims=True)
