@@ -1,7 +1,7 @@
 """R(lobe | material): what a surface of Lambert + GGX reflectance reflects of one light lobe.
 
-Four operators compute it, behind one interface (`reflection_operator`): `reference` by quadrature, `closed_form` by
-formula, `network` by a learned correction of the formula, and `paper_network`, the baseline of Wang et al.
+Three operators compute it, behind one interface (`reflection_operator`): `reference` by quadrature, `closed_form` by
+formula, and `network` by a learned correction of the formula, compiled where there is a C compiler.
 
 By symmetry the diffuse part depends on 2 scalars (λ, n·z) and the specular part on 5 (α, λ, n·o, n·z, o·z).
 """

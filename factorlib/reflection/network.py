@@ -1,6 +1,6 @@
 """The reflection networks: each formula times the exponential of a small fully connected network.
 
-    R = closed form · exp(s · tanh(net(features) / s)),     s = 4
+    R = closed form · exp(s · tanh(net(features) / s)),     s = 8
 
 Features are smooth functions of the symmetric inputs, most of them what the formula is made of: where it expanded the
 light, how far the product is from the normal, how much is above the horizon.  A lobe sharper than the training saw keeps
@@ -27,7 +27,8 @@ from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import Operator, Response
 
 SHIPPED = Path(__file__).parent / "weights"
-LARGEST = 4.0  # of the logarithm of the correction
+FEATURES = {"diffuse": 8, "specular": 24}
+LARGEST = 8.0  # of the logarithm of the correction
 SHARPEST = 1e4  # in training
 
 
@@ -68,6 +69,8 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
     alpha = alpha.clamp(0.005, 1)
     log_width = torch.log(form.sharpness.clamp_max(2e4))
     u = form.ni / form.deviation
+    height = nz * torch.sqrt(form.sharpness)  # of the axis above the horizon, in widths of the lobe
+    mirror = form.sharpness * (1 + oz - 2 * no * nz).clamp_min(0)  # λ'(1 − z·m), m the mirror direction
     return (
         torch.log(alpha),
         log_width,
@@ -89,6 +92,10 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
         form.cosine / (form.cosine + alpha),
         form.lit,
         no / (no + alpha),
+        height * torch.rsqrt(1 + height * height),
+        height * torch.rsqrt(16 + height * height),
+        mirror / (1 + mirror),
+        mirror / (16 + mirror),
     )
 
 
@@ -111,7 +118,7 @@ class Network(Operator):
 
         super().__init__(dtype)
         folder = Path(weights) if weights is not None else SHIPPED
-        self.layers = {part: read_layers(folder / f"{part}.safetensors").to(dtype) for part in ("diffuse", "specular")}
+        self.layers = {part: read_layers(folder / f"{part}.safetensors", FEATURES[part]).to(dtype) for part in FEATURES}
         self.fused = {part: fused(part, layers) for part, layers in self.layers.items()} if dtype == torch.float32 else {}
 
     def _compiled(self, sharpness: Tensor, *others: Tensor) -> bool:
@@ -156,10 +163,14 @@ def write_layers(path: Path, layers: Layers, **metadata: str) -> None:
     path.chmod(0o644)
 
 
-def read_layers(path: Path) -> Layers:
+def read_layers(path: Path, features: int) -> Layers:
+    """The network of `features` inputs in the file `path`."""
     if not path.exists():
         raise InputError("no weights of the reflection network here", file=path, cure="make them by `make train`, or leave `weights` out")
     with safe_open(path, framework="pt") as file:
         count = sum(name.endswith(".bias") for name in file.keys())  # noqa: SIM118
         weights, biases = ([file.get_tensor(f"layer.{k}.{kind}") for k in range(count)] for kind in ("weight", "bias"))
-        return Layers(file.get_tensor("feature.mean"), file.get_tensor("feature.scale"), weights, biases)
+        layers = Layers(file.get_tensor("feature.mean"), file.get_tensor("feature.scale"), weights, biases)
+    if len(layers.mean) != features:
+        raise InputError(f"a network of {len(layers.mean)} features, not {features}", file=path, cure="make it again by `make train`")
+    return layers

@@ -50,8 +50,8 @@ def test_the_curve_falls(trained):
 
 def test_the_weights_say_their_architecture_and_can_be_used(trained):
     with safe_open(trained[0] / "specular.safetensors", framework="pt") as file:
-        assert json.loads(file.metadata()["factorlib"])["sizes"] == [20, 32, 32, 32, 1]
-    assert reflection_operator("network", weights=trained[0]).layers["specular"].weights[0].shape == (32, 20)
+        assert json.loads(file.metadata()["factorlib"])["sizes"] == [24, 32, 32, 32, 1]
+    assert reflection_operator("network", weights=trained[0]).layers["specular"].weights[0].shape == (32, 24)
 
 
 def test_shipped_weights_are_of_this_stage_and_within_the_bounds():
