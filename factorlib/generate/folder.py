@@ -19,18 +19,17 @@ from factorlib.images.focal import FILM_DIAGONAL
 from factorlib.images.transfer import srgb_encode
 
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
-JPEG_QUALITY = 95
 
 
-def write_photo(path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None) -> None:
-    """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, quality 95, EXIF focal if given)."""
+def write_photo(path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None, quality: int = 95) -> None:
+    """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, EXIF focal if given)."""
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
     encoded = srgb_encode(np.clip(radiance, 0, 1))
     kind, top = (np.uint16, 65535) if path.suffix == ".png" else (np.uint8, 255)
     attributes: dict[str, Any] = {"DateTime": FIXED_DATE, "Software": "factorlib", "oiio:ColorSpace": "sRGB"}
     if path.suffix == ".jpg":
-        attributes |= {"Compression": f"jpeg:{JPEG_QUALITY}", "jpeg:subsampling": "4:4:4"}
+        attributes |= {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"}
     if focal_35mm is not None:
         attributes["Exif:FocalLengthIn35mmFilm"] = round(focal_35mm)
     write_codes(path, (encoded * top + 0.5).astype(kind), attributes)

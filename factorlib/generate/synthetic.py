@@ -161,7 +161,7 @@ def write_shot(
     labels = folder.labels_of(labelled, camera, list(poses.values()))
     radiance = composed(shot, light, materials, meshes, poses, camera, parameters.spp, seed)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT), shot)
-    folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure)
+    folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
     folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
     folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal)
