@@ -12,7 +12,8 @@ from factorlib.align.raster import Maps
 FULL_DISTANCE = 0.01  # of the mask's extent: nearer to a contour, a small error of pose or mesh shows another place
 FULL_COSINE = 0.3  # flatter than this, a small error of shape turns the normal much
 INSIDE_OF_SHELL = 0.3  # the inside of an open shell is often another surface than the outside
-DEPTH_JUMP = 0.02  # of the object's depth range to the next pixel: one part hides another
+DEPTH_JUMP = 0.02  # of the object's depth range to the next pixel: one part may hide another,
+STEEPER = 3.0  # and does if the step is this many times that of a pixel beside it; a slanted surface goes on as it came
 
 
 def confidence(maps: Maps, evidence: Evidence) -> Float[np.ndarray, "h w"]:
@@ -39,8 +40,17 @@ def depth_jumps(maps: Maps) -> np.ndarray:
     result = np.zeros(seen.shape, bool)
     for axis in (0, 1):
         first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
-        jump = (np.abs(maps.depth[first] - maps.depth[second]) > limit) | (maps.object[first] != maps.object[second])
-        jump &= seen[first] & seen[second]
+        both = seen[first] & seen[second]
+        step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
+        jump = both & (((step > limit) & (step > STEEPER * _least_beside(step, axis))) | (maps.object[first] != maps.object[second]))
         result[first] |= jump
         result[second] |= jump
     return result
+
+
+def _least_beside(step: np.ndarray, axis: int) -> np.ndarray:
+    """The lesser of the steps before and after each along `axis`; infinite where there is neither."""
+    width = [(1, 1) if k == axis else (0, 0) for k in range(2)]
+    padded = np.pad(step, width, constant_values=np.inf)
+    size = step.shape[axis]
+    return np.minimum(np.take(padded, range(size), axis), np.take(padded, range(2, size + 2), axis))

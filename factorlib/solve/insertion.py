@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 
 from factorlib.light.lobes import lobe_integral
-from factorlib.solve.normal_equations import predicted_radiance, residuals
+from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
 from factorlib.solve.problem import Block
 from factorlib.solve.unknowns import Light, Materials
 
@@ -60,16 +60,14 @@ def _sampled_rows(block: Block, seed: int) -> np.ndarray:
 
 
 def _whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sharpness, light: Light) -> Float[np.ndarray, "3 n j"]:
-    normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
-    no, nz, oz = ((normal * view).sum(1), normal @ torch.from_numpy(axis).T, view @ torch.from_numpy(axis).T)
-    no, nz, oz = (c.to(operator.dtype) for c in (no, nz, oz))
-    lambdas = torch.from_numpy(sharpness).to(operator.dtype)
-    diffuse = operator.diffuse(lambdas, nz).double().numpy()
-    specular = np.empty_like(diffuse)
-    for m in np.unique(block.material[rows]):
-        of = torch.from_numpy(block.material[rows] == m)
-        roughness = torch.tensor(materials.roughness[m], dtype=operator.dtype)
-        specular[of.numpy()] = operator.specular(roughness, lambdas, no[of], nz[of], oz[of]).double().numpy()
+    with torch.no_grad():
+        _, lambdas, _, nz, _ = operator_inputs(block, rows, axis, sharpness, 0.5, operator)
+        diffuse = operator.diffuse(lambdas, nz).double().numpy()
+        specular = np.empty_like(diffuse)
+        for m in np.unique(block.material[rows]):
+            of = block.material[rows] == m
+            inputs = operator_inputs(block, rows[of], axis, sharpness, materials.roughness[m], operator)
+            specular[of] = operator.specular(*inputs).double().numpy()
     material = block.material[rows]
     scale = block.precision[rows] * np.exp(light.log_exposure)[block.photo[rows]][:, None]
     return np.stack([

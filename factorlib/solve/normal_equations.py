@@ -42,14 +42,11 @@ class System(msgspec.Struct, frozen=True):
     light_hessian: Float[np.ndarray, "l l"]
 
 
-def lobe_responses(block: Block, rows: slice, light: Light, roughness: float, operator):
-    """Response (see `factorlib.reflection`) of every lobe at the observations `rows`, and cosines' gradients' axes."""
-    normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
-    axis = torch.from_numpy(light.axis)
-    cosines = (normal * view).sum(1), normal @ axis.T, view @ axis.T
-    no, nz, oz = (c.to(operator.dtype) for c in cosines)
-    sharpness = torch.from_numpy(light.sharpness).to(operator.dtype)
-    return operator.response(torch.tensor(roughness, dtype=operator.dtype), sharpness, no, nz, oz)
+def operator_inputs(block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpness: Float[np.ndarray, "p"], roughness: float, operator):
+    """roughness, sharpness, n·o, n·z, o·z of lobes at the observations `rows`, as the operator takes them."""
+    normal, view, axis = (torch.from_numpy(v) for v in (block.normal[rows], block.view[rows], axis))
+    inputs = torch.tensor(roughness), torch.from_numpy(sharpness), (normal * view).sum(1), normal @ axis.T, view @ axis.T
+    return [t.to(operator.dtype) for t in inputs]
 
 
 def material_slices(block: Block) -> list[tuple[int, slice]]:
@@ -68,9 +65,10 @@ def predicted_radiance(block: Block, light: Light, materials: Materials, operato
     radiance = np.zeros_like(block.radiance)
     exposure = np.exp(light.log_exposure)[block.photo]
     for m, rows in material_slices(block):
-        response = lobe_responses(block, rows, light, materials.roughness[m], operator)
-        diffuse = response.diffuse.double().numpy() @ light.weight
-        specular = response.specular.double().numpy() @ light.weight
+        roughness, sharpness, no, nz, oz = operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[m], operator)
+        with torch.no_grad():
+            parts = operator.diffuse(sharpness, nz), operator.specular(roughness, sharpness, no, nz, oz)
+        diffuse, specular = (part.double().numpy() @ light.weight for part in parts)
         radiance[rows] = exposure[rows, None] * (materials.diffuse[m] * diffuse + materials.specular[m] * specular)
     return radiance
 
@@ -101,7 +99,7 @@ def system(block: Block, light: Light, materials: Materials, operator, loss: Los
     gradient = np.zeros(7 * m + size)
     total = 0.0
     for index, rows in material_slices(block):
-        response = lobe_responses(block, rows, light, materials.roughness[index], operator)
+        response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[index], operator))
         total += _add_rows(hessian, gradient, block, rows, light, materials, index, response, loss)
     prior, prior_gradient, prior_hessian = _prior(block, light, loss)
     weights = slice(7 * m + 3 * p, 7 * m + 6 * p)

@@ -101,6 +101,14 @@ def test_confidence_falls_at_depth_jumps():
     assert inner.sum() > 20 and sure[:, 1:][inner].max() == 0
 
 
+def test_a_small_smooth_object_keeps_its_slanted_normals():
+    caster, camera, pose = photo_of(ball(), 6, width=80, height=60)
+    maps = rasterise(caster, camera, pose)
+    sure = confidence(maps, Evidence(maps.label.astype(np.int16)))
+    slanted = (maps.edge > 0.35) & (maps.edge < 0.7)
+    assert slanted.sum() > 50 and (sure[slanted] > 0).mean() > 0.95
+
+
 def test_overlay_draws_both_contours():
     caster, camera, pose = photo_of(chair(), 7, width=80, height=60)
     maps, evidence = rasterise(caster, camera, pose), evidence_of(caster, camera, pose)
