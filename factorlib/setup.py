@@ -35,9 +35,9 @@ def main() -> None:
         return
     check_system()
     make_venv()
+    install_torch()  # first, with what it needs: the others are installed as they stand in the lock
     say("installing the pinned packages (about 400 MB, some minutes)")
     pip("install", "--no-deps", "-r", str(LOCK))
-    install_torch()
     # relative, so that the checkout can be moved; `import factorlib` then works from anywhere, notebooks too
     next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
     subprocess.run([VENV / "bin" / "python", "-c", "import open3d, torch, mitsuba, OpenImageIO, pycolmap"], check=True, cwd="/")
