@@ -102,7 +102,7 @@ def test_confidence_falls_at_depth_jumps():
 
 
 def test_a_small_smooth_object_keeps_its_slanted_normals():
-    caster, camera, pose = photo_of(ball(), 6, width=80, height=60)
+    caster, camera, pose = photo_of(mesh_of([ball()]), 6, width=80, height=60)
     maps = rasterise(caster, camera, pose)
     sure = confidence(maps, Evidence(maps.label.astype(np.int16)))
     slanted = (maps.edge > 0.35) & (maps.edge < 0.7)
