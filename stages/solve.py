@@ -4,6 +4,8 @@ Writes materials.json, lobes.parquet, exposures.json, convergence.parquet and un
 """
 
 import logging
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -67,7 +69,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
     _warn_of_gaps(materials, blocks, seen)
     operator = reflection_operator(params.operator, weights=inputs["train"])
-    joint = solve(blocks, len(materials), operator, _bundle(params), inputs.map, _to_progress(progress, params))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
+        spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
+        joint = solve(blocks, len(materials), operator, _bundle(params), spread, _to_progress(progress, params))
     _write(out, materials, blocks, joint, operator)
 
 

@@ -20,6 +20,7 @@ from factorlib.solve.insertion import lobes_inserted, pruned
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
 from factorlib.solve.problem import Block, of_rows, sampled
 from factorlib.solve.start import starting_light, starting_materials
+from factorlib.solve.unknowns import Light
 from factorlib.solve.weights import refitted_weights
 
 
@@ -116,10 +117,13 @@ def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: L
 
 
 def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
-    lights = []
-    for i, (block, light) in enumerate(zip(blocks, current.lights, strict=True)):
-        count = min(bundle.insert, bundle.lobes - len(light))
-        lights.append(lobes_inserted(block, light, current.materials, operator, count, bundle.seed + 1000 * number + i) if count > 0 else light)
+    def grown(index: int) -> Light:
+        block, light = blocks[index], current.lights[index]
+        count = bundle.lobes - len(light)
+        seed = bundle.seed + 1000 * number + index
+        return lobes_inserted(block, light, current.materials, operator, min(bundle.insert, count), seed) if count > 0 else light
+
+    lights = list(map_(grown, range(len(blocks))))
     return _refitted(blocks, evaluated(blocks, current.materials, lights, operator, loss, map_), operator, loss, map_)
 
 
