@@ -1,13 +1,13 @@
 import msgspec
 import numpy as np
 import pytest
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, solve
 from factorlib.solve.normal_equations import predicted_radiance
 from factorlib.solve.problem import connected_components
 from factorlib.stage import serial_map
+from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 QUICK = Bundle(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)

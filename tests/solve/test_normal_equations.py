@@ -1,11 +1,11 @@
 import msgspec
 import numpy as np
 import pytest
-from tests.solve.problems import MATERIALS, block, random_light
 
 from factorlib.reflection import reflection_operator
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, system
 from factorlib.solve.unknowns import Light, Materials
+from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 

@@ -3,7 +3,6 @@ import logging
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from tests.solve.problems import MATERIALS, random_light, sphere_normals
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
@@ -13,6 +12,7 @@ from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
+from tests.solve.problems import MATERIALS, random_light, sphere_normals
 
 NAMES = ("red", "green", "blue")
 
