@@ -142,7 +142,7 @@ def surroundings(
         return {"light": envmap(light), "ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
     if shot.sun:
         return lights.daylight(rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows)
-    return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180)
+    return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
 
 
 def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict[str, Any]:

@@ -59,8 +59,8 @@ def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> Things:
     return block(place, size, np.degrees(angle), vivid(rng))
 
 
-def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0) -> Things:
-    """A closed room of coloured walls with bright windows, warm lamps, pictures and furniture, none toward `clear_deg`."""
+def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> Things:
+    """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
     things = {
@@ -92,7 +92,7 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
             "emitter": {"type": "area", "radiance": rgb(warm)},
         }
     for k in range(4):
-        angle = np.radians(clear_deg + rng.uniform(75, 285))
+        angle = np.radians(clear_deg + clear_half_deg + rng.uniform(0, 1) * (360 - 2 * clear_half_deg))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
         things[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
