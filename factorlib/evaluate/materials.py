@@ -2,9 +2,10 @@
 
 Roughness     absolute difference.
 Colours       diffuse and specular, relative to the truth, after one factor per channel that all materials of a
-              connected component share, because observations cannot tell it from the light.  The factor is the one
-              that minimises the sum of squared relative errors: f = Σ r / Σ r² over r = estimate / truth, diffuse and
-              specular of the component's materials alike.  A true albedo below 0.01 counts as 0.01.
+              connected component share, because observations cannot tell it from the light.  The factor is the
+              median over the component's materials of true over estimated diffuse + specular: what one material
+              reflects in all is known best, and one bad material does not move it.  A true albedo below 0.01 counts as
+              0.01.
 Null          a grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
 """
 
@@ -91,15 +92,15 @@ def compare_materials(
 
 
 def common_factor(estimates: list[Material], truths: list[Material]) -> Vec3:
-    """The factor per channel that minimises the sum of squared relative errors.
+    """The median over materials of true over estimated diffuse + specular, per channel; 1 where nothing is reflected.
 
     >>> m = Material((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3)
     >>> common_factor([m], [Material((0.4, 0.4, 0.1), (0.2, 0.1, 0.1), 0.3)])
     (2.0, 1.0, 1.0)
     """
-    ratio = np.array([_albedos(e) / _floored(t) for e, t in zip(estimates, truths)]).reshape(-1, 3)
-    square = (ratio**2).sum(axis=0)
-    return tuple(float(v) for v in np.where(square > 0, ratio.sum(axis=0) / np.where(square > 0, square, 1), 1.0))
+    estimated, true = (np.array([_albedos(m).sum(axis=0) for m in group]) for group in (estimates, truths))
+    ratio = np.where(estimated > 0, true / np.maximum(estimated, 1e-30), 1.0)
+    return tuple(float(v) for v in np.median(ratio, axis=0))
 
 
 def _albedos(material: Material) -> Float[np.ndarray, "2 3"]:

@@ -12,6 +12,9 @@ from factorlib.errors import InputError
 from factorlib.urm.observations import Observations
 
 
+HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
+
+
 class Block(msgspec.Struct, frozen=True):
     """The n observations under one illumination, sorted by material.
 
@@ -85,11 +88,23 @@ def _block(seen: Observations, name: str, noise: Noise, held_out: float, rotatio
     scaled = radiance / unit
     sigma = np.sqrt(noise.absolute**2 + (noise.relative * scaled) ** 2)
     weight = seen.weight / (1 + seen.weight / noise.most_weight)
-    chosen = np.random.default_rng(seed).random(len(seen)) < held_out
+    chosen = _held_out(normal, view, held_out, seed)
     return Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), np.sqrt(weight)[:, None] / sigma,
         seen.material.astype(np.int64), local, chosen,
     )  # fmt: skip
+
+
+def _held_out(normal: np.ndarray, view: np.ndarray, share: float, seed: int) -> Bool[np.ndarray, "n"]:
+    """About a `share` of the observations: all whose mirror direction lies in one of randomly chosen cells.
+
+    Neighbouring pixels err alike, so single pixels would not tell a lobe that the light needs from one that explains
+    the error of a place.
+    """
+    mirror = 2 * np.sum(normal * view, axis=1, keepdims=True) * normal - view
+    cells = np.floor((mirror + 1) / HELD_OUT_CELL).astype(int) @ [1, 1_000, 1_000_000]
+    names, cell = np.unique(cells, return_inverse=True)
+    return (np.random.default_rng(seed).random(len(names)) < share)[cell.reshape(-1)]
 
 
 def _in_frame(vectors: np.ndarray, seen: Observations, rotations: Mapping) -> Float[np.ndarray, "n 3"]:
