@@ -16,7 +16,7 @@ import numpy as np
 
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.gauge import in_gauge
-from factorlib.solve.insertion import lobes_inserted, pruned
+from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
 from factorlib.solve.problem import Block, of_rows, sampled
 from factorlib.solve.start import starting_light, starting_materials
@@ -128,8 +128,9 @@ def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bun
 
 
 def _tidied(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
-    """Pruned and in gauge."""
-    materials, lights = in_gauge(current.materials, [pruned(light) for light in current.lights], blocks)
+    """Pruned, no sharper than the materials can tell, and in gauge."""
+    sharpest = sharpest_told(current.materials)
+    materials, lights = in_gauge(current.materials, [blurred(pruned(light), sharpest) for light in current.lights], blocks)
     return evaluated(blocks, materials, lights, operator, loss, map_)
 
 

@@ -22,6 +22,7 @@ from factorlib.solve.unknowns import Light, Materials
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations that vote
+RESOLVED = 16.0  # a lobe this many times as sharp as the sharpest reflection widens it by 3 %: nothing sharper can be told
 TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
 
 
@@ -47,6 +48,8 @@ def lobes_inserted(block: Block, light: Light, materials: Materials, operator, c
     rows = _sampled_rows(block, seed)
     residual = -residuals(block, predicted_radiance(block, light, materials, operator))[rows]
     axis, sharpness = dictionary()
+    told = sharpness <= max(sharpest_told(materials), sharpness.min())
+    axis, sharpness = axis[told], sharpness[told]
     atoms = _whitened_atoms(block, rows, materials, operator, axis, sharpness, light)
     chosen, weights = _pursuit(atoms, residual, axis, sharpness, count)
     return light.joined(axis[chosen], np.log(sharpness[chosen]), np.array(weights).reshape(-1, 3))
@@ -94,6 +97,18 @@ def _pursuit(atoms, residual, axis, sharpness, count: int) -> tuple[list[int], l
         apart = np.linalg.norm(axis - axis[best], axis=1)
         allowed &= (apart > width) | (np.abs(np.log(sharpness / sharpness[best])) > 1)
     return chosen, weights
+
+
+def sharpest_told(materials: Materials) -> float:
+    """The sharpness beyond which lobes reflect alike: GGX spreads a mirror direction's light by about 2α² (radians²)."""
+    return RESOLVED / (2 * float(materials.roughness.min()) ** 4)
+
+
+def blurred(light: Light, sharpest: float) -> Light:
+    """Lobes sharper than `sharpest` at that sharpness, their energy kept."""
+    log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
+    kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(log_sharpness))
+    return Light(light.axis, log_sharpness, light.weight * kept[:, None], light.log_exposure)
 
 
 def pruned(light: Light, least_share: float = 1e-5) -> Light:
