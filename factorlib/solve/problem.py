@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from factorlib.errors import InputError
 from factorlib.urm.observations import Observations
 
-
 HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
 
 
