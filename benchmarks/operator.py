@@ -25,7 +25,7 @@ OPERATORS = (
     ("network", "float64"),
     ("reference", "float64"),
 )
-SLOPES = ("roughness", "log_sharpness", "nz", "oz")
+SLOPES = ("roughness", "log_sharpness", "no", "nz", "oz")
 
 
 def errors(operator, samples) -> dict:
@@ -43,8 +43,8 @@ def gradient_errors(operator, reference, count: int = 512) -> dict:
 
 def gradients(operator, alpha, sharpness, no, nz, oz) -> list[torch.Tensor]:
     """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
-    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), nz, oz)]
-    value = operator.specular(leaves[0], leaves[1].exp(), no.to(operator.dtype), *leaves[2:])
+    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), no, nz, oz)]
+    value = operator.specular(leaves[0], leaves[1].exp(), *leaves[2:])
     return [t.detach()[:, 0].double() for t in (value, *torch.autograd.grad(value.sum(), leaves))]
 
 

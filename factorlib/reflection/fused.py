@@ -47,10 +47,10 @@ class Fused:
         self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
 
     def __call__(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
-        """Value and derivatives by roughness, log λ, n·z, o·z; [n, p], float32."""
+        """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""
         no, nz, oz = (t.detach().float().contiguous() for t in (no, nz, oz))
-        out = [torch.empty_like(nz) for _ in range(5)]
-        pointers = (ctypes.c_void_p * 5)(*(t.data_ptr() for t in out))
+        out = [torch.empty_like(nz) for _ in range(6)]
+        pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))
         lobes = _lobe_table(sharpness)
         arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
         self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
@@ -96,9 +96,9 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     result = formula * grown
     by_net = result * fade * (1 - t * t)
     seeds = [(formula, grown), (fade, result * LARGEST * t), *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns))]
-    by_alpha, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "nz", "oz", *MOMENTS)])
+    by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)])
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
-    results = (result, by_alpha, by_log_sharpness, by_nz, by_oz)
+    results = (result, by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
     places = PLACES | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
     backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
     text = (Path(__file__).parent / "kernel.c").read_text()
@@ -128,7 +128,7 @@ def compiled(part: str, features: int, width: int, depth: int):
             os.replace(made, library)
     function = ctypes.CDLL(str(library)).response
     function.restype = None
-    function.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_float, *[ctypes.c_void_p] * 7, ctypes.c_void_p * 5]
+    function.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_float, *[ctypes.c_void_p] * 7, ctypes.c_void_p * 6]
     return function
 
 

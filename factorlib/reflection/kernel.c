@@ -92,12 +92,12 @@ static void network(const float *w, const float *b, const float *wt, lanes *feat
 }
 
 /* lobes: λ, λ', t̄, v∥, v⊥ and the derivatives of all five by log λ, each [p]; out: value and its derivatives by α, log λ,
-   n·z and o·z, each [rows, p]. */
+   n·o, n·z and o·z, each [rows, p]. */
 void response(long rows, long p, float alpha, const float *lobes, const float *no_, const float *nz_, const float *oz_,
               const float *w, const float *b, const float *wt, float *const *out) {
   long size = rows * p;
   for (long start = 0; start < size; start += LANES) {
-    lanes no, nz, oz, lobe[2 * MOMENTS], formula, net, feature[FEATURES], slope[FEATURES], result[5];
+    lanes no, nz, oz, lobe[2 * MOMENTS], formula, net, feature[FEATURES], slope[FEATURES], result[6];
     long row = start / p, column = start % p;
     for (int l = 0; l < LANES; l++) {
       long at = start + l < size ? start + l : size - 1;
@@ -113,6 +113,6 @@ void response(long rows, long p, float alpha, const float *lobes, const float *n
       BACKWARD
     }
     long count = size - start < LANES ? size - start : LANES;
-    for (int k = 0; k < 5; k++) memcpy(out[k] + start, result[k], count * sizeof(float));
+    for (int k = 0; k < 6; k++) memcpy(out[k] + start, result[k], count * sizeof(float));
   }
 }

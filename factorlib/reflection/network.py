@@ -24,7 +24,7 @@ from factorlib.jsonfile import json_text
 from factorlib.reflection import diffuse as diffuse_form
 from factorlib.reflection.filtering import Filtered, filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
-from factorlib.reflection.operator import Operator, Response
+from factorlib.reflection.operator import Operator, Response, columns
 
 SHIPPED = Path(__file__).parent / "weights"
 FEATURES = {"diffuse": 8, "specular": 24}
@@ -132,7 +132,7 @@ class Network(Operator):
         """As of every operator; in float32 by compiled code, where there is a compiler."""
         if not self._compiled(sharpness.detach(), nz.detach()):
             return super().response(roughness, sharpness, no, nz, oz)
-        diffuse, _, diffuse_by_log_sharpness, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
+        diffuse, _, diffuse_by_log_sharpness, _, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
         return Response(diffuse, diffuse_by_log_sharpness, diffuse_by_nz, *self.fused["specular"](float(roughness), sharpness, no, nz, oz))
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
@@ -144,9 +144,9 @@ class Network(Operator):
         )
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
-        if roughness.ndim == 0 and self._compiled(sharpness, no, nz, oz, roughness):
+        if roughness.ndim == 0 and no.ndim == 1 and self._compiled(sharpness, no, nz, oz, roughness):
             return self.fused["specular"](float(roughness), sharpness, no, nz, oz)[0]
-        alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, no[:, None], nz, oz)
+        alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         form = filtered_specular(alpha, sharpness, no, nz, oz)
         return form.value * torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))
 

@@ -32,6 +32,7 @@ class Response(msgspec.Struct, frozen=True):
     specular: Tensor
     specular_by_roughness: Tensor
     specular_by_log_sharpness: Tensor
+    specular_by_no: Tensor
     specular_by_nz: Tensor
     specular_by_oz: Tensor
 
@@ -53,7 +54,7 @@ class Operator:
     def specular(
         self, roughness: Tensor, sharpness: Float[Tensor, "p"], no: Float[Tensor, "n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
     ) -> Float[Tensor, "n p"]:
-        """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²."""
+        """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²; every input may be [n, p] as well."""
         raise NotImplementedError
 
     def response(
@@ -71,11 +72,11 @@ class Operator:
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
         with torch.enable_grad():
             r, log_sharpness = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (roughness, sharpness.log()))
-            nz, oz = (t.detach().clone().requires_grad_() for t in (nz, oz))
+            views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (columns(no), nz, oz))
             diffuse = self.diffuse(log_sharpness.exp(), nz)
-            specular = self.specular(r, log_sharpness.exp(), no, nz, oz)
+            specular = self.specular(r, log_sharpness.exp(), views, nz, oz)
             by_diffuse = torch.autograd.grad(diffuse.sum(), [log_sharpness, nz])
-            by_specular = torch.autograd.grad(specular.sum(), [r, log_sharpness, nz, oz])
+            by_specular = torch.autograd.grad(specular.sum(), [r, log_sharpness, views, nz, oz])
         return Response(diffuse.detach(), *by_diffuse, specular.detach(), *by_specular)
 
     def __call__(self, lobes, material, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -91,6 +92,11 @@ class Operator:
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
         radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (self.specular(roughness, sharpness, no, nz, oz) @ weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
+
+
+def columns(no: Tensor) -> Tensor:
+    """n·o as it meets the lobes: [n, 1], or [n, p] as it is."""
+    return no if no.ndim == 2 else no[:, None]
 
 
 def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype: str | None = None) -> Operator:

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from factorlib.reflection.brdf import LEAST_COSINE, ggx, smith
 from factorlib.reflection.lobe import lobe_integral
-from factorlib.reflection.operator import Operator
+from factorlib.reflection.operator import Operator, columns
 
 LEVELS = (8, 12, 18, 27, 40, 60, 90, 135, 202, 303, 455)  # nodes in each direction, raised until two levels agree
 FLOOR = 1e-5  # errors are relative to S + FLOOR × the lobe's integral
@@ -45,7 +45,7 @@ class Reference(Operator):
         return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
-        scalars = torch.broadcast_tensors(roughness**2, sharpness, no[:, None], nz, oz)
+        scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
 
