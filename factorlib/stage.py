@@ -37,6 +37,7 @@ class Inputs(msgspec.Struct, frozen=True):
     photo:   name of this step's photo, None in a stage over the whole set
     map:     an ordered map over independent work
     log:     the run log (JSON lines), only for a stage that declares `logs: true`
+    unfinished: a folder that outlives a kill of this step and goes with its success; None outside the runner
     """
 
     folders: dict[str, Path]
@@ -45,6 +46,7 @@ class Inputs(msgspec.Struct, frozen=True):
     photo: str | None = None
     map: Callable = serial_map
     log: Path | None = None
+    unfinished: Path | None = None
 
     def __getitem__(self, stage: str) -> Path:
         return self.folders[stage]

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
+from factorlib.checkpoint import Checkpoint
 from factorlib.jsonfile import write_json
 from factorlib.reflection.accuracy import diffuse_table, specular_table
 from factorlib.reflection.network import write_layers
@@ -51,32 +52,40 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
     try:
-        curves = {"diffuse": _diffuse(params, out, progress), "specular": _specular(params, out, progress)}
+        curves = {"diffuse": _diffuse(params, inputs, out, progress), "specular": _specular(params, inputs, out, progress)}
     finally:
         torch.set_num_threads(threads)
     write_json(out / "accuracy.json", {part: table for part, (table, _) in curves.items()})
     _write_curves(out / "training.parquet", {part: curve for part, (_, curve) in curves.items()})
 
 
-def _specular(params: Params, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
+def _specular(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
     progress(0, 1, "specular: samples of the reference")
     seen = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
     held_out = specular_samples(params.held_out, params.seed + 1_000_003, tolerance=HELD_OUT_TOLERANCE)
     schedule = Schedule(params.steps, params.batch, params.rate, params.width, params.depth, params.seed)
     problem = specular_problem(held_out)
-    layers, curve = train(specular_problem(seen), problem, schedule, _report(progress, "specular", params.steps))
+    layers, curve = train(
+        specular_problem(seen), problem, schedule, _report(progress, "specular", params.steps), _checkpoint(inputs, "specular")
+    )
     write_layers(out / "specular.safetensors", layers, inputs="see factorlib.reflection.network.specular_features")
     return specular_table(problem.float().errors(layers), *held_out.inputs()), curve
 
 
-def _diffuse(params: Params, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
+def _diffuse(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
     seen = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
     held_out = diffuse_samples(params.held_out, params.seed + 1_000_003)
     schedule = Schedule(params.diffuse_steps, params.batch, params.rate, params.diffuse_width, params.diffuse_depth, params.seed)
     problem = diffuse_problem(held_out)
-    layers, curve = train(diffuse_problem(seen), problem, schedule, _report(progress, "diffuse", params.diffuse_steps))
+    layers, curve = train(
+        diffuse_problem(seen), problem, schedule, _report(progress, "diffuse", params.diffuse_steps), _checkpoint(inputs, "diffuse")
+    )
     write_layers(out / "diffuse.safetensors", layers, inputs="see factorlib.reflection.network.diffuse_features")
     return diffuse_table(problem.float().errors(layers), held_out.sharpness, held_out.nz), curve
+
+
+def _checkpoint(inputs: Inputs, part: str) -> Checkpoint:
+    return Checkpoint(inputs.unfinished / f"{part}.pt" if inputs.unfinished else None)
 
 
 def _report(progress: Progress, part: str, steps: int):

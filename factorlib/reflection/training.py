@@ -1,8 +1,9 @@
 """Training of the reflection networks on samples of the reference.
 
 The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at its tip; Adam, with a step that warms up and
-falls to zero by a cosine; the weights that are kept are those of the least held-out error.  Everything is seeded and the
-threads are fixed, so that the same parameters give the same bytes.
+falls to zero by a cosine; samples of large error are seen more often, since the worst case matters as the mean does.  The
+weights that are kept are those of the least held-out error, and training stops where that has long ceased to fall.
+Everything is seeded and the threads are fixed, so that the same parameters give the same bytes, killed in between or not.
 """
 
 from __future__ import annotations
@@ -15,10 +16,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from factorlib.checkpoint import Checkpoint
 from factorlib.reflection.diffuse import diffuse
 from factorlib.reflection.filtering import filtered_specular
 from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
 from factorlib.reflection.samples import DiffuseSamples, Samples
+
+POINTS = 40  # of the training curve
+PATIENCE = POINTS // 4
+HARD, REPEATED = 0.02, 20.0  # samples of this error are seen twice as often, and the worst this often
 
 
 class Schedule(msgspec.Struct, frozen=True):
@@ -69,36 +75,97 @@ class Step(msgspec.Struct, frozen=True):
     training_loss: float
     held_out_median_error: float
     held_out_p95_error: float
+    held_out_p999_error: float
+
+    def score(self) -> float:
+        """Which of two networks is better: each quantile in units of what is wanted of it."""
+        return self.held_out_median_error / 0.003 + self.held_out_p95_error / 0.02 + self.held_out_p999_error / 0.1
 
 
-def train(problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None]) -> tuple[Layers, list[Step]]:
-    """The network of least held-out error, and the curve."""
-    problem, held_out = problem.float(), held_out.float()
-    generator = torch.Generator().manual_seed(schedule.seed)
-    layers = initial_layers(problem.features, schedule, generator)
-    parameters = [*layers.weights, *layers.biases]
-    optimiser = torch.optim.Adam(parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-    slope = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda k: _rate(k, schedule.steps))
-    best, kept, curve, running = math.inf, layers, [], 0.0
-    every = max(1, schedule.steps // 40)
-    order = torch.empty(0, dtype=torch.long)
-    for step in range(1, schedule.steps + 1):
-        if len(order) < schedule.batch:
-            order = torch.randperm(len(problem.exact), generator=generator)
-        batch, order = problem.rows(order[: schedule.batch]), order[schedule.batch :]
-        loss = robust(batch.errors(layers)).mean()
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        slope.step()
-        running += (float(loss.detach()) - running) / min(step, every)
-        if step % every == 0:
-            point = _measured(step, running, layers, held_out)
-            curve.append(point)
-            report(point)
-            if (score := point.held_out_median_error + 0.1 * point.held_out_p95_error) < best:
-                best, kept = score, _copy(layers)
-    return kept, curve
+def train(
+    problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None], checkpoint: Checkpoint | None = None
+) -> tuple[Layers, list[Step]]:
+    """The network of least held-out error, and the curve; goes on from `checkpoint`, to the same bytes."""
+    run = Run(problem.float(), held_out.float(), schedule)
+    checkpoint = checkpoint or Checkpoint(None)
+    if (state := checkpoint.load()) is not None:
+        run.load_state(state)
+    while not run.finished():
+        report(run.advance())
+        checkpoint.save(run.state())
+    return run.kept, run.curve
+
+
+class Run:
+    """A training run that can be stopped between any two points of its curve."""
+
+    def __init__(self, problem: Problem, held_out: Problem, schedule: Schedule):
+        self.problem, self.held_out, self.schedule = problem, held_out, schedule
+        self.generator = torch.Generator().manual_seed(schedule.seed)
+        self.layers = initial_layers(problem.features, schedule, self.generator)
+        self.parameters = [*self.layers.weights, *self.layers.biases]
+        self.optimiser = torch.optim.Adam(self.parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+        self.order = torch.empty(0, dtype=torch.long)
+        self.kept, self.curve = self.layers, []
+        self.stretch = max(1, schedule.steps // POINTS)  # steps between two points of the curve
+
+    def finished(self) -> bool:
+        """All steps are done, or the held-out error has not fallen for a quarter of them."""
+        scores = [point.score() for point in self.curve]
+        return len(scores) >= POINTS or (len(scores) > PATIENCE and min(scores) < min(scores[-PATIENCE:]))
+
+    def advance(self) -> Step:
+        """Train to the next point of the curve."""
+        total, first = 0.0, len(self.curve) * self.stretch
+        for step in range(first, first + self.stretch):
+            for group in self.optimiser.param_groups:
+                group["lr"] = self.schedule.rate * _rate(step, self.schedule.steps)
+            loss = robust(self._batch().errors(self.layers)).mean()
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            self.optimiser.step()
+            total += float(loss.detach())
+        point = _measured(first + self.stretch, total / self.stretch, self.layers, self.held_out)
+        if all(point.score() < earlier.score() for earlier in self.curve):
+            self.kept = _copy(self.layers)
+        self.curve.append(point)
+        return point
+
+    def _batch(self) -> Problem:
+        if len(self.order) < self.schedule.batch:
+            self.order = self._reshuffled()
+        rows, self.order = self.order[: self.schedule.batch], self.order[self.schedule.batch :]
+        return self.problem.rows(rows)
+
+    def _reshuffled(self) -> Tensor:
+        """Every sample once, and those of large error up to REPEATED times more, in random order."""
+        with torch.no_grad():
+            error = self.problem.errors(self.layers).abs()
+        times = (1 + error / HARD).clamp(max=REPEATED) if self.curve else torch.ones_like(error)
+        times = torch.floor(times + torch.rand(len(error), generator=self.generator)).long()
+        rows = torch.repeat_interleave(torch.arange(len(error)), times)
+        return rows[torch.randperm(len(rows), generator=self.generator)]
+
+    def state(self) -> dict:
+        return {
+            "parameters": [p.detach() for p in self.parameters],
+            "kept": [*self.kept.weights, *self.kept.biases],
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "order": self.order,
+            "curve": [msgspec.structs.asdict(point) for point in self.curve],
+        }
+
+    def load_state(self, state: dict) -> None:
+        with torch.no_grad():
+            for parameter, value in zip(self.parameters, state["parameters"], strict=True):
+                parameter.copy_(value)
+        count = len(self.layers.weights)
+        self.kept = Layers(self.layers.mean, self.layers.scale, state["kept"][:count], state["kept"][count:])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
+        self.order = state["order"]
+        self.curve = [Step(**point) for point in state["curve"]]
 
 
 def robust(error: Tensor) -> Tensor:
@@ -124,7 +191,7 @@ def _rate(step: int, steps: int) -> float:
 def _measured(step: int, loss: float, layers: Layers, held_out: Problem) -> Step:
     with torch.no_grad():
         error = held_out.errors(layers).abs()
-    return Step(step, loss, float(error.median()), float(error.quantile(0.95)))
+    return Step(step, loss, *(float(error.quantile(q)) for q in (0.5, 0.95, 0.999)))
 
 
 def _copy(layers: Layers) -> Layers:

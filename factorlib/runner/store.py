@@ -4,6 +4,7 @@
     build/store/keys/<key>.json   {"output", "record", "files"}: what the key gave
     build/store/logs/<key>.jsonl  what making it cost and said (times and machine facts are only here)
     build/store/views/<hash>/     the results of all photos of a stage in one folder
+    build/store/unfinished/<key>/ what lets a step that was killed go on
     build/store/locks, tmp, cache
 
 A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.
@@ -38,8 +39,8 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs, self.views, self.locks, self.tmp, self.cache = (
-            root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache")
+        self.trees, self.keys, self.logs, self.views, self.locks, self.tmp, self.cache, self.unfinished = (
+            root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache", "unfinished")
         )
 
     def entry(self, key: str) -> Entry | None:

@@ -10,6 +10,7 @@ import importlib
 import json
 import logging
 import os
+import shutil
 import sys
 import time
 import traceback
@@ -123,11 +124,15 @@ def _made(task: Task, events: Events) -> str:
     module = load_stage(task.code)
     params = params_of(module, task.code)
     task.temporary.mkdir(parents=True)
-    inputs = Inputs(folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log)
+    store = Store(task.store)
+    unfinished = store.unfinished / task.key
+    inputs = Inputs(folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=unfinished)
     module.main(params, inputs, task.temporary, events.progress)
     _check_files_still(task)
     _check_made(task)
-    return Store(task.store).commit(task.key, task.record, task.temporary).output
+    output = store.commit(task.key, task.record, task.temporary).output
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return output
 
 
 def _check_files_still(task: Task) -> None:

@@ -343,3 +343,18 @@ def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machin
     write(tmp_path / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {threads: 3}"))
     assert make(project, targets=["table"]) == 0
     assert (project.build / "set" / "table" / "table.json").read_text() == value
+
+
+def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success(project):
+    write(
+        project.root / "stages" / "table.py",
+        toy.TABLE.replace(
+            "(out /",
+            'note = inputs.unfinished / "n"\n    note.parent.mkdir(parents=True, exist_ok=True)\n    seen = note.exists()\n    note.write_text("half")\n    if not seen:\n        raise RuntimeError("killed")\n    (out /',
+            1,
+        ),
+    )
+    assert make(project) != 0
+    assert len(list((project.build / "store" / "unfinished").iterdir())) == 1
+    assert make(project) == 0
+    assert not list((project.build / "store" / "unfinished").iterdir())

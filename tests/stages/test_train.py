@@ -61,3 +61,26 @@ def test_shipped_weights_are_of_this_stage_and_within_the_bounds():
     assert accuracy["specular"]["median"] < 0.003
     assert accuracy["specular"]["p95"] < 0.02
     assert accuracy["diffuse"]["p95"] < 0.005
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_training_goes_on_to_the_same_bytes(trained, tmp_path):
+    inputs = Inputs({}, unfinished=tmp_path / "unfinished")
+    points = []
+
+    def killed_at_the_last_but_one(done, total, text=""):
+        points.append(text)
+        if len(points) == 60:
+            raise Killed
+
+    (tmp_path / "out").mkdir()
+    with pytest.raises(Killed):
+        train.main(BRIEF, inputs, tmp_path / "out", killed_at_the_last_but_one)
+    before = len(points)
+    train.main(BRIEF, inputs, tmp_path / "out", lambda *_: points.append(""))
+    assert len(points) - before < 40, "it started again"
+    for path in trained[0].iterdir():
+        assert path.read_bytes() == (tmp_path / "out" / path.name).read_bytes(), path.name
