@@ -10,6 +10,7 @@ import torch
 from scipy.optimize import least_squares
 
 from factorlib.reflection.diffuse import REMAINDER, normal_mean_cosine
+from factorlib.reflection.filtering import TAIL
 from factorlib.reflection.lobe import lobe_integral, lobe_moments
 from factorlib.reflection.reference import diffuse_quadrature
 
@@ -38,20 +39,20 @@ def diffuse_remainder(orders: int = 8, powers: int = 5) -> tuple[np.ndarray, flo
     return found.reshape(orders, powers).numpy() @ even[:, ::2], float(error.max())
 
 
-def ggx_as_gaussians(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """Rates τ and weights w of 1/(1 + x)² ≈ Σ w exp(−τ x), in relative error, the tail beyond x = 100 less."""
-    x = np.concatenate([[0.0], np.logspace(-2.5, 3.0, 300)])
-    importance = np.where(x == 0, 30, 1) / (1 + x / 100)
+def ggx_as_gaussians(count: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """Rates τ and weights w of 1/(1 + x)² ≈ Σ w exp(−τ x) + 1/((1 + x)² + TAIL²), in relative error."""
+    x = np.concatenate([[0.0], np.logspace(-2.5, 7.0, 500)])
+    importance = np.where(x == 0, 30, 1)
 
     def parameters(p):
         return np.exp(np.cumsum(np.r_[p[0], np.exp(p[1:count])])), np.exp(p[count:])
 
     def residual(p):
         rate, weight = parameters(p)
-        return (np.exp(-np.outer(x, rate)) @ weight * (1 + x) ** 2 - 1) * importance
+        return ((np.exp(-np.outer(x, rate)) @ weight + 1 / ((1 + x) ** 2 + TAIL**2)) * (1 + x) ** 2 - 1) * importance
 
-    first = np.log(np.geomspace(3e-3, 5, count))
-    found = least_squares(residual, np.r_[first[0], np.log(np.diff(first)), np.log(np.geomspace(1e-5, 0.5, count))], max_nfev=20000)
+    first = np.log(np.geomspace(3 / TAIL, 5, count))
+    found = least_squares(residual, np.r_[first[0], np.log(np.diff(first)), np.log(np.geomspace(TAIL**-1.5, 0.5, count))], max_nfev=20000)
     return parameters(found.x)
 
 

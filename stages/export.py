@@ -1,6 +1,6 @@
 """What was solved, in the forms that other programs read.
 
-Writes illumination/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
+Writes illumination/<light>.exr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
 scenes/<photo>.xml with their meshes and lights, materials.mtlx and <mesh>.glb.
 """
 
@@ -12,15 +12,16 @@ import msgspec
 import numpy as np
 import OpenImageIO as oiio
 
+from factorlib.conventions import lat_long_directions
 from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
 from factorlib.export.materials import headroom_factor, materials_of_table, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import Environment, Shape, View, write_scene
-from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.jsonfile import read_json, write_json
-from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes, read_lobes, write_lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh, write_ply
@@ -53,6 +54,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_materialx(out / "materials.mtlx", materials)
     progress(1, 4, "lights")
     _write_lights(out, lobes, params)
+    _write_coverage(out, inputs["solve"], lobes, params)
     progress(2, 4, "meshes")
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
@@ -85,6 +87,16 @@ def _write_lights(out: Path, lobes: dict[str, Lobes], params: Params) -> None:
     for name, light in lobes.items():
         write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long_of_lobes(light, params.height, 2 * params.height), LAT_LONG)
         write_rgb_exr(out / "scenes" / "light" / f"{name}.exr", _mitsuba_map(light, params), LAT_LONG)
+
+
+def _write_coverage(out: Path, solved: Path, lobes: dict[str, Lobes], params: Params) -> None:
+    """Standard errors of the lights over their mean radiance, in the maps' layout; a light that was not solved has none."""
+    (out / "coverage").mkdir()
+    directions = lat_long_directions(params.height, 2 * params.height)
+    for name in lobes:
+        if (file := solved / "coverage" / f"{name}.exr").exists():
+            channels = read_exr(file)
+            write_rgb_exr(out / "coverage" / f"{name}.exr", sampled(np.stack([channels[c] for c in "RGB"], -1), directions), LAT_LONG)
 
 
 def _mitsuba_map(light: Lobes, params: Params) -> np.ndarray:

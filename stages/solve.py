@@ -1,6 +1,6 @@
 """The joint solve: from all observations, one reflectance per material and one light per illumination.
 
-Writes materials.json, lobes.parquet, exposures.json, convergence.parquet and uncertainty.json.
+Writes materials.json, lobes.parquet, exposures.json, convergence.parquet, uncertainty.json and coverage/<illumination>.exr.
 """
 
 import logging
@@ -15,10 +15,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factorlib.dataset.schema import LightSlice
+from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes, write_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, Event, Joint, solve
+from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
@@ -113,7 +115,7 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
 
 
 def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator) -> None:
-    errors, deviation = standard_errors(blocks, joint.solution, operator)
+    errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     found, components = joint.solution.materials, connected_components(blocks, len(names))
     component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
     model = {
@@ -130,6 +132,10 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
     exposures = {photo: [float(np.exp(light.log_exposure[k]))] * 3 for b, light in lights for k, photo in enumerate(b.photos)}
     write_json(out / "exposures.json", exposures)
     _write_history(out / "convergence.parquet", joint.history)
+    (out / "coverage").mkdir()
+    for block, light in lights:
+        coverage = relative_standard_errors(block, light, found, operator, joint.loss, deviation)
+        write_rgb_exr(out / "coverage" / f"{block.name}.exr", coverage, LAT_LONG)
 
 
 def _as_json(names: list[str], materials: Materials, errors: Materials | None) -> dict:

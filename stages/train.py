@@ -24,15 +24,16 @@ HELD_OUT_TOLERANCE = 1e-5  # of the reference; a tenth of the median error that 
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """samples: of the reference, to fit;  held_out: others, to measure;  tolerance: of the reference on `samples`.
+    """samples: of the reference, to fit, half as many more at grazing views;  held_out: others, to measure;
+    tolerance: of the reference on `samples`.
 
     steps, batch, rate: of Adam;  width, depth: hidden layers of the specular network;  diffuse_…: of the diffuse one.
     """
 
-    samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 262_144
+    samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 524_288
     held_out: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
     tolerance: Annotated[float, Meta(gt=0, le=0.1)] = 1e-3
-    steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 20_000
+    steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 60_000
     batch: Annotated[int, Meta(ge=64, le=1 << 16)] = 2048
     rate: Annotated[float, Meta(gt=0, le=0.1)] = 6e-3
     width: Annotated[int, Meta(ge=4, le=1024)] = 32
@@ -62,11 +63,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def _specular(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
     progress(0, 1, "specular: samples of the reference")
     seen = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
+    grazing = specular_samples(params.samples // 2, params.seed + 1, tolerance=params.tolerance, grazing=True, **WIDER)
     held_out = specular_samples(params.held_out, params.seed + 1_000_003, tolerance=HELD_OUT_TOLERANCE)
     schedule = Schedule(params.steps, params.batch, params.rate, params.width, params.depth, params.seed)
     problem = specular_problem(held_out)
     layers, curve = train(
-        specular_problem(seen), problem, schedule, _report(progress, "specular", params.steps), _checkpoint(inputs, "specular")
+        specular_problem(seen.joined(grazing)),
+        problem,
+        schedule,
+        _report(progress, "specular", params.steps),
+        _checkpoint(inputs, "specular"),
     )
     write_layers(out / "specular.safetensors", layers, inputs="see factorlib.reflection.network.specular_features")
     return specular_table(problem.float().errors(layers), *held_out.inputs()), curve

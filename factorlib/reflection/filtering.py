@@ -2,7 +2,8 @@
 
 In the plane of projected half vectors p = (h_x, h_y) (n = (0, 0, 1), o in the plane y = 0) the GGX distribution is a
 Student distribution without singularities, D = 1/(π α² (1 + k p²)²) with k = (1 − α²)/α²  (Tokuyoshi and Kaplanyan 2021),
-and a Student distribution is a mixture of normal ones, 1/(1 + x)² = ∫ τ e^{−τ(1+x)} dτ ≈ Σ w e^{−τx}.  So
+and a Student distribution is a mixture of normal ones, 1/(1 + x)² = ∫ τ e^{−τ(1+x)} dτ ≈ Σ w e^{−τx} + 1/((1 + x)² + T²), whose
+last term is the far tail, flat on the scale of any lobe that sees it.  So
 
     ∫ SG(i) D(h) di  ≈  E / (π α²) Σ w ∫ N(p; c, V) e^{−τ k p²} dp  =  E / (π α²) Σ w |I + 2τkV|^{−½} e^{−τk cᵀ(I + 2τkV)⁻¹c}   (1)
 
@@ -12,8 +13,9 @@ i* = 2(o·h*)h* − o and J = ∂i/∂p:  |i − z|² ≈ |i* + J(p − p*) − 
     V = (λ' JᵀJ)⁻¹,     c = p* + (JᵀJ)⁻¹ Jᵀz,     and a factor e^{−λ(1 − i*·z)²/2} for the part of z − i* along i*.          (2)
 
 Where the product of light and D has its weight depends on both: about the half vector of o and z if the light is the
-narrower, about p = 0 if D is.  So p* is a blend of the two by their widths, improved by one Gauss–Newton step to the
-product's mode.  There the spread of n·i says how much of the light is above the horizon, by a logistic law.
+narrower, about p = 0 if D is; where both are narrow and far apart the product has a mode at each, of which the heavier is
+taken.  So p* is a blend of the two, improved by one Gauss–Newton step to the product's mode.  The mean and spread of n·i
+there say how much of the light is above the horizon, by a logistic law.
 """
 
 from __future__ import annotations
@@ -28,16 +30,21 @@ from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 
 # (τ, w) of 1/(1 + x)² ≈ Σ w e^{−τx}: `python -m benchmarks.operator_fit` fits these
 GAUSSIANS = (
-    (0.0024845254, 1.13437788e-05),
-    (0.0105940139, 0.000135391374),
-    (0.0326024309, 0.00108677292),
-    (0.0901947617, 0.00733593392),
-    (0.237218396, 0.0422063235),
-    (0.607146685, 0.186882868),
-    (1.52835431, 0.464628301),
-    (3.83363341, 0.297674865),
+    (0.00526739272, 6.63308013e-06),
+    (0.0161784582, 0.000251757547),
+    (0.044304079, 0.00200260083),
+    (0.129553576, 0.015833542),
+    (0.378542089, 0.104991034),
+    (1.09856493, 0.426327784),
+    (3.15835381, 0.450414161),
 )
+TAIL = 200.0  # 1/((1 + x)² + TAIL²) is what is left of it beyond
 LOGISTIC = 1.702  # the logistic law of this scale is within .01 of the normal one
+LEAST_HALF = 2e-4  # |o + z|²
+LEAST_HN, LARGEST_P = 1e-3, 0.998  # (n·h)² and |p|² where h is perpendicular to n, and p* is kept from there
+SHARE = 2.0  # curvature of −log D at its peak over k, as the blend takes it
+WIDE = 0.03  # a lobe's V is no wider than 1/WIDE: p ends at the unit circle
+RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
 PEAK = 3.0  # −∂²/∂p² of the logarithm of D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
 
 
@@ -53,7 +60,7 @@ class Filtered(msgspec.Struct):
     density: Tensor  # D of (1), D(0) = 1
     spread: Tensor  # log |I + 2kV|
     distance: Tensor  # k c²
-    ni: Tensor  # n·i*
+    ni: Tensor  # mean n·i of the product
     deviation: Tensor  # of n·i
     lit: Tensor  # part of the light above the horizon
     cosine: Tensor  # mean n·i of that
@@ -74,12 +81,15 @@ def filtered(alpha: Tensor, sharpness: Tensor, lam: Tensor, along_lobe: Tensor, 
     geometry = so, no, zx, zy, nz
     px, py = _blend(k, lam, oz, *geometry)
     px, py = _mode(k, lam, px, py, *geometry)
-    xx, yy, xy, det, cx, cy, along, ni, nix, niy = _expansion(px, py, *geometry)
+    xx, yy, xy, det, cx, cy, along, ni, nix, niy = _expansion(lam, px, py, *geometry)
     cx, cy = px + cx, py + cy
     misfit = 0.5 * sharpness * (1 - along) ** 2
     density, spread = _student(k, lam, xx, yy, xy, det, cx, cy, sharpness / lam, misfit)
-    curvature = _curvature(k, px, py) / lam
-    variance = (nix * nix * (yy + curvature) + niy * niy * (xx + curvature) - 2 * nix * niy * xy) / _plus(xx, yy, det, curvature)
+    r = _curvature(k, px, py) / lam
+    total = _plus(xx, yy, det, r)
+    mx, my = _product(r, total, xx, yy, xy, cx, cy)
+    ni = ni + nix * (mx - px) + niy * (my - py)
+    variance = (nix * nix * (yy + r) + niy * niy * (xx + r) - 2 * nix * niy * xy) / total
     deviation = torch.sqrt(variance / lam + along_lobe * ni * ni + 1e-8)
     u = LOGISTIC * (ni / deviation).clamp_min(-20)
     lit = torch.sigmoid(u)
@@ -90,13 +100,16 @@ def filtered(alpha: Tensor, sharpness: Tensor, lam: Tensor, along_lobe: Tensor, 
 
 
 def _blend(k: Tensor, lam: Tensor, oz: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, Tensor]:
-    """p between n and the half vector of o and z, by the widths of light and D (isotropic)."""
+    """p between n and the half vector of o and z, by the widths and weights of light and D there (isotropic)."""
     x, y, z = so + zx, zy, no + nz
     length = torch.sqrt(x * x + y * y + z * z + 1e-6)
     x, y, z = x / length, y / length, z / length
-    variance = 1 / (lam * (2 + 2 * oz).clamp_min(4e-3))
-    tail = 1 + k * (x * x + y * y) / (1 + 2 * k * variance)
-    share = tail / (tail + k * variance)
+    variance = 1 / (lam * (2 + 2 * oz).clamp_min(LEAST_HALF))
+    square = x * x + y * y
+    tail = 1 + k * square
+    broad = 1 + SHARE * k * variance
+    chosen = torch.sigmoid((0.5 * square / variance).clamp_max(40) - 2 * torch.log(tail) + torch.log(broad))
+    share = chosen * tail / (tail + SHARE * k * variance) + (1 - chosen) / broad
     x, y, z = share * x, share * y, share * z + 1 - share
     scale = torch.rsqrt(x * x + y * y + z * z + 1e-12)
     return x * scale, y * scale
@@ -104,14 +117,18 @@ def _blend(k: Tensor, lam: Tensor, oz: Tensor, so: Tensor, no: Tensor, zx: Tenso
 
 def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, *geometry: Tensor) -> tuple[Tensor, Tensor]:
     """One Gauss–Newton step from p to the mode of light times D: (JᵀJ + r)⁻¹ JᵀJ c, kept inside the disc."""
-    xx, yy, xy, det, cx, cy, *_ = _expansion(px, py, *geometry)
+    xx, yy, xy, det, cx, cy, *_ = _expansion(lam, px, py, *geometry)
     cx, cy = px + cx, py + cy
     r = _curvature(k, px, py) / lam
-    shrink = r / _plus(xx, yy, det, r)
-    x = cx - shrink * ((yy + r) * cx - xy * cy)
-    y = cy - shrink * ((xx + r) * cy - xy * cx)
-    outside = torch.sqrt((x * x + y * y) / 0.97 + 1e-12).clamp_min(1.0)
+    x, y = _product(r, _plus(xx, yy, det, r), xx, yy, xy, cx, cy)
+    outside = torch.sqrt((x * x + y * y) / LARGEST_P + 1e-12).clamp_min(1.0)
     return x / outside, y / outside
+
+
+def _product(r: Tensor, total: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, cx: Tensor, cy: Tensor) -> tuple[Tensor, Tensor]:
+    """(JᵀJ + r)⁻¹ JᵀJ c: the mode of light about c times D about 0."""
+    shrink = r / total
+    return cx - shrink * ((yy + r) * cx - xy * cy), cy - shrink * ((xx + r) * cy - xy * cx)
 
 
 def _curvature(k: Tensor, px: Tensor, py: Tensor) -> Tensor:
@@ -123,18 +140,18 @@ def _plus(xx: Tensor, yy: Tensor, det: Tensor, r: Tensor) -> Tensor:
     return det + r * (xx + yy) + r * r
 
 
-def _expansion(px: Tensor, py: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
+def _expansion(lam: Tensor, px: Tensor, py: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
     """JᵀJ (xx, yy, xy, its determinant), its solution for Jᵀz, i·z, n·i and the derivatives of n·i, at p."""
-    hn = torch.sqrt((1 - px * px - py * py).clamp_min(1e-2))
+    hn = torch.sqrt((1 - px * px - py * py).clamp_min(LEAST_HN))
     oh = so * px + no * hn
-    oh = torch.sqrt(oh * oh + 1e-4)
     tx, ty = px / hn, py / hn
     ax, ay = so - no * tx, -no * ty  # ∂(o·h)/∂p
     # ∂i/∂p = 2 ∂(o·h)/∂p h + 2 (o·h) ∂h/∂p, halved
     xx1, xx2, xx3 = ax * px + oh, ax * py, ax * hn - oh * tx
     yy1, yy2, yy3 = ay * px, ay * py + oh, ay * hn - oh * ty
-    xx = 4 * (xx1 * xx1 + xx2 * xx2 + xx3 * xx3)
-    yy = 4 * (yy1 * yy1 + yy2 * yy2 + yy3 * yy3)
+    ridge = RIDGE + WIDE / lam
+    xx = 4 * (xx1 * xx1 + xx2 * xx2 + xx3 * xx3) + ridge
+    yy = 4 * (yy1 * yy1 + yy2 * yy2 + yy3 * yy3) + ridge
     xy = 4 * (xx1 * yy1 + xx2 * yy2 + xx3 * yy3)
     bx = 2 * (xx1 * zx + xx2 * zy + xx3 * nz)
     by = 2 * (yy1 * zx + yy2 * zy + yy3 * nz)
@@ -157,4 +174,6 @@ def _student(k, lam, xx, yy, xy, det, cx, cy, ratio, misfit) -> tuple[Tensor, Te
         inflation = 1 + f * (trace + f * determinant)
         exponent = 0.5 * f * (square + f * (trace * square - across)) / inflation
         density = density + weight * torch.exp(-(ratio * exponent + misfit).clamp_max(60)) * torch.rsqrt(inflation)
+    x = 1 + k * (square + trace)
+    density = density + torch.exp(-misfit.clamp_max(60)) / (x * x + TAIL * TAIL)
     return density, torch.log1p(2 * k * (trace + 2 * k * determinant))

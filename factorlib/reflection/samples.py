@@ -18,6 +18,8 @@ from torch import Tensor
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.reference import converged, diffuse_quadrature
 
+GRAZING = 0.3  # n·o below which most of the hard cases lie
+
 
 class Samples(msgspec.Struct, frozen=True):
     """The five scalars of the specular part and its value, float64."""
@@ -38,6 +40,9 @@ class Samples(msgspec.Struct, frozen=True):
 
     def __len__(self) -> int:
         return len(self.alpha)
+
+    def joined(self, other: Samples) -> Samples:
+        return Samples(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in self.__struct_fields__))
 
 
 class DiffuseSamples(msgspec.Struct, frozen=True):
@@ -65,12 +70,17 @@ def diffuse_samples(count: int, seed: int, *, sharpness=(0.3, 5000.0)) -> Diffus
     return DiffuseSamples(lam, nz, value)
 
 
-def specular_inputs(count: int, seed: int, *, alpha=(0.01, 1.0), sharpness=(0.3, 5000.0), least_no: float = 0.02) -> tuple[Tensor, ...]:
-    """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence."""
+def specular_inputs(
+    count: int, seed: int, *, alpha=(0.01, 1.0), sharpness=(0.3, 5000.0), least_no: float = 0.02, grazing: bool = False
+) -> tuple[Tensor, ...]:
+    """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence.
+
+    grazing: n·o log-uniform up to GRAZING instead
+    """
     u = qmc.Sobol(6, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count]
     a = alpha[0] * (alpha[1] / alpha[0]) ** u[:, 0]
     lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 1]
-    no = least_no + (1 - least_no) * u[:, 2]
+    no = least_no * (GRAZING / least_no) ** u[:, 2] if grazing else least_no + (1 - least_no) * u[:, 2]
     view = np.stack([np.sqrt(1 - no**2), 0 * no, no], 1)
     spread = 2 * np.sqrt(a**2 / 2 + 1 / lam)
     near = _turned(view * [-1, 1, 1], spread * _rayleigh(u[:, 3]), 2 * np.pi * u[:, 4])

@@ -56,10 +56,11 @@ Report = Callable[[Event], None]
 
 
 class Joint(msgspec.Struct, frozen=True):
-    """The answer, in the gauge of `solve.gauge`: materials, one light per block, and how it was reached."""
+    """The answer, in the gauge of `solve.gauge`: materials, one light per block; how it was reached, and the last loss."""
 
     solution: Solution
     history: list[Event]
+    loss: Loss
 
 
 def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
@@ -93,7 +94,7 @@ def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map
     best = evaluated(everything, best.materials, best.lights, operator, loss, map_)
     best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
     best = _tidied(everything, best, operator, loss, map_)
-    return Joint(best, history)
+    return Joint(best, history, loss)
 
 
 def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:

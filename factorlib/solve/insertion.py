@@ -50,7 +50,7 @@ def lobes_inserted(block: Block, light: Light, materials: Materials, operator, c
     axis, sharpness = dictionary()
     told = sharpness <= max(sharpest_told(materials), sharpness.min())
     axis, sharpness = axis[told], sharpness[told]
-    atoms = _whitened_atoms(block, rows, materials, operator, axis, sharpness, light)
+    atoms = whitened_atoms(block, rows, materials, operator, axis, sharpness, light)
     chosen, weights = _pursuit(atoms, residual, axis, sharpness, count)
     return light.joined(axis[chosen], np.log(sharpness[chosen]), np.array(weights).reshape(-1, 3))
 
@@ -62,7 +62,7 @@ def _sampled_rows(block: Block, seed: int) -> np.ndarray:
     return np.sort(np.random.default_rng(seed).choice(fit, SAMPLE, replace=False))
 
 
-def _whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sharpness, light: Light) -> Float[np.ndarray, "3 n j"]:
+def whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sharpness, light: Light) -> Float[np.ndarray, "3 n j"]:
     with torch.no_grad():
         _, lambdas, _, nz, _ = operator_inputs(block, rows, axis, sharpness, 0.5, operator)
         diffuse = operator.diffuse(lambdas, nz).double().numpy()

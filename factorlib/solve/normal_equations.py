@@ -13,10 +13,12 @@ from one [n, 4p] block per channel rather than from a sparse [3n, 6p] Jacobian.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from factorlib.solve.problem import Block
 from factorlib.solve.unknowns import Light, Materials
@@ -32,7 +34,10 @@ class Loss(msgspec.Struct, frozen=True):
 
 
 class System(msgspec.Struct, frozen=True):
-    """Gauss–Newton system of one illumination: gradient and Hessian blocks of materials (m) and light (l)."""
+    """Gauss–Newton system of one illumination: gradient and Hessian blocks of materials (m) and light (l).
+
+    scores: the gradient's part from each cluster of observations, where clusters were asked for
+    """
 
     loss: float
     material_gradient: Float[np.ndarray, "7m"]
@@ -40,6 +45,7 @@ class System(msgspec.Struct, frozen=True):
     material_hessian: Float[np.ndarray, "7m 7m"]
     cross_hessian: Float[np.ndarray, "7m l"]
     light_hessian: Float[np.ndarray, "l l"]
+    scores: Float[np.ndarray, "k 7m+l"] | None = None
 
 
 def operator_inputs(block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpness: Float[np.ndarray, "p"], roughness: float, operator):
@@ -91,26 +97,58 @@ def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: L
     return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0]
 
 
-def system(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> System:
-    """Loss, gradient and Gauss–Newton Hessian of one illumination (all of Σ r², without the factor 2)."""
+def system(
+    block: Block, light: Light, materials: Materials, operator, loss: Loss, clusters: Int[np.ndarray, "n"] | None = None
+) -> System:
+    """Loss, gradient and Gauss–Newton Hessian of one illumination (all of Σ r², without the factor 2).
+
+    clusters: number of each observation's cluster, from 0, for `System.scores`
+    """
     p, f, m = len(light), len(light.log_exposure), len(materials)
     size = 6 * p + f - 1
     hessian = np.zeros((7 * m + size, 7 * m + size))
     gradient = np.zeros(7 * m + size)
+    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, 7 * m + size))
     total = 0.0
     for index, rows in material_slices(block):
         response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[index], operator))
-        total += _add_rows(hessian, gradient, block, rows, light, materials, index, response, loss)
+        own = None if clusters is None else (scores, clusters[rows])
+        total += _add_rows(hessian, gradient, own, block, rows, light, materials, index, response, loss)
     prior, prior_gradient, prior_hessian = _prior(block, light, loss)
     weights = slice(7 * m + 3 * p, 7 * m + 6 * p)
     gradient[weights] += prior_gradient
     hessian[weights, weights] += prior_hessian
     k = 7 * m
-    return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:])
+    return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:], scores)
 
 
-def _add_rows(hessian, gradient, block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> float:
+def _add_rows(hessian, gradient, scores, block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> float:
     """Add the rows of one material; returns their loss."""
+    total = 0.0
+    for channel in whitened_rows(block, rows, light, materials, m, response, loss):
+        total += channel.loss
+        places, scaled, residual = channel.places, channel.jacobian, channel.residual
+        hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
+        gradient[places] += (scaled.T @ residual).numpy()
+        if scores is not None:
+            np.add.at(scores[0], (scores[1][:, None], places[None]), (scaled * residual[:, None]).numpy())
+    return total
+
+
+class Channel(msgspec.Struct, frozen=True):
+    """One channel of n rows, whitened and weighted so that a least-squares step on it is one of the robust loss.
+
+    places: which unknowns (materials first, then the light's) the k columns of the Jacobian are
+    """
+
+    places: Int[np.ndarray, "k"]
+    jacobian: Float[torch.Tensor, "n k"]
+    residual: Float[torch.Tensor, "n"]
+    loss: float
+
+
+def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> Iterator[Channel]:
+    """The three channels of rows of material m; rows that are held out weigh nothing."""
     p, first = len(light), 7 * len(materials)
     exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
     normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
@@ -120,8 +158,7 @@ def _add_rows(hessian, gradient, block: Block, rows: slice, light: Light, materi
     weight = torch.from_numpy(light.weight)
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
     photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure))[:, 1:].double()
-    geometry = slice(first, first + 3 * p)
-    total = 0.0
+    geometry, exposures = np.arange(first, first + 3 * p), np.arange(first + 6 * p, first + 6 * p + len(light.log_exposure) - 1)
     for c in range(3):
         kd, ks = materials.diffuse[m, c], materials.specular[m, c]
         basis = kd * r["diffuse"] + ks * r["specular"]
@@ -134,15 +171,14 @@ def _add_rows(hessian, gradient, block: Block, rows: slice, light: Light, materi
         jacobian = torch.cat([*columns, photos * predicted[:, None], torch.stack(own, 1)], 1)
         precision = torch.from_numpy(block.precision[rows, c])
         difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
-        residual = torch.where(torch.from_numpy(block.clipped[rows, c]) & (difference > 0), 0.0, difference)
+        satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
+        residual = torch.where(satisfied, 0.0, difference)
         root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
-        total += float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
-        pull = fit / root * (residual != 0)
-        scaled = jacobian * (precision * pull.sqrt())[:, None]
-        places = np.r_[geometry, first + (3 + c) * p : first + (4 + c) * p, first + 6 * p : len(gradient), 7 * m + c, 7 * m + 3 + c, 7 * m + 6]
-        hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
-        gradient[places] += (scaled.T @ (residual * pull.sqrt())).numpy()
-    return total
+        pull = (fit / root * ~satisfied).sqrt()
+        weights = np.arange(first + (3 + c) * p, first + (4 + c) * p)
+        places = np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6]])
+        lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
+        yield Channel(places, jacobian * (precision * pull)[:, None], residual * pull, lost)
 
 
 def _prior(block: Block, light: Light, loss: Loss):

@@ -100,10 +100,14 @@ def _held_out(normal: np.ndarray, view: np.ndarray, share: float, seed: int) -> 
     Neighbouring pixels err alike, so single pixels would not tell a lobe that the light needs from one that explains
     the error of a place.
     """
-    mirror = 2 * np.sum(normal * view, axis=1, keepdims=True) * normal - view
-    cells = np.floor((mirror + 1) / HELD_OUT_CELL).astype(int) @ [1, 1_000, 1_000_000]
-    names, cell = np.unique(cells, return_inverse=True)
+    names, cell = np.unique(mirror_cells(normal, view, HELD_OUT_CELL), return_inverse=True)
     return (np.random.default_rng(seed).random(len(names)) < share)[cell.reshape(-1)]
+
+
+def mirror_cells(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n"]:
+    """A name of the cell, a cube of `size` cut by the unit sphere, in which each observation's mirror direction lies."""
+    mirror = 2 * np.sum(normal * view, axis=1, keepdims=True) * normal - view
+    return np.floor((mirror + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
 
 
 def _in_frame(vectors: np.ndarray, seen: Observations, rotations: Mapping) -> Float[np.ndarray, "n 3"]:

@@ -34,17 +34,17 @@ def damped_step(systems: Sequence[System], materials: Materials, lights: Sequenc
     gradient = np.sum([s.material_gradient for s in systems], axis=0)
     hessian = np.sum([s.material_hessian for s in systems], axis=0)
     free = ~held_materials(materials, gradient)
-    reduced, right = _damped(hessian, damping), -gradient
+    reduced, right = damped(hessian, damping), -gradient
     eliminated = []
     for s, light in zip(systems, lights, strict=True):
         loose = ~held_unknowns(light, s.light_gradient)
-        factor = cho_factor(_masked(_damped(s.light_hessian, damping), loose), check_finite=False)
+        factor = cho_factor(masked(damped(s.light_hessian, damping), loose), check_finite=False)
         cross = s.cross_hessian * loose
         solved = cho_solve(factor, np.column_stack([cross.T, s.light_gradient * loose]), check_finite=False)
         reduced -= cross @ solved[:, :-1]
         right += cross @ solved[:, -1]
         eliminated.append((solved, loose))
-    by_material = np.linalg.solve(_masked(reduced, free), np.where(free, right, 0.0))
+    by_material = np.linalg.solve(masked(reduced, free), np.where(free, right, 0.0))
     by_light = [-(solved[:, -1] + solved[:, :-1] @ by_material) * loose for solved, loose in eliminated]
     return Step(by_material, by_light)
 
@@ -54,7 +54,7 @@ def schur_complement(systems: Sequence[System], materials: Materials, lights: Se
     reduced = np.sum([s.material_hessian for s in systems], axis=0)
     for s, light in zip(systems, lights, strict=True):
         loose = ~held_unknowns(light, s.light_gradient)
-        factor = cho_factor(_masked(_damped(s.light_hessian, 1e-9), loose), check_finite=False)
+        factor = cho_factor(masked(damped(s.light_hessian, 1e-9), loose), check_finite=False)
         cross = s.cross_hessian * loose
         reduced = reduced - cross @ cho_solve(factor, cross.T, check_finite=False)
     return (reduced + reduced.T) / 2
@@ -81,13 +81,13 @@ def held_unknowns(light: Light, gradient: Float[np.ndarray, "l"]) -> Bool[np.nda
     return held
 
 
-def _damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
+def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
     diagonal = np.diag(hessian)
     floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
     return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
 
 
-def _masked(matrix: Float[np.ndarray, "k k"], kept: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+def masked(matrix: Float[np.ndarray, "k k"], kept: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
     """Rows and columns that are not kept become those of the identity (scaled as the rest)."""
     scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
     masked = matrix * np.outer(kept, kept)

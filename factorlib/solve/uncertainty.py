@@ -1,4 +1,15 @@
-"""Standard errors of the materials, from the Schur-complemented normal equations in a fixed gauge.
+"""Standard errors of the materials, honest about what the model cannot say, in a fixed gauge.
+
+With all lights eliminated, S is the materials' information and s_k the score of cluster k of observations: its part of
+the gradient, less what the lights take up of it.  Were residuals independent noise, the covariance would be σ² S⁻¹.
+They are not: where a light has fewer lobes than it has features, or normals are wrong, neighbouring pixels err alike.
+The sandwich
+
+    S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                     (1)
+
+lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  A cluster is what one light
+sends toward nearby mirror directions: a region of the light, whose bias all materials there share.  The larger variance
+of both is taken, unknown by unknown.
 
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
 Here the sum of diffuse and specular reflectance over a component's materials is held in each channel: with g the
@@ -10,37 +21,64 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.solve.normal_equations import predicted_radiance, residuals
-from factorlib.solve.problem import Block, connected_components
-from factorlib.solve.step import schur_complement
+from factorlib.solve.normal_equations import Loss, System, predicted_radiance, residuals, system
+from factorlib.solve.problem import Block, connected_components, mirror_cells
+from factorlib.solve.step import damped, held_unknowns, masked, schur_complement
 from factorlib.solve.unknowns import Light, Materials
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 CONDITION = 1e-10  # smaller eigenvalues of the scaled information are directions the data do not see
+CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
-def standard_errors(blocks: Sequence[Block], solution, operator) -> tuple[Materials, float]:
+def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> tuple[Materials, float]:
     """Standard error of every material unknown, and the residual's standard deviation in units of the noise model.
 
-    solution: a `descent.Solution`, whose systems hold the normal equations
+    solution: a `descent.Solution` of these blocks;  loss: that it minimises
     """
-    materials = solution.materials
-    sigma = residual_deviation(blocks, materials, solution.lights, operator)
-    covariance = _pseudo_inverse(schur_complement(solution.systems, materials, solution.lights)) * sigma**2
-    for members, _ in connected_components(blocks, len(materials)):
-        for channel in range(3):
-            project = _gauge_projection(materials, members, channel)
-            covariance = project @ covariance @ project.T
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(-1, 7)
+    materials, lights = solution.materials, solution.lights
+    sigma = residual_deviation(blocks, materials, lights, operator)
+    systems = [
+        system(block, light, materials, operator, loss, clusters_of(block)) for block, light in zip(blocks, lights, strict=True)
+    ]
+    inverse = _pseudo_inverse(schur_complement(systems, materials, lights))
+    scores = np.vstack([reduced_scores(s, light) for s, light in zip(systems, lights, strict=True)])
+    count = max(len(scores), 2)
+    sandwich = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
+    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in (inverse * sigma**2, sandwich)]
+    errors = np.sqrt(np.maximum(*variances).clip(0)).reshape(-1, 7)
     return Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma
+
+
+def clusters_of(block: Block) -> Int[np.ndarray, "n"]:
+    """The number of each observation's cluster."""
+    return np.unique(mirror_cells(block.normal, block.view, CLUSTER), return_inverse=True)[1].reshape(-1)
+
+
+def reduced_scores(s: System, light: Light) -> Float[np.ndarray, "k 7m"]:
+    """Scores with this light eliminated."""
+    m = len(s.material_gradient)
+    loose = ~held_unknowns(light, s.light_gradient)
+    factor = cho_factor(masked(damped(s.light_hessian, 1e-9), loose), check_finite=False)
+    return s.scores[:, :m] - (s.scores[:, m:] * loose) @ cho_solve(factor, (s.cross_hessian * loose).T, check_finite=False)
 
 
 def residual_deviation(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator) -> float:
     """Robust standard deviation of the whitened residuals."""
     every = [residuals(b, predicted_radiance(b, light, materials, operator)) for b, light in zip(blocks, lights, strict=True)]
     return 1.4826 * float(np.median(np.abs(np.concatenate(every))))
+
+
+def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]) -> Float[np.ndarray, "k k"]:
+    """The covariance where the sum of each component and channel is held."""
+    for members, _ in connected_components(blocks, len(materials)):
+        for channel in range(3):
+            project = _gauge_projection(materials, members, channel)
+            covariance = project @ covariance @ project.T
+    return covariance
 
 
 def _gauge_projection(materials: Materials, members: Sequence[int], channel: int) -> Float[np.ndarray, "7m 7m"]:
