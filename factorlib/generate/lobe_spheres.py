@@ -1,6 +1,7 @@
 """Pixels of rendered spheres, each sphere of one material in the light of one lobe: what the paper's network learns from.
 
-Scene    A unit sphere before the camera at `DISTANCE`, in the camera frame (OpenCV), which is Mitsuba's world here.
+Scene    A unit sphere seen from afar, so that every pixel's view is (0, 0, −1), in the camera frame (OpenCV), which is
+         Mitsuba's world here.
 Light    A unit lobe exp(λ(ω·z − 1)) as an `envmap` turned so that its pole lies along z: the map is then a function of
          its row alone, and `MAP_ROWS` rows of a few columns hold the sharpest lobe.
 Pixels   Single rays, not squares: the light of a sharp lobe on a glossy sphere changes within a pixel of any small image.
@@ -20,7 +21,6 @@ from factorlib.conventions import FRONT, alpha_of_roughness
 from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.generate.tracing import SAMPLER, rgb, rigid, transform
 
-DISTANCE = 5.0  # of the sphere's centre, in radii
 MAP_ROWS, MAP_COLUMNS = 2048, 8
 SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
 LEAST_COSINE = 0.01  # n·o of a pixel
@@ -38,10 +38,9 @@ class Spheres(msgspec.Struct, frozen=True):
 
 
 class Pixels(msgspec.Struct, frozen=True):
-    """Pixels of spheres [n, m]: unit vectors of the camera frame, and the radiance at unit reflectance and unit weight."""
+    """Pixels of spheres [n, m]: unit normals in the camera frame, and the radiance at unit reflectance and unit weight."""
 
     normal: Float[np.ndarray, "n m 3"]
-    view: Float[np.ndarray, "n m 3"]
     diffuse: Float[np.ndarray, "n m"]
     specular: Float[np.ndarray, "n m"]
 
@@ -61,14 +60,9 @@ def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator, progress: 
         light, sensor = _envmap(axis, sharpness), _sensor(normal)
         matte = {"type": "diffuse", "reflectance": rgb(1.0)}
         gloss = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha_of_roughness(roughness))}
-        rows.append((normal, view_of_normal(normal), *(_radiance(bsdf, light, sensor, k) for bsdf in (matte, gloss))))
+        rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (matte, gloss))))
         progress(k + 1, len(spheres.axis))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
-
-
-def view_of_normal(normal: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """Unit directions toward the camera, from the sphere's points of these normals."""
-    return -_unit(normal - DISTANCE * FRONT)
 
 
 def _normals(axis, sharpness: float, alpha: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
@@ -80,7 +74,7 @@ def _normals(axis, sharpness: float, alpha: float, count: int, rng: np.random.Ge
     angle, radius = rng.uniform(0, 2 * np.pi, 4 * count), np.sqrt(rng.uniform(0, 1, 4 * count))
     even = np.stack([radius * np.cos(angle), radius * np.sin(angle), -np.sqrt(1 - radius**2)], axis=-1)
     highlight = _unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
-    even, highlight = (n[np.sum(n * view_of_normal(n), axis=-1) > LEAST_COSINE] for n in (even, _unit(highlight)))
+    even, highlight = (n[n @ FRONT > LEAST_COSINE] for n in (even, _unit(highlight)))
     half = min(count // 2, len(highlight))  # none is seen of a light right behind the sphere
     return np.concatenate([even[: count - half], highlight[:half]])
 
@@ -99,22 +93,16 @@ def _envmap(axis: Float[np.ndarray, "3"], sharpness: float):
 
 
 def _sensor(normal: Float[np.ndarray, "m 3"]):
-    """One ray a pixel, from the camera to the sphere's points of these normals, side by side in an image of one row."""
-    rays = -view_of_normal(normal)
+    """One ray a pixel, toward the sphere's points of these normals, side by side in an image of one row."""
     film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    one = film | {"width": 1}
-    meters = {
-        f"ray{k:05d}": {"type": "radiancemeter", "origin": [0.0] * 3, "direction": [float(c) for c in ray], "film": one}
-        for k, ray in enumerate(rays)
-    }
-    return mitsuba().load_dict(
-        {"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **meters}, parallel=False
-    )
+    ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
+    rays = {f"ray{k:05d}": ray | {"origin": (point + FRONT).tolist()} for k, point in enumerate(normal)}
+    return mitsuba().load_dict({"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False)
 
 
 def _radiance(bsdf, light, sensor, seed: int) -> Float[np.ndarray, "m"]:
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
-    ball = mi.load_dict({"type": "sphere", "center": [float(c) for c in -DISTANCE * FRONT], "radius": 1.0, "bsdf": bsdf})
+    ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}, parallel=False)
     return np.array(mi.render(scene, seed=seed, spp=SPP), dtype=np.float64)[0, :, 0]
