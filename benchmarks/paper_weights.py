@@ -17,60 +17,45 @@ from factorlib.conventions import FRONT, half_of_normal_and_view
 from factorlib.generate.lobe_spheres import Pixels, Spheres, random_spheres, rendered
 from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
-from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import SHIPPED, write_layers
 from factorlib.reflection.paper_network import diffuse_inputs, specular_inputs
+from factorlib.reflection.paper_training import Examples, trained
 from factorlib.reflection.samples import diffuse_samples, specular_samples
-from factorlib.reflection.training import Problem, Schedule, Step, train
+from factorlib.reflection.training import Schedule
 
-SPHERES, HELD_OUT, PIXELS = 4000, 200, 50
+SPHERES, PIXELS = 4000, 50
 SCHEDULES = {
     "diffuse": Schedule(steps=8000, batch=1024, rate=2e-3, width=288, depth=2, seed=0),
     "specular": Schedule(steps=24_000, batch=1024, rate=2e-3, width=288, depth=3, seed=0),
 }
 
 
-def main(folder: Path = SHIPPED, spheres: int = SPHERES, held_out: int = HELD_OUT, schedules: dict[str, Schedule] = SCHEDULES) -> None:
+def main(folder: Path = SHIPPED, spheres: int = SPHERES, schedules: dict[str, Schedule] = SCHEDULES) -> None:
     """Render, train and write into `folder`."""
     torch.set_num_threads(1)  # sums depend on it
-    seen, others = (problems(count, seed) for count, seed in ((spheres, 0), (held_out, 1)))
-    for part, schedule in schedules.items():
+    rng, start = np.random.default_rng(0), time.process_time()
+    light = random_spheres(rng, spheres)
+    pixels = rendered(light, PIXELS, rng)
+    print(f"{spheres} spheres rendered in {time.process_time() - start:.0f} s of a core", flush=True)
+    for part, examples in examples_of_pixels(light, pixels).items():
         start = time.process_time()
-        layers, _ = train(seen[part], others[part], schedule, _report(part))
+        layers = trained(
+            examples, schedules[part], lambda step, error, part=part: print(f"{part}: step {step}, error {error:.2%}", flush=True)
+        )
         print(f"{part}: trained in {time.process_time() - start:.0f} s of a core", flush=True)
         write_layers(folder / f"paper_{part}.safetensors", layers, torch.float16, inputs="see factorlib.reflection.paper_network")
 
 
-def _report(part: str):
-    def report(point: Step) -> None:
-        print(f"{part}: step {point.step}, held-out error {point.held_out_median_error:.2%} (median)", flush=True)
-
-    return report
-
-
-def problems(spheres: int, seed: int) -> dict[str, Problem]:
-    """Fits of both networks to pixels of so many spheres; the formula that they correct is the lobe's integral alone."""
-    rng, start = np.random.default_rng(seed), time.process_time()
-    light = random_spheres(rng, spheres)
-    pixels = rendered(light, PIXELS, rng)
-    print(f"{spheres} spheres rendered in {time.process_time() - start:.0f} s of a core", flush=True)
-    return problems_of_pixels(light, pixels)
-
-
-def problems_of_pixels(light: Spheres, pixels: Pixels) -> dict[str, Problem]:
+def examples_of_pixels(light: Spheres, pixels: Pixels) -> dict[str, Examples]:
+    """What each of the two networks is to learn, in the camera frame."""
     half = half_of_normal_and_view(pixels.normal, FRONT)
     each = (light.axis[:, None], light.sharpness[:, None], light.roughness[:, None])
     axis, sharpness, roughness = (np.broadcast_to(t, (*pixels.normal.shape[:2], *t.shape[2:])) for t in each)
     normal, half, axis = (tuple(_flat(v[..., k]) for k in range(3)) for v in (pixels.normal, half, axis))
     sharpness, roughness = _flat(sharpness), _flat(roughness)
-    energy = lobe_integral(sharpness)
-
-    def problem(inputs: torch.Tensor, value: torch.Tensor) -> Problem:
-        return Problem(inputs, sharpness, energy, value, value + energy / 100)
-
     return {
-        "diffuse": problem(diffuse_inputs(normal, axis, sharpness), _flat(pixels.diffuse)),
-        "specular": problem(specular_inputs(normal, half, axis, sharpness, roughness), _flat(pixels.specular)),
+        "diffuse": Examples(diffuse_inputs(normal, axis, sharpness), sharpness, _flat(pixels.diffuse)),
+        "specular": Examples(specular_inputs(normal, half, axis, sharpness, roughness), sharpness, _flat(pixels.specular)),
     }
 
 
