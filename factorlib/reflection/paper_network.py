@@ -24,7 +24,8 @@ Training      `paper_training`: relative error, Adam.
 Frame         normals and lobes of every azimuth about the camera's axis, as in photographs.  An operator is asked for
               scalars only, so the networks are asked in the frame where the view is (0, 0, −1) and the normal in the
               plane y = 0, or, for the diffuse part, where the normal is (0, 0, −1).  To have seen that azimuth alone
-              would more than halve the specular error (a median of 1.9 % fell to 0.8 %): the price of the symmetry.
+              would more than halve the specular error (in runs half as long, a median of 1.9 % fell to 0.8 %): the price
+              of the symmetry.
 
 `python -m benchmarks.paper_weights` makes the weights again; paper_accuracy.json beside them says what they reach.
 """
