@@ -14,7 +14,7 @@ import typer
 
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator
-from factorlib.reflection.accuracy import quantiles, specular_table
+from factorlib.reflection.accuracy import diffuse_table, quantiles, specular_table
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import diffuse_samples, specular_inputs, specular_samples
 
@@ -23,6 +23,7 @@ OPERATORS = (
     ("closed_form", "float64"),
     ("network", "float32"),
     ("network", "float64"),
+    ("paper_network", "float32"),
     ("reference", "float64"),
 )
 SLOPES = ("roughness", "log_sharpness", "no", "nz", "oz")
@@ -33,6 +34,13 @@ def errors(operator, samples) -> dict:
     with torch.no_grad():
         value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0]
     return specular_table((value.double() - samples.value) / samples.scale(), *samples.inputs())
+
+
+def diffuse_errors(operator, samples) -> dict:
+    sharpness, nz = (t.to(operator.dtype)[:, None] for t in (samples.sharpness, samples.nz))
+    with torch.no_grad():
+        value = operator.diffuse(sharpness, nz)[:, 0]
+    return diffuse_table((value.double() - samples.value) / samples.scale(), samples.sharpness, samples.nz)
 
 
 def gradient_errors(operator, reference, count: int = 512) -> dict:
@@ -76,12 +84,8 @@ def main(samples: Annotated[int, typer.Option(help="of the reference")] = 16384)
         operator = reflection_operator(name, dtype=dtype)
         row = table[f"{name} {dtype}"] = {"microseconds": microseconds(operator, 8 if name == "reference" else 2048)}
         if name != "reference":
-            with torch.no_grad():
-                value = operator.diffuse(diffuse.sharpness[:, None].to(operator.dtype), diffuse.nz[:, None].to(operator.dtype))[
-                    :, 0
-                ].double()
             row |= {"specular": errors(operator, specular), "gradients": gradient_errors(operator, reference)}
-            row["diffuse"] = quantiles((value - diffuse.value) / diffuse.scale())
+            row["diffuse"] = diffuse_errors(operator, diffuse)
     print(json_text(table), end="")
 
 

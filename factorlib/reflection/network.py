@@ -151,15 +151,15 @@ class Network(Operator):
         return form.value * torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))
 
 
-def write_layers(path: Path, layers: Layers, **metadata: str) -> None:
-    """Weights as safetensors; the metadata say the architecture."""
+def write_layers(path: Path, layers: Layers, dtype: torch.dtype = torch.float32, **metadata: str) -> None:
+    """Weights as safetensors, rounded to `dtype`; the metadata say the architecture."""
     tensors = {"feature.mean": layers.mean, "feature.scale": layers.scale}
     for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
         tensors |= {f"layer.{k}.weight": weight, f"layer.{k}.bias": bias}
     sizes = [layers.weights[0].shape[1], *(len(b) for b in layers.biases)]
     about = {"architecture": "standardise, linear, SiLU, …, linear", "sizes": sizes, **metadata}
     one_key = {"factorlib": json_text(about)}  # safetensors writes several in an order that changes from run to run
-    save_file({name: t.detach().float().contiguous() for name, t in tensors.items()}, path, metadata=one_key)
+    save_file({name: t.detach().to(dtype).contiguous() for name, t in tensors.items()}, path, metadata=one_key)
     path.chmod(0o644)
 
 

@@ -13,12 +13,13 @@ from torch import Tensor
 
 from factorlib.errors import InputError, did_you_mean
 
-Name = Literal["reference", "closed_form", "network"]
+Name = Literal["reference", "closed_form", "network", "paper_network"]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 MODULES = {
     "reference": ("reference", "Reference"),
     "closed_form": ("closed_form", "ClosedForm"),
     "network": ("network", "Network"),
+    "paper_network": ("paper_network", "PaperNetwork"),
 }
 CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
 

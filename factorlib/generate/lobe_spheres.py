@@ -1,0 +1,108 @@
+"""Pixels of rendered spheres, each sphere of one material in the light of one lobe: what the paper's network learns from.
+
+Scene    A unit sphere seen from afar, so that every pixel's view is (0, 0, −1), in the camera frame (OpenCV), which is
+         Mitsuba's world here.
+Light    A unit lobe exp(λ(ω·z − 1)) as an `envmap` turned so that its pole lies along z: the map is then a function of
+         its row alone, and `MAP_ROWS` rows of a few columns hold the sharpest lobe.
+Pixels   Single rays, not squares: the light of a sharp lobe on a glossy sphere changes within a pixel of any small image.
+         Half of them are spread evenly over the sphere's disc, half about its highlight.
+Material Reflectances of 1: the model is linear in them, and its colour channels are independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.conventions import FRONT, alpha_of_roughness
+from factorlib.generate.mitsuba_variant import mitsuba
+from factorlib.generate.tracing import SAMPLER, rgb, rigid, transform
+
+MAP_ROWS, MAP_COLUMNS = 2048, 8
+SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
+LEAST_COSINE = 0.01  # n·o of a pixel
+ALPHA, SHARPNESS = (0.008, 1.0), (0.05, 1e4)  # log-uniform
+
+Progress = Callable[[int, int], None]
+
+
+class Spheres(msgspec.Struct, frozen=True):
+    """n spheres: the lobe's axis (camera frame, unit) and sharpness, the material's roughness."""
+
+    axis: Float[np.ndarray, "n 3"]
+    sharpness: Float[np.ndarray, "n"]
+    roughness: Float[np.ndarray, "n"]
+
+
+class Pixels(msgspec.Struct, frozen=True):
+    """Pixels of spheres [n, m]: unit normals in the camera frame, and the radiance at unit reflectance and unit weight."""
+
+    normal: Float[np.ndarray, "n m 3"]
+    diffuse: Float[np.ndarray, "n m"]
+    specular: Float[np.ndarray, "n m"]
+
+
+def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
+    """Axes uniform on the sphere, α and λ log-uniform."""
+    axis = _unit(rng.standard_normal((count, 3)))
+    alpha, sharpness = (np.exp(rng.uniform(*np.log(limits), count)) for limits in (ALPHA, SHARPNESS))
+    return Spheres(axis, sharpness, np.sqrt(alpha))
+
+
+def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator, progress: Progress = lambda done, total: None) -> Pixels:
+    """`pixels` random pixels of each sphere, by Mitsuba; equal generators give equal bytes on one machine."""
+    rows = []
+    for k, (axis, sharpness, roughness) in enumerate(zip(spheres.axis, spheres.sharpness, spheres.roughness, strict=True)):
+        normal = _normals(axis, sharpness, alpha_of_roughness(roughness), pixels, rng)
+        light, sensor = _envmap(axis, sharpness), _sensor(normal)
+        matte = {"type": "diffuse", "reflectance": rgb(1.0)}
+        gloss = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha_of_roughness(roughness))}
+        rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (matte, gloss))))
+        progress(k + 1, len(spheres.axis))
+    return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _normals(axis, sharpness: float, alpha: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+    """Normals that the camera sees, the even ones and those of the highlight in turn.
+
+    A normal's change turns the mirror direction twice as much: the highlight's are spread by √(α²/2 + 1/λ), half of what
+    `factorlib.reflection.samples` spreads lobes by.
+    """
+    angle, radius = rng.uniform(0, 2 * np.pi, 4 * count), np.sqrt(rng.uniform(0, 1, 4 * count))
+    even = np.stack([radius * np.cos(angle), radius * np.sin(angle), -np.sqrt(1 - radius**2)], axis=-1)
+    highlight = _unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
+    even, highlight = (n[n @ FRONT > LEAST_COSINE] for n in (even, _unit(highlight)))
+    half = min(count // 2, len(highlight))  # none is seen of a light right behind the sphere
+    return np.concatenate([even[: count - half], highlight[:half]])
+
+
+def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _envmap(axis: Float[np.ndarray, "3"], sharpness: float):
+    theta = np.arange(MAP_ROWS) / (MAP_ROWS - 1) * np.pi  # Mitsuba's rows
+    radiance = np.exp(-2 * sharpness * np.sin(theta / 2) ** 2).astype(np.float32)
+    bitmap = mitsuba().Bitmap(np.tile(radiance[:, None, None], (1, MAP_COLUMNS, 3)))
+    across = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
+    turn = np.stack([across, axis, np.cross(across, axis)], axis=-1)
+    return mitsuba().load_dict({"type": "envmap", "bitmap": bitmap, "to_world": transform(rigid(turn, np.zeros(3)))})
+
+
+def _sensor(normal: Float[np.ndarray, "m 3"]):
+    """One ray a pixel, toward the sphere's points of these normals, side by side in an image of one row."""
+    film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
+    rays = {f"ray{k:05d}": ray | {"origin": (point + FRONT).tolist()} for k, point in enumerate(normal)}
+    return mitsuba().load_dict({"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False)
+
+
+def _radiance(bsdf, light, sensor, seed: int) -> Float[np.ndarray, "m"]:
+    mi = mitsuba()
+    integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
+    ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}, parallel=False)
+    return np.array(mi.render(scene, seed=seed, spp=SPP), dtype=np.float64)[0, :, 0]
