@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 
 from factorlib.light.lobes import lobe_integral
+from factorlib.light.sphere import fibonacci_sphere
 from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
 from factorlib.solve.problem import Block
 from factorlib.solve.unknowns import Light, Materials
@@ -24,18 +25,6 @@ DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness
 SAMPLE = 700  # observations that vote
 RESOLVED = 16.0  # a lobe this many times as sharp as the sharpest reflection widens it by 3 %: nothing sharper can be told
 TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
-
-
-def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
-    """`count` nearly uniform unit directions.
-
-    >>> bool(abs(fibonacci_sphere(100).mean()) < 1e-2)
-    True
-    """
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - z**2)
-    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
 
 
 def dictionary() -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "j"]]:

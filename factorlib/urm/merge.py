@@ -2,13 +2,15 @@
 
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
 Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean: normal, view and radiance alike, so that what is lost is second order in the cell's size.
+mean: normal, view and radiance alike, so that what is lost is second order in the cell's size.  Radiance is linear in
+visibility, whose mean is thus what the mean radiance shows.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
+from scipy.sparse import csr_array
 
 from factorlib.urm.observations import Observations
 
@@ -56,4 +58,12 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
         weight=total.astype("f4"),
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
         **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations")},
+        visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
     )
+
+
+def _mean_visibility(visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "g k"]:
+    """Means with weights that sum to 1 in each group."""
+    averaging = csr_array((share.astype("f4"), (group, np.arange(len(group)))))
+    columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
+    return np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
