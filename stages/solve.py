@@ -36,7 +36,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """operator: how a lobe's reflection is computed;  merge_degrees: observations this near are merged before solving.
 
     lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
-    illumination that choose the lobes, before all of them polish the answer;  prior: weight of the paper's tint
+    illumination that choose the lobes, before all of them polish the answer;  self_shadowing: whether what the meshes
+    hide is taken to be dark, `auto` where held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
@@ -51,6 +52,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
+    self_shadowing: Literal["auto", "on", "off"] = "auto"
     prior: Annotated[float, Meta(ge=0)] = 1e-4
     noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
     noise_relative: Annotated[float, Meta(ge=0)] = 0.05
@@ -59,9 +61,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
-    seen = concatenate([read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))])
+    seen = concatenate([merge(read_observations(path), params.merge_degrees) for path in sorted(inputs["urm"].glob("*.parquet"))])
     blocks = blocks_of_observations(
-        merge(seen, params.merge_degrees),
+        seen,
         Noise(params.noise_absolute, params.noise_relative),
         held_out=params.held_out,
         world_from_camera=_rotations(inputs),
@@ -81,7 +83,7 @@ def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def _bundle(params: Params) -> Bundle:
-    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "seed")}
+    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "self_shadowing", "seed")}
     return Bundle(loss=Loss(prior=params.prior), **same)
 
 
@@ -121,6 +123,8 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "lobes": {block.name: len(light) for block, light in zip(blocks, joint.solution.lights, strict=True)},
         "lobes_chosen_by": "held-out loss per round, see convergence.parquet",
         "held_out_loss": [event.held_out for event in joint.history if event.phase == "round"],
+        "self_shadowing": joint.self_shadowing,
+        "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }
     gauge = {"rule": RULE, "component": {name: component_of[m] for m, name in enumerate(names)}, "stderr": GAUGE}
     write_json(out / "materials.json", {"materials": _as_json(names, found, errors), "gauge": gauge, "model": model})

@@ -19,6 +19,7 @@ from factorlib.light.lobes import lobe_integral
 from factorlib.light.sphere import fibonacci_sphere
 from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
 from factorlib.solve.problem import Block
+from factorlib.solve.shadowing import shadowed
 from factorlib.solve.unknowns import Light, Materials
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
@@ -59,7 +60,8 @@ def _whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sh
         for m in np.unique(block.material[rows]):
             of = block.material[rows] == m
             inputs = operator_inputs(block, rows[of], axis, sharpness, materials.roughness[m], operator)
-            specular[of] = operator.specular(*inputs).double().numpy()
+            parts = torch.from_numpy(diffuse[of]), operator.specular(*inputs).double()
+            diffuse[of], specular[of] = shadowed(parts, block, rows[of], axis, sharpness, materials.roughness[m])
     material = block.material[rows]
     scale = block.precision[rows] * np.exp(light.log_exposure)[block.photo[rows]][:, None]
     return np.stack([
