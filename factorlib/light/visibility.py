@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
 LEAST = 1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
 
 
@@ -67,8 +68,9 @@ def highlight_weights(
 
 
 def kernel(directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, "p"]) -> Float[Tensor, "k p"]:
-    """L of the equations: lobes at the directions, widened."""
-    return torch.exp(-0.5 * widened(sharpness, len(directions)) * torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist") ** 2)
+    """L of the equations: lobes at the directions, widened, and no less than e^FAINTEST."""
+    distance = torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.exp((-0.5 * widened(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
 
 
 def widened(sharpness: Float[Tensor, "p"], count: int) -> Float[Tensor, "p"]:
