@@ -52,7 +52,7 @@ def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3
 def highlight_weights(
     normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"], roughness: float
 ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """f of equation (2), each row's sum 1, and its derivative by roughness (the row's sum being held)."""
+    """f of equation (2), each row's sum 1, and its derivative by roughness."""
     square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
     nd, no, od = normals @ directions.T, (normals * views).sum(1, keepdim=True), views @ directions.T
     upper = (nd > 0).to(nd.dtype)
@@ -61,10 +61,9 @@ def highlight_weights(
     spread = nh2 * (square - 1) + 1
     root = torch.sqrt(square + (1 - square) * nd * nd)
     weight = upper * square / spread**2 * nd / (nd + root)
-    scale = weight.sum(1, keepdim=True).clamp_min(1e-12)
-    by_square = 1 / square - 2 * nh2 / spread - (1 - nd * nd) / (2 * root * (nd + root))
-    weight = weight / scale
-    return weight, weight * by_square * (4 * roughness**3)
+    weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
+    by_square = weight * (1 / square - 2 * nh2 / spread - (1 - nd * nd) / (2 * root * (nd + root)))
+    return weight, (by_square - weight * by_square.sum(1, keepdim=True)) * (4 * roughness**3)
 
 
 def kernel(directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, "p"]) -> Float[Tensor, "k p"]:
