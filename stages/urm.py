@@ -31,8 +31,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0  # 0 keeps every pixel
     least_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
-    directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 256
-    cast_points: Annotated[int, msgspec.Meta(ge=100)] = 50_000
+    directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
+    cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
