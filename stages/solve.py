@@ -18,7 +18,7 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes, write_lobes
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, Event, Joint, solve
+from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
@@ -73,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     operator = reflection_operator(params.operator, weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        joint = solve(blocks, len(materials), operator, _bundle(params), spread, _to_progress(progress, params))
+        joint = solve(blocks, len(materials), operator, _bundle(params), spread, _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))))
     _write(out, materials, blocks, joint, operator)
 
 
@@ -87,11 +87,15 @@ def _bundle(params: Params) -> Bundle:
     return Bundle(loss=Loss(prior=params.prior), **same)
 
 
-def _to_progress(progress: Progress, params: Params):
+def _to_progress(progress: Progress, params: Params, models: int):
+    total, fitted, round_ = models * params.rounds + 1, 0, 0  # of the models to choose from, those that are done
+
     def report(event: Event) -> None:
+        nonlocal fitted, round_
+        fitted, round_ = fitted + (event.round < round_), event.round
         of_round = (event.iteration + 1) / params.iterations if event.phase == "descent" else 1.0
-        done = event.round + min(of_round, 1.0) if event.phase != "polish" else params.rounds
-        progress(done, params.rounds + 1, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
+        done = fitted * params.rounds + event.round + min(of_round, 1.0) if event.phase != "polish" else total - 1
+        progress(done, total, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
 
     return report
 
