@@ -73,7 +73,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     operator = reflection_operator(params.operator, weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        joint = solve(blocks, len(materials), operator, _bundle(params), spread, _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))))
+        joint = solve(
+            blocks,
+            len(materials),
+            operator,
+            _bundle(params),
+            spread,
+            _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))),
+        )
     _write(out, materials, blocks, joint, operator)
 
 
@@ -83,7 +90,10 @@ def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def _bundle(params: Params) -> Bundle:
-    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "self_shadowing", "seed")}
+    same = {
+        name: getattr(params, name)
+        for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "self_shadowing", "seed")
+    }
     return Bundle(loss=Loss(prior=params.prior), **same)
 
 

@@ -58,9 +58,7 @@ def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, 
     """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
     poses = read_json(inputs["align"] / f"{inputs.photo}.json")
     camera = Camera(shape[1], shape[0], poses["camera"]["focal_px"], tuple(poses["camera"]["principal_point"]))
-    found = visibility(
-        occluders_of(inputs, poses["objects"]), camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points
-    )
+    found = visibility(occluders_of(inputs, poses["objects"]), camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
     return msgspec.structs.replace(seen, visibility=found)
 
 

@@ -77,9 +77,7 @@ def widened(sharpness: Float[Tensor, "p"], count: int) -> Float[Tensor, "p"]:
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
 
-def seen_share(
-    visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]
-) -> Float[Tensor, "n p"]:
+def seen_share(visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
     return ((visibility * weights) @ lobes + LEAST) / (weights @ lobes + LEAST)
 

@@ -120,7 +120,9 @@ def best_round(blocks: Sequence[Block], materials: int, operator, bundle: Bundle
     for number in range(bundle.rounds):
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
-        current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s))
+        current = descend(
+            blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s)
+        )
         current = _tidied(blocks, current, operator, loss, map_)
         held = record(number, "round", -1, current)
         gained = best_held - held
@@ -157,7 +159,10 @@ def _descent(bundle: Bundle, iterations: int) -> Descent:
 
 def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
     """Three robust standard deviations of the current residual, never below one σ of the noise model."""
-    absolute = [np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator))) for b, light in zip(blocks, solution.lights, strict=True)]
+    absolute = [
+        np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator)))
+        for b, light in zip(blocks, solution.lights, strict=True)
+    ]
     return max(3 * 1.4826 * float(np.median(np.concatenate(absolute))), 1.0)
 
 

@@ -145,7 +145,9 @@ def _add_rows(hessian, gradient, block: Block, rows: slice, light: Light, materi
         total += float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
         pull = fit / root * (residual != 0)
         scaled = jacobian * (precision * pull.sqrt())[:, None]
-        places = np.r_[geometry, first + (3 + c) * p : first + (4 + c) * p, first + 6 * p : len(gradient), 7 * m + c, 7 * m + 3 + c, 7 * m + 6]
+        places = np.r_[
+            geometry, first + (3 + c) * p : first + (4 + c) * p, first + 6 * p : len(gradient), 7 * m + c, 7 * m + 3 + c, 7 * m + 6
+        ]
         hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
         gradient[places] += (scaled.T @ (residual * pull.sqrt())).numpy()
     return total

@@ -19,6 +19,9 @@ from factorlib.light.visibility import Seen, cosine_weights, highlight_weights, 
 from factorlib.solve.problem import Block
 
 
+TOGETHER = 512  # observations whose visibility a processor's cache holds
+
+
 class Turning(msgspec.Struct, frozen=True):
     """Derivatives [n, p] of responses as their lobes turn toward the two tangents, by visibility alone."""
 
@@ -42,13 +45,14 @@ def without_shadows(block: Block) -> Block:
 
 
 def shadowed_rows(block: Block, rows) -> Iterator[Rows]:
-    """The shadowed among `rows`, photo by photo."""
+    """The shadowed among `rows`, photo by photo, at most TOGETHER at once."""
     visibility, photo = block.visibility[rows], block.photo[rows]
     hidden = (visibility < 255).any(1)
     for k in np.unique(photo[hidden]):
-        of = hidden & (photo == k)
-        normal, view, directions = (torch.from_numpy(v).float() for v in (block.normal[rows][of], block.view[rows][of], block.directions[k]))
-        yield Rows(torch.from_numpy(np.flatnonzero(of)), torch.from_numpy(visibility[of]).float() / 255, normal, view, directions)
+        directions, places = torch.from_numpy(block.directions[k]).float(), np.flatnonzero(hidden & (photo == k))
+        for some in np.split(places, range(TOGETHER, len(places), TOGETHER)):
+            normal, view = (torch.from_numpy(v[rows][some]).float() for v in (block.normal, block.view))
+            yield Rows(torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions)
 
 
 def shadowed(parts, block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpness: Float[np.ndarray, "p"], roughness: float):

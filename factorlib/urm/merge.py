@@ -78,7 +78,9 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
     )
 
 
-def _mean_visibility(visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "g k"]:
+def _mean_visibility(
+    visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]
+) -> UInt8[np.ndarray, "g k"]:
     """Means with weights that sum to 1 in each group."""
     averaging = csr_array((share.astype("f4"), (group, np.arange(len(group)))))
     columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]

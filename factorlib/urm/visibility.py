@@ -120,7 +120,10 @@ def spread_subset(x: Int[np.ndarray, "n"], y: Int[np.ndarray, "n"], most: int) -
 
 
 def nearest(
-    place: Float[np.ndarray, "m 3"], normal: Float[np.ndarray, "m 3"], place_asked: Float[np.ndarray, "n 3"], normal_asked: Float[np.ndarray, "n 3"]
+    place: Float[np.ndarray, "m 3"],
+    normal: Float[np.ndarray, "m 3"],
+    place_asked: Float[np.ndarray, "n 3"],
+    normal_asked: Float[np.ndarray, "n 3"],
 ) -> Int[np.ndarray, "n"]:
     """Of the m surface points the one nearest to each of n, in place (in units of their spacing) and in normal."""
     spacing = max(float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])), 1e-12)

@@ -21,8 +21,6 @@ NAMES = ("red", "green", "blue")
 LOSS = Loss(robust_scale=3.0, prior=0.0)
 
 
-
-
 def bowl_sees(normals, directions):
     """A ray from −n leaves the sphere at −n + 2(n·d)d; it is free where that lies before the rim."""
     exit_z = -normals[:, 2:] + 2 * (normals @ directions.T) * directions[:, 2]
@@ -131,7 +129,9 @@ def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(rooms):
     quick, error = Bundle(lobes=8, insert=4, rounds=3, iterations=10, polish=20, tolerance=1e-3), {}
     for choice in ("off", "auto"):
-        joint = solve(rooms, 3, reflection_operator("network"), msgspec.structs.replace(quick, self_shadowing=choice), serial_map, lambda event: None)
+        joint = solve(
+            rooms, 3, reflection_operator("network"), msgspec.structs.replace(quick, self_shadowing=choice), serial_map, lambda event: None
+        )
         found = joint.solution.materials
         factor = factor_between(found, MATERIALS)
         error[choice] = np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(), np.abs(found.roughness - MATERIALS.roughness).mean()

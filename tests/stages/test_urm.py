@@ -24,7 +24,9 @@ def step(folder, poses: dict[str, Pose]):
     inside = (maps.label > 0).astype("f4")
     for stage in ("masks", "align"):
         (folder / stage).mkdir(parents=True)
-    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")} | {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
+    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")} | {
+        f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")
+    }
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
     clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside})
