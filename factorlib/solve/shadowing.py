@@ -18,7 +18,6 @@ from torch import Tensor
 from factorlib.light.visibility import Seen, cosine_weights, highlight_weights, kernel, seen, seen_share
 from factorlib.solve.problem import Block
 
-
 TOGETHER = 512  # observations whose visibility a processor's cache holds
 
 
