@@ -24,6 +24,7 @@ from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import resynthesised
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
+from factorlib.urm.observations import Observations, read_observations
 
 log = logging.getLogger("factorlib.render")
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
@@ -51,7 +52,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     def report(done: float, pixels: float) -> None:
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    _write(out / "resynthesis" / name, resynthesised(reflector, materials, photo, geometry, report), exposure)
+    _write(out / "resynthesis" / name, resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs)), exposure)
     seen = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
@@ -60,6 +61,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         _write(out / "materials" / name / label, ball(reflector, material, params.ball_size), exposure, disc=True)
         _write_map(out / "reflectance_maps" / name / label, reflector, material, normals, exposure, params.map_size)
     progress(total, total, name)
+
+
+def shadowed(inputs: Inputs) -> Observations | None:
+    """The photo's observations, where the solve took their visibility into account."""
+    model = read_json(inputs["solve"] / "materials.json")["model"]
+    return read_observations(inputs["urm"] / f"{inputs.photo}.parquet") if model.get("self_shadowing") else None
 
 
 def light_of_photo(inputs: Inputs) -> Lobes:

@@ -19,7 +19,7 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes, write_lobes
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, Event, Joint, solve
+from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
 from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
@@ -38,7 +38,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """operator: how a lobe's reflection is computed;  merge_degrees: observations this near are merged before solving.
 
     lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
-    illumination that choose the lobes, before all of them polish the answer;  prior: weight of the paper's tint
+    illumination that choose the lobes, before all of them polish the answer;  self_shadowing: whether what the meshes
+    hide is taken to be dark, `auto` where held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
@@ -53,6 +54,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
+    self_shadowing: Literal["auto", "on", "off"] = "auto"
     prior: Annotated[float, Meta(ge=0)] = 1e-4
     noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
     noise_relative: Annotated[float, Meta(ge=0)] = 0.05
@@ -61,9 +63,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
-    seen = concatenate([read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))])
+    seen = concatenate([merge(read_observations(path), params.merge_degrees) for path in sorted(inputs["urm"].glob("*.parquet"))])
     blocks = blocks_of_observations(
-        merge(seen, params.merge_degrees),
+        seen,
         Noise(params.noise_absolute, params.noise_relative),
         held_out=params.held_out,
         world_from_camera=_rotations(inputs),
@@ -73,7 +75,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     operator = reflection_operator(params.operator, weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        joint = solve(blocks, len(materials), operator, _bundle(params), spread, _to_progress(progress, params))
+        joint = solve(
+            blocks,
+            len(materials),
+            operator,
+            _bundle(params),
+            spread,
+            _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))),
+        )
     _write(out, materials, blocks, joint, operator)
 
 
@@ -83,15 +92,22 @@ def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def _bundle(params: Params) -> Bundle:
-    same = {name: getattr(params, name) for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "seed")}
+    same = {
+        name: getattr(params, name)
+        for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "self_shadowing", "seed")
+    }
     return Bundle(loss=Loss(prior=params.prior), **same)
 
 
-def _to_progress(progress: Progress, params: Params):
+def _to_progress(progress: Progress, params: Params, models: int):
+    total, fitted, round_ = models * params.rounds + 1, 0, 0  # of the models to choose from, those that are done
+
     def report(event: Event) -> None:
+        nonlocal fitted, round_
+        fitted, round_ = fitted + (event.round < round_), event.round
         of_round = (event.iteration + 1) / params.iterations if event.phase == "descent" else 1.0
-        done = event.round + min(of_round, 1.0) if event.phase != "polish" else params.rounds
-        progress(done, params.rounds + 1, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
+        done = fitted * params.rounds + event.round + min(of_round, 1.0) if event.phase != "polish" else total - 1
+        progress(done, total, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
 
     return report
 
@@ -123,6 +139,8 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "lobes": {block.name: len(light) for block, light in zip(blocks, joint.solution.lights, strict=True)},
         "lobes_chosen_by": "held-out loss per round, see convergence.parquet",
         "held_out_loss": [event.held_out for event in joint.history if event.phase == "round"],
+        "self_shadowing": joint.self_shadowing,
+        "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }
     gauge = {"rule": RULE, "component": {name: component_of[m] for m, name in enumerate(names)}, "stderr": GAUGE}
     write_json(out / "materials.json", {"materials": _as_json(names, found, errors), "gauge": gauge, "model": model})

@@ -1,31 +1,47 @@
-"""Unstructured reflectance map: every pixel whose material and normal are known becomes an observation."""
+"""Unstructured reflectance map: every pixel whose material and normal are known becomes an observation.
+
+What an observation sees past its own mesh and the photo's other objects stands in its `visibility`.
+"""
 
 import logging
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
+from factorlib.align.camera import Camera, Pose
+from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
+from factorlib.jsonfile import read_json
+from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.merge import merge
-from factorlib.urm.observations import write_observations
+from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.visibility import Occluders, visibility
 
 log = logging.getLogger("factorlib.urm")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """directions: of the sphere whose visibility is cast, 0 for none;  cast_points: observations of a photo that rays are
+    cast from, the others take their neighbours' visibility.
+    """
+
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0  # 0 keeps every pixel
     least_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
+    cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name = inputs.photo
     light = inputs.facts["dataset.light"]
+    photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     observations = observations_of_photo(
-        read_exr(inputs["masks"] / f"{name}.exr"),
-        read_exr(inputs["align"] / f"{name}.exr"),
+        photo,
+        geometry,
         name=name,
         illumination=light["illumination"],
         materials=inputs.facts["dataset.materials"],
@@ -33,4 +49,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
+    elif params.directions:
+        observations = with_visibility(observations, photo["label"].shape, inputs, params)
     write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
+
+
+def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, params: Params) -> Observations:
+    """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
+    poses = read_json(inputs["align"] / f"{inputs.photo}.json")
+    camera = Camera(shape[1], shape[0], poses["camera"]["focal_px"], tuple(poses["camera"]["principal_point"]))
+    found = visibility(occluders_of(inputs, poses["objects"]), camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
+    return msgspec.structs.replace(seen, visibility=found)
+
+
+def occluders_of(inputs: Inputs, poses: dict) -> Occluders:
+    """Every object of the photo where `align` put it."""
+    slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
+    for thing in slice_.objects:
+        mesh = slice_.meshes[thing.mesh]
+        meshes.append(read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials))
+    placed = [poses[thing.name] for thing in slice_.objects]
+    return Occluders(meshes, [Pose(np.array(pose["rotation"]), np.array(pose["translation"])) for pose in placed])

@@ -7,18 +7,22 @@ Specular   At each point a few lobes make up nearly all of the radiance.  The op
            25 times cheaper, tells which they are, and stands for the others.  Together the others are at most `tail`
            of the point's radiance in every channel, and the closed form errs by about a fifth of that.
            tail = 0: the operator throughout.
+
+Points that do not see every direction (`Shadows`) reflect of each lobe what they see, as in the solve.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from factorlib.light.lobes import Lobes
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.reflection import Operator, reflection_operator
 
 TAIL = 0.005
@@ -26,6 +30,16 @@ NODES = 1024  # of n·z in a lobe's table
 PAIRS_AT_ONCE = 1 << 17  # of a point and a lobe: about 200 MB in the networks
 
 Report = Callable[[float, float], None]
+
+
+class Shadows(msgspec.Struct, frozen=True):
+    """What n points see of k directions, 0 to 255; directions in the frame of their normals."""
+
+    visibility: UInt8[np.ndarray, "n k"]
+    directions: Float[np.ndarray, "k 3"]
+
+    def take(self, rows) -> Shadows:
+        return Shadows(self.visibility[rows], self.directions)
 
 
 class Reflector:
@@ -39,28 +53,42 @@ class Reflector:
         self.table = self._diffuse_table()
 
     def __call__(
-        self, material, normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], report: Report = lambda done, total: None
+        self,
+        material,
+        normals: Float[np.ndarray, "n 3"],
+        views: Float[np.ndarray, "n 3"],
+        report: Report = lambda done, total: None,
+        shadows: Shadows | None = None,
     ) -> Float[np.ndarray, "n 3"]:
         """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away."""
         result, step = np.zeros((len(normals), 3)), max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
-                result[rows] = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows])).double().numpy()
+                some = None if shadows is None else shadows.take(rows)
+                result[rows] = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), some).double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
 
-    def _radiance(self, material, normals: Tensor, views: Tensor) -> Float[Tensor, "n 3"]:
+    def _radiance(self, material, normals: Tensor, views: Tensor, shadows: Shadows | None) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
-        radiance = kd * (self._diffuse(nz) @ self.weight)
+        matte, glossy = (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
+        radiance = kd * ((matte * self._diffuse(nz)) @ self.weight)
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)
-            radiance = radiance + ks * (self._specular(roughness, ks, no, nz, oz, radiance) @ self.weight)
+            radiance = radiance + ks * ((glossy * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
+
+    def _seen(self, shadows: Shadows, normals: Tensor, views: Tensor, roughness: float) -> tuple[Tensor, Tensor]:
+        """Shares of the diffuse and of the specular reflection of each lobe, [n, p]."""
+        visibility, directions = torch.from_numpy(shadows.visibility).float() / 255, torch.from_numpy(shadows.directions).float()
+        normals, views, lobes = normals.float(), views.float(), kernel(directions, self.axis.float(), self.sharpness.float())
+        weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)[0]
+        return tuple(seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
 
     # diffuse ----------------------------------------------------------------------------------------------------------
 

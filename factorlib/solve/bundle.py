@@ -5,11 +5,15 @@
             (all on a sample of the observations, which finds the lobes as well as all of them do)
     stop:   when a round lowers the held-out loss by less than `least_gain`, at `lobes` lobes per light, or after
             `rounds`; the best round by held-out loss is kept and polished on all observations.
+
+Where observations see past something, the rounds are run with and without that (self_shadowing = auto), and what
+explains the held-out pixels better is polished.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -19,6 +23,7 @@ from factorlib.solve.gauge import in_gauge
 from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
 from factorlib.solve.problem import Block, of_rows, sampled
+from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.unknowns import Light
 from factorlib.solve.weights import refitted_weights
@@ -37,6 +42,7 @@ class Bundle(msgspec.Struct, frozen=True):
     least_gain: float = 0.01
     start_roughness: float = 0.4
     start_specular_share: float = 0.2
+    self_shadowing: Literal["auto", "on", "off"] = "auto"
     loss: Loss = Loss()
     seed: int = 0
 
@@ -56,25 +62,58 @@ Report = Callable[[Event], None]
 
 
 class Joint(msgspec.Struct, frozen=True):
-    """The answer, in the gauge of `solve.gauge`: materials, one light per block; how it was reached, and the last loss."""
+    """The answer, in the gauge of `solve.gauge`: materials, one light per block, how it was reached, and the last loss.
+
+    self_shadowing: whether visibility was used;  held_out: the held-out loss with and without it, of what was tried
+    """
 
     solution: Solution
     history: list[Event]
     loss: Loss
+    self_shadowing: bool = False
+    held_out: dict[str, float] = {}
+
+
+class Fit(msgspec.Struct, frozen=True):
+    """The best round, its held-out loss, the loss function it was fitted by, and all events up to the last round."""
+
+    solution: Solution
+    held_out: float
+    loss: Loss
+    history: list[Event]
 
 
 def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
     """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
-    everything, blocks = blocks, [sampled(block, bundle.sample, bundle.seed) for block in blocks]
-    history: list[Event] = []
+    models = candidates(blocks, bundle.self_shadowing)
+    fits = {name: best_round(model, materials, operator, bundle, map_, report) for name, model in models.items()}
+    chosen = min(fits, key=lambda name: fits[name].held_out)
+    solution, history = polished(models[chosen], fits[chosen], operator, bundle, map_, report)
+    return Joint(solution, history, fits[chosen].loss, chosen == "with", {name: fit.held_out for name, fit in fits.items()})
 
+
+def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[Block]]:
+    """The models to choose from: `with` self-shadowing, `without`, or both.  Where nothing is hidden they are one."""
+    shadows = self_shadowing != "off" and any(block.visibility is not None for block in blocks)
+    models = {"without": [without_shadows(block) for block in blocks]} if not shadows or self_shadowing == "auto" else {}
+    return models | ({"with": list(blocks)} if shadows else {})
+
+
+def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report) -> Callable:
     def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
-        held = held_out_loss(blocks, solution.materials, solution.lights, operator, bundle.loss) if iteration < 0 else np.nan
+        held = held_out_loss(blocks, solution.materials, solution.lights, operator, loss) if iteration < 0 else np.nan
         fitted = sum(int((~b.held_out).sum()) * 3 for b in blocks)
         history.append(Event(round_, phase, iteration, solution.loss / fitted, held, sum(map(len, solution.lights))))
         report(history[-1])
         return held
 
+    return record
+
+
+def best_round(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Fit:
+    """Rounds on a sample of the observations, as long as they gain."""
+    blocks, history = [sampled(block, bundle.sample, bundle.seed) for block in blocks], []
+    record = _recorder(blocks, history, operator, bundle.loss, report)
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
     current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
     current = _refitted(blocks, current, operator, bundle.loss, map_)
@@ -82,7 +121,9 @@ def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map
     for number in range(bundle.rounds):
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
-        current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s))
+        current = descend(
+            blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s)
+        )
         current = _tidied(blocks, current, operator, loss, map_)
         held = record(number, "round", -1, current)
         gained = best_held - held
@@ -90,11 +131,17 @@ def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map
             best, best_held = current, held
         if gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
             break
-    blocks = everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in everything]
-    best = evaluated(everything, best.materials, best.lights, operator, loss, map_)
+    return Fit(best, best_held, loss, history)
+
+
+def polished(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report) -> tuple[Solution, list[Event]]:
+    """The best round brought to rest on all observations, and the whole history."""
+    everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
+    history, number, loss = list(fit.history), fit.history[-1].round, fit.loss
+    record = _recorder(everything, history, operator, loss, report)
+    best = evaluated(everything, fit.solution.materials, fit.solution.lights, operator, loss, map_)
     best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
-    best = _tidied(everything, best, operator, loss, map_)
-    return Joint(best, history, loss)
+    return _tidied(everything, best, operator, loss, map_), history
 
 
 def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
@@ -113,7 +160,10 @@ def _descent(bundle: Bundle, iterations: int) -> Descent:
 
 def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
     """Three robust standard deviations of the current residual, never below one σ of the noise model."""
-    absolute = [np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator))) for b, light in zip(blocks, solution.lights, strict=True)]
+    absolute = [
+        np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator)))
+        for b, light in zip(blocks, solution.lights, strict=True)
+    ]
     return max(3 * 1.4826 * float(np.median(np.concatenate(absolute))), 1.0)
 
 

@@ -16,26 +16,16 @@ import torch
 from jaxtyping import Float
 
 from factorlib.light.lobes import lobe_integral
+from factorlib.light.sphere import fibonacci_sphere
 from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
 from factorlib.solve.problem import Block
+from factorlib.solve.shadowing import shadowed
 from factorlib.solve.unknowns import Light, Materials
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations that vote
 RESOLVED = 16.0  # a lobe this many times as sharp as the sharpest reflection widens it by 3 %: nothing sharper can be told
 TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
-
-
-def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
-    """`count` nearly uniform unit directions.
-
-    >>> bool(abs(fibonacci_sphere(100).mean()) < 1e-2)
-    True
-    """
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - z**2)
-    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
 
 
 def dictionary() -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "j"]]:
@@ -70,7 +60,8 @@ def whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sha
         for m in np.unique(block.material[rows]):
             of = block.material[rows] == m
             inputs = operator_inputs(block, rows[of], axis, sharpness, materials.roughness[m], operator)
-            specular[of] = operator.specular(*inputs).double().numpy()
+            parts = torch.from_numpy(diffuse[of]), operator.specular(*inputs).double()
+            diffuse[of], specular[of] = shadowed(parts, block, rows[of], axis, sharpness, materials.roughness[m])
     material = block.material[rows]
     scale = block.precision[rows] * np.exp(light.log_exposure)[block.photo[rows]][:, None]
     return np.stack([

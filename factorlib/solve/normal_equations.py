@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Int
 
 from factorlib.solve.problem import Block
+from factorlib.solve.shadowing import shadowed, shadowed_response
 from factorlib.solve.unknowns import Light, Materials
 
 CHUNK = 4096  # observations whose responses are held at once
@@ -74,6 +75,7 @@ def predicted_radiance(block: Block, light: Light, materials: Materials, operato
         roughness, sharpness, no, nz, oz = operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[m], operator)
         with torch.no_grad():
             parts = operator.diffuse(sharpness, nz), operator.specular(roughness, sharpness, no, nz, oz)
+            parts = shadowed(parts, block, rows, light.axis, light.sharpness, materials.roughness[m])
         diffuse, specular = (part.double().numpy() @ light.weight for part in parts)
         radiance[rows] = exposure[rows, None] * (materials.diffuse[m] * diffuse + materials.specular[m] * specular)
     return radiance
@@ -155,6 +157,7 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
     tangents = [torch.from_numpy(t) for t in light.tangents()]
     by_tangent = [(normal @ t.T, view @ t.T) for t in tangents]
     r = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
+    r, turning = shadowed_response(r, block, rows, light, materials.roughness[m])
     weight = torch.from_numpy(light.weight)
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
     photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure))[:, 1:].double()
@@ -165,6 +168,9 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
         by_nz = (kd * r["diffuse_by_nz"] + ks * r["specular_by_nz"]) * weight[:, c]
         by_oz = ks * r["specular_by_oz"] * weight[:, c]
         columns = [by_nz * n + by_oz * o for n, o in by_tangent]
+        if turning is not None:
+            shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(turning.diffuse, turning.specular, strict=True)]
+            columns = [column + also for column, also in zip(columns, shading, strict=True)]
         columns += [(kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]) * weight[:, c], basis]
         predicted = basis @ weight[:, c]
         own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]

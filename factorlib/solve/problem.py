@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.errors import InputError
+from factorlib.light.sphere import fibonacci_sphere
 from factorlib.urm.observations import Observations
 
 HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
@@ -19,7 +20,8 @@ class Block(msgspec.Struct, frozen=True):
 
     radiance is divided by `unit` (the block's mean radiance); precision is 1/σ of the noise model times the root of
     the observation's weight, zero where a channel tells nothing; held_out observations choose the model and do not
-    fit it.
+    fit it.  visibility says how much of each direction an observation sees, 0 to 255 (None: all of all of them);
+    directions are those, in the block's frame, of each photo.
     """
 
     name: str
@@ -33,6 +35,8 @@ class Block(msgspec.Struct, frozen=True):
     material: Int[np.ndarray, "n"]
     photo: Int[np.ndarray, "n"]
     held_out: Bool[np.ndarray, "n"]
+    visibility: UInt8[np.ndarray, "n k"] | None = None
+    directions: Float[np.ndarray, "f k 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -90,8 +94,17 @@ def _block(seen: Observations, name: str, noise: Noise, held_out: float, rotatio
     chosen = _held_out(normal, view, held_out, seed)
     return Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), np.sqrt(weight)[:, None] / sigma,
-        seen.material.astype(np.int64), local, chosen,
+        seen.material.astype(np.int64), local, chosen, *_visibility(seen, photos, rotations),
     )  # fmt: skip
+
+
+def _visibility(seen: Observations, photos: Sequence[str], rotations: Mapping) -> tuple:
+    """Visibility and its directions in the block's frame; None where nothing is hidden."""
+    if seen.visibility is None or (seen.visibility == 255).all():
+        return None, None
+    directions = fibonacci_sphere(seen.visibility.shape[1])
+    frames = [np.eye(3) if rotations.get(photo) is None else np.asarray(rotations[photo], dtype=float) for photo in photos]
+    return seen.visibility, np.stack([directions @ frame.T for frame in frames])
 
 
 def _held_out(normal: np.ndarray, view: np.ndarray, share: float, seed: int) -> Bool[np.ndarray, "n"]:
@@ -122,7 +135,8 @@ def _in_frame(vectors: np.ndarray, seen: Observations, rotations: Mapping) -> Fl
 def of_rows(block: Block, rows: np.ndarray) -> Block:
     """The observations `rows` (indices or a mask) alone."""
     fields = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
-    return msgspec.structs.replace(block, **{name: getattr(block, name)[rows] for name in fields})
+    visibility = None if block.visibility is None else block.visibility[rows]
+    return msgspec.structs.replace(block, **{name: getattr(block, name)[rows] for name in fields}, visibility=visibility)
 
 
 def sampled(block: Block, count: int, seed: int) -> Block:

@@ -3,14 +3,23 @@
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
 Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
 mean: normal, view and radiance alike, so that what is lost is second order in the cell's size.
+
+Radiance is linear in visibility, whose mean is thus what the mean radiance shows.  But on a flat seat all points would
+become one, and what their shadows tell of the light be lost: points merge only where what is hidden from them lies
+alike, by the mean over the sphere of hidden × direction.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
+from scipy.sparse import csr_array
 
+from factorlib.light.sphere import fibonacci_sphere
 from factorlib.urm.observations import Observations
+
+HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
+ROWS = 1 << 16  # observations whose visibility is held as floats
 
 
 def merge(observations: Observations, degrees: float) -> Observations:
@@ -24,6 +33,8 @@ def merge(observations: Observations, degrees: float) -> Observations:
     mirror = 2 * np.sum(observations.normal * observations.view, -1, keepdims=True) * observations.normal - observations.view
     flags = observations.clipped @ np.array([1, 2, 4])
     keys = np.column_stack([observations.photo, observations.material, flags, _cells(observations.normal, cell), _cells(mirror, 2 * cell)])
+    if observations.visibility is not None:
+        keys = np.column_stack([keys, _hidden_cells(observations.visibility)])
     _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return _merged(observations, first, group.reshape(-1))
 
@@ -36,6 +47,13 @@ def _cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, 
     v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
     step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
     return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)
+
+
+def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"]:
+    """Cells of where the hidden directions lie."""
+    mean = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
+    hidden = [(255 - visibility[i : i + ROWS]).astype("f4") / 255 @ mean for i in range(0, len(visibility), ROWS)]
+    return np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64)
 
 
 def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[np.ndarray, "n"]) -> Observations:
@@ -56,4 +74,14 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
         weight=total.astype("f4"),
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
         **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations")},
+        visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
     )
+
+
+def _mean_visibility(
+    visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]
+) -> UInt8[np.ndarray, "g k"]:
+    """Means with weights that sum to 1 in each group."""
+    averaging = csr_array((share.astype("f4"), (group, np.arange(len(group)))))
+    columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
+    return np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")

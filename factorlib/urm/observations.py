@@ -2,6 +2,9 @@
 
 The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, radiance linear, the names behind the
 indices and the units in the schema metadata under the key `factorlib`.
+
+`visibility`, where some observation does not see every direction, is a further column of K bytes: the share of each
+direction of `fibonacci_sphere(K)` that is seen, 0 to 255.
 """
 
 from __future__ import annotations
@@ -14,12 +17,16 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
 
 VECTORS = ("normal", "half", "view", "radiance")
+VISIBILITY = (
+    "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
+    "azimuth about z from x toward y = k π (3 − √5)"
+)
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
     "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo", "x": "pixels", "y": "pixels", "weight": "pixels"},
@@ -42,6 +49,7 @@ class Observations(msgspec.Struct, frozen=True):
     materials: tuple[str, ...]
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
+    visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -52,7 +60,8 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+        visibility = None if self.visibility is None else self.visibility[rows]
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, visibility=visibility)
 
 
 COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
@@ -61,7 +70,7 @@ DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "mater
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns."""
+    """Write the fixed Parquet columns, and `visibility` where there is one."""
     columns = {}
     for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:]):
         dtype = DTYPES.get(name, "f4")
@@ -69,7 +78,10 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         flat = pa.array(values.reshape(-1))
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
     names = {"materials": observations.materials, "photos": observations.photos, "illuminations": observations.illuminations}
-    metadata = {"factorlib": json.dumps({**UNITS, **names}, sort_keys=True, ensure_ascii=False)}
+    about = {**UNITS, **names}
+    if observations.visibility is not None:
+        columns["visibility"], about["visibility"] = _bytes(observations.visibility), VISIBILITY
+    metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
     pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
 
 
@@ -79,6 +91,7 @@ def read_observations(path: str | Path) -> Observations:
         table = pq.read_table(path)
         names = json.loads(table.schema.metadata[b"factorlib"])
         columns = {name: _array(table[name].combine_chunks(), DTYPES[name]) for name in COLUMNS}
+        columns["visibility"] = _of_bytes(table["visibility"].combine_chunks()) if "visibility" in table.column_names else None
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise InputError(f"not a reflectance map ({error})", file=path, cure="run the stage `urm` again") from error
     return Observations(**columns, **{k: tuple(names[k]) for k in ("materials", "photos", "illuminations")})
@@ -95,11 +108,34 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
         columns[column] = np.concatenate(renumbered).astype("i4")
-    return Observations(**columns, materials=materials, **names)
+    return Observations(**columns, materials=materials, **names, visibility=_all_visibility(parts))
+
+
+def _all_visibility(parts: Sequence[Observations]) -> UInt8[np.ndarray, "n k"] | None:
+    """Of all parts; those without see everything."""
+    counts = {part.visibility.shape[1] for part in parts if part.visibility is not None}
+    if len(counts) > 1:
+        raise InputError(
+            f"reflectance maps whose visibility has {sorted(counts)} directions", cure="run the stage `urm` again for all photos"
+        )
+    if not counts:
+        return None
+    (k,) = counts
+    return np.concatenate([np.full((len(part), k), 255, "u1") if part.visibility is None else part.visibility for part in parts])
 
 
 def _renumber(index: np.ndarray, old: Sequence[str], new: Sequence[str]) -> np.ndarray:
     return np.array([new.index(name) for name in old], dtype="i4")[index] if len(old) else index
+
+
+def _bytes(values: UInt8[np.ndarray, "n k"]) -> pa.Array:
+    data = pa.py_buffer(np.ascontiguousarray(values, dtype="u1"))
+    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(values.shape[1]), len(values), [None, data])
+
+
+def _of_bytes(column: pa.Array) -> UInt8[np.ndarray, "n k"]:
+    k = column.type.byte_width
+    return np.frombuffer(column.buffers()[1], "u1").reshape(-1, k)[column.offset : column.offset + len(column)].copy()
 
 
 def _array(column: pa.Array, dtype: str) -> np.ndarray:

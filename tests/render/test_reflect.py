@@ -9,9 +9,11 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.export.materials import Material
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
+from factorlib.light.sphere import fibonacci_sphere
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render.reflect import Reflector
+from factorlib.render import reflect
+from factorlib.render.reflect import Reflector, Shadows
 
 GLOSSY = Material((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
 
@@ -99,3 +101,21 @@ def test_darkness_is_black(dark):
 def test_surfaces_that_face_away_are_black():
     normals, views = points(20)
     assert not Reflector(reflection_operator("closed_form"), light())(GLOSSY, normals, -views).any()
+
+
+def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_darkness():
+    reflector, directions = Reflector(reflection_operator("closed_form"), light()), fibonacci_sphere(256)
+    normals, views = points(40)
+    for level, factor in ((255, 1.0), (0, 0.0)):
+        shadows = Shadows(np.full((40, 256), level, np.uint8), directions)
+        found = reflector(GLOSSY, normals, views, shadows=shadows)
+        np.testing.assert_allclose(found, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
+
+
+def test_each_point_has_its_own_shadow_whatever_is_computed_at_once(monkeypatch):
+    reflector, directions = Reflector(reflection_operator("closed_form"), light()), fibonacci_sphere(256)
+    normals, views = points(40)
+    shadows = Shadows(255 * np.random.default_rng(0).integers(0, 2, (40, 256)).astype(np.uint8), directions)
+    whole = reflector(GLOSSY, normals, views, shadows=shadows)
+    monkeypatch.setattr(reflect, "PAIRS_AT_ONCE", 7 * len(light()))
+    np.testing.assert_allclose(reflector(GLOSSY, normals, views, shadows=shadows), whole, rtol=1e-5)

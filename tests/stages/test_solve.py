@@ -1,5 +1,6 @@
 import logging
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -65,9 +66,25 @@ def test_writes_the_fixed_artifacts(tmp_path, linked):
     assert (out / "convergence.parquet").exists() and (out / "uncertainty.json").exists()
 
 
+def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, linked):
+    def hidden(part, kind):
+        random = np.random.default_rng(0).integers(0, 2, (len(part), 128))
+        return msgspec.structs.replace(part, visibility=np.full_like(random, 255) if kind == "nothing" else 255 * random)
+
+    same = [run(tmp_path / "plain", linked), run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()})]
+    for file in sorted(p.relative_to(same[0]) for p in same[0].rglob("*") if p.is_file()):
+        assert (same[0] / file).read_bytes() == (same[1] / file).read_bytes(), file
+    wrong = {k: hidden(v, "random") for k, v in linked.items()}  # radiance was made without
+    models = {c: read_json(run(tmp_path / c, wrong, self_shadowing=c) / "materials.json")["model"] for c in ("auto", "on", "off")}
+    assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
+    evidence = models["auto"]["self_shadowing_chosen_by"]
+    assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"]
+    assert set(models["on"]["self_shadowing_chosen_by"]) == {"held_out_loss_with"}
+
+
 def test_the_same_observations_give_the_same_bytes(tmp_path, linked):
     one, other = run(tmp_path / "1", linked), run(tmp_path / "2", dict(reversed(linked.items())))
-    for file in sorted(p.name for p in one.iterdir()):
+    for file in sorted(p.relative_to(one) for p in one.rglob("*") if p.is_file()):
         assert (one / file).read_bytes() == (other / file).read_bytes(), file
 
 

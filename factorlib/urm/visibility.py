@@ -1,0 +1,131 @@
+"""Which directions each observed surface point sees past the objects of its photo, by Open3D's ray casting on the CPU.
+
+A ray leaves the surface a thousandth of its object's radius along the face's normal.  What is asked is the smooth
+surface that the mesh stands for, so a direction that the shading normal's hemisphere holds but the flat face's does not
+is bent up to the face's horizon first: no convex mesh, however coarse, shadows itself.  Directions below the shading
+normal's horizon are not cast and count as seen; nothing is reflected from there.
+
+Of more than `most_points` points an evenly spread subset is cast, and the others take the visibility of the nearest cast
+one, near in place and in normal alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import open3d as o3d
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.light.sphere import fibonacci_sphere
+from factorlib.meshes.mesh import Mesh, area_vectors
+
+LIFT = 1e-3  # of the object's radius: how far off the surface rays start
+GRAZING = 0.02  # sine of the least angle between a ray and its face
+BELOW = -0.1  # n·d of directions that are still cast: normals that are averaged later may lean that far
+ROWS = 4096  # points whose rays are held at once
+NORMAL_WEIGHT = 10.0  # spacings of cast points that a difference of 1 between normals counts for
+
+
+class Points(msgspec.Struct, frozen=True):
+    """Surface points under pixels: place and face normal (camera frame, facing the camera) and where there is one."""
+
+    place: Float[np.ndarray, "n 3"]  # mesh units, lifted off the surface
+    face_normal: Float[np.ndarray, "n 3"]
+    found: Bool[np.ndarray, "n"]
+
+
+class Occluders:
+    """The posed objects of one photo as one scene."""
+
+    def __init__(self, meshes: Sequence[Mesh], poses: Sequence[Pose]):
+        """poses: cam_from_object; raises ValueError for no mesh at all."""
+        vertices = [pose.apply(mesh.vertices) for mesh, pose in zip(meshes, poses, strict=True)]
+        first = np.cumsum([0, *map(len, vertices)])
+        faces = np.vstack([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
+        vertices = np.vstack(vertices)
+        self.normal = area_vectors(vertices, faces)
+        self.normal /= np.maximum(np.linalg.norm(self.normal, axis=1, keepdims=True), 1e-300)
+        self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
+        used = vertices[np.unique(faces)]
+        self.centre = (used.min(0) + used.max(0)) / 2
+        self.radius = float(np.linalg.norm(used - self.centre, axis=1).max())
+        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        scaled = ((vertices - self.centre) / self.radius).astype(np.float32)
+        self.scene.add_triangles(o3d.core.Tensor(scaled), o3d.core.Tensor(faces.astype(np.uint32)))
+
+    def points_under(self, camera: Camera, x: Int[np.ndarray, "n"], y: Int[np.ndarray, "n"]) -> Points:
+        """What the rays through the centres of pixels (x, y) meet first."""
+        along = camera.rays_through(np.column_stack([x, y]) + 0.5)
+        hits = self.scene.cast_rays(self._rays(np.zeros_like(along), along), nthreads=1)
+        depth = hits["t_hit"].numpy().astype(float) * self.radius
+        found = np.isfinite(depth)
+        face = np.where(found, hits["primitive_ids"].numpy(), 0).astype(np.int64)
+        normal = self.normal[face]
+        normal = np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
+        place = np.where(found, depth, 0.0)[:, None] * along + self.lift[face][:, None] * normal
+        return Points(place, normal, found)
+
+    def seen_from(
+        self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]
+    ) -> UInt8[np.ndarray, "n k"]:
+        """255 where `directions` (camera frame, unit) are free of the objects, 0 where not."""
+        seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
+        for i in range(0, len(seen), ROWS):
+            rows = slice(i, i + ROWS)
+            row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
+            normal, place, along = points.face_normal[rows][row], points.place[rows][row], directions[k]
+            along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
+            seen[rows][row, k] = np.where(self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy(), 0, 255)
+        return seen
+
+    def _rays(self, start: np.ndarray, along: np.ndarray) -> o3d.core.Tensor:
+        """In the scene's frame, where `along` keeps its length: distances come back in units of the radius."""
+        return o3d.core.Tensor(np.column_stack([(start - self.centre) / self.radius, along]).astype(np.float32))
+
+
+def visibility(
+    occluders: Occluders,
+    camera: Camera,
+    x: Int[np.ndarray, "n"],
+    y: Int[np.ndarray, "n"],
+    shading_normal: Float[np.ndarray, "n 3"],
+    directions: int,
+    most_points: int,
+) -> UInt8[np.ndarray, "n k"] | None:
+    """What the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all."""
+    points = occluders.points_under(camera, x, y)
+    cast = spread_subset(x, y, most_points)
+    some = Points(*(getattr(points, name)[cast] for name in points.__struct_fields__))
+    seen = occluders.seen_from(some, shading_normal[cast], fibonacci_sphere(directions))
+    if (seen == 255).all():
+        return None
+    if len(cast) == len(x):
+        return seen
+    return seen[nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)]
+
+
+def spread_subset(x: Int[np.ndarray, "n"], y: Int[np.ndarray, "n"], most: int) -> Int[np.ndarray, "m"]:
+    """Rows of at most about `most` pixels: the first in each square of the picture.
+
+    >>> y, x = np.divmod(np.arange(64), 8)
+    >>> spread_subset(x, y, 16).tolist() == [8 * i + j for i in range(0, 8, 2) for j in range(0, 8, 2)]
+    True
+    """
+    size = int(np.ceil(np.sqrt(len(x) / most)))
+    return np.sort(np.unique(np.column_stack([y // size, x // size]), axis=0, return_index=True)[1])
+
+
+def nearest(
+    place: Float[np.ndarray, "m 3"],
+    normal: Float[np.ndarray, "m 3"],
+    place_asked: Float[np.ndarray, "n 3"],
+    normal_asked: Float[np.ndarray, "n 3"],
+) -> Int[np.ndarray, "n"]:
+    """Of the m surface points the one nearest to each of n, in place (in units of their spacing) and in normal."""
+    spacing = max(float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])), 1e-12)
+    tree = cKDTree(np.column_stack([place / spacing, NORMAL_WEIGHT * normal]))
+    return tree.query(np.column_stack([place_asked / spacing, NORMAL_WEIGHT * normal_asked]))[1]

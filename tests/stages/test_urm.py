@@ -1,0 +1,77 @@
+"""The urm stage from masks, align's maps and meshes to observations with visibility."""
+
+import numpy as np
+import pytest
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.raster import rasterise
+from factorlib.images.exr import write_exr
+from factorlib.jsonfile import write_json
+from factorlib.meshes import write_ply
+from factorlib.stage import Inputs, silent
+from factorlib.urm.observations import read_observations
+from stages import urm
+from tests.align.scenes import ball, mesh_of
+
+CAMERA = Camera(80, 60, 90.0, (40.0, 30.0))
+LEFT, RIGHT = Pose(np.eye(3), np.array([-1.05, 0.0, 6.0])), Pose(np.eye(3), np.array([1.05, 0.0, 6.0]))
+
+
+def step(folder, poses: dict[str, Pose]):
+    """Inputs of a photo of white balls."""
+    mesh = mesh_of([ball(1.0, 3)])
+    maps = rasterise([mesh] * len(poses), CAMERA, list(poses.values()))
+    inside = (maps.label > 0).astype("f4")
+    for stage in ("masks", "align"):
+        (folder / stage).mkdir(parents=True)
+    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")} | {
+        f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")
+    }
+    write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
+    clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
+    write_exr(folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside})
+    placed = {name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()} for name, pose in poses.items()}
+    camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
+    write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})
+    write_ply(folder / "ball.ply", mesh)
+    facts = {
+        "dataset.materials": ["white"],
+        "dataset.light": {"illumination": "room", "world_from_camera": None},
+        "dataset.objects": {
+            "camera": {},
+            "objects": [{"name": name, "mesh": "ball"} for name in poses],
+            "meshes": {"ball": {"file": "ball.ply", "material": "white"}},
+        },
+    }
+    return Inputs({stage: folder / stage for stage in ("masks", "align")}, facts, {"ball.ply": folder / "ball.ply"}, "a")
+
+
+def run(folder, inputs, **params):
+    folder.mkdir()
+    urm.main(urm.Params(**params), inputs, folder, silent)
+    return folder / "a.parquet"
+
+
+@pytest.fixture
+def two(tmp_path):
+    return step(tmp_path, {"left": LEFT, "right": RIGHT})
+
+
+def test_one_ball_sees_everything_and_its_file_says_nothing_of_visibility(tmp_path):
+    inputs = step(tmp_path, {"left": LEFT})
+    one, other = run(tmp_path / "1", inputs), run(tmp_path / "2", inputs, directions=0)
+    assert read_observations(one).visibility is None
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_two_balls_hide_each_other_where_they_face(tmp_path, two):
+    seen = read_observations(run(tmp_path / "out", two))
+    hidden = (seen.visibility < 255).mean(1)
+    left = seen.x < 40
+    assert seen.visibility.shape[1] == urm.Params().directions
+    assert hidden[left & (seen.normal[:, 0] > 0.6)].min() > hidden[left & (seen.normal[:, 0] < -0.2)].max()
+    assert (hidden[~left & (seen.normal[:, 0] > 0.2)] == 0).all()
+
+
+def test_the_same_bytes_again(tmp_path, two):
+    assert run(tmp_path / "1", two, merge_degrees=3.0).read_bytes() == run(tmp_path / "2", two, merge_degrees=3.0).read_bytes()

@@ -1,0 +1,143 @@
+"""Cast visibility: convex bodies see everything, occluders hide what geometry says, and few rays do for many points."""
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.raster import rasterise
+from factorlib.errors import InputError
+from factorlib.light.sphere import fibonacci_sphere
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import concatenate, read_observations, write_observations
+from factorlib.urm.visibility import Occluders, visibility
+from tests.align.scenes import at, ball, mesh_of
+from tests.urm.test_urm import observations
+
+CAMERA = Camera(64, 64, 100.0, (32.0, 32.0))
+AWAY = Pose(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(), np.array([0.1, -0.1, 5.0]))
+
+
+def pixels(meshes, poses, camera=CAMERA):
+    """x, y and normals of the pixels that show an object, and the object each shows."""
+    maps = rasterise(meshes, camera, poses)
+    y, x = np.nonzero(maps.object)
+    return x, y, maps.normal[y, x], maps.object[y, x]
+
+
+def seen_by(meshes, poses, count=256, most=10_000, camera=CAMERA):
+    x, y, normal, thing = pixels(meshes, poses, camera)
+    return visibility(Occluders(meshes, poses), camera, x, y, normal, count, most), normal, thing
+
+
+def open_share(seen, normal):
+    """Cosine-weighted share of the hemisphere that is seen."""
+    weight = np.maximum(normal @ fibonacci_sphere(seen.shape[1]).T, 0)
+    return np.sum(weight * (seen / 255), 1) / weight.sum(1)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(
+    "part",
+    [
+        ball(subdivisions=1),
+        ball(subdivisions=3),
+        trimesh.creation.box(extents=(1.5, 1, 0.7)),
+        trimesh.creation.cylinder(0.4, 1.5, sections=12),
+    ],
+)
+def test_no_convex_mesh_hides_anything_from_itself_however_coarse(part, scale):
+    """Smooth normals lean up to 30° away from the faces here."""
+    mesh = mesh_of([part.copy().apply_scale(scale)], crease_deg=60.0)
+    assert seen_by([mesh], [Pose(AWAY.rotation, AWAY.translation * scale)])[0] is None
+
+
+def test_a_ball_over_a_floor_hides_its_form_factor():
+    """A ball of radius r, its centre at distance d and angle θ from a floor's normal, wholly above the horizon, covers
+    (r/d)² cos θ of the cosine-weighted hemisphere."""
+    floor, radius, height = mesh_of([trimesh.creation.box(extents=(8, 8, 0.1))]), 0.5, 1.5
+    facing = Pose(np.eye(3), np.array([0.0, 0.0, 6.05]))  # its upper side, z = 6, faces the camera
+    centre = np.array([0.6, 0.0, 6 - height])
+    seen, normal, thing = seen_by([floor, mesh_of([ball(radius, 4)])], [facing, Pose(np.eye(3), centre)], count=2048)
+    x, y, *_ = pixels([floor, mesh_of([ball(radius, 4)])], [facing, Pose(np.eye(3), centre)])
+    place = CAMERA.rays_through(np.column_stack([x, y]) + 0.5) * 6
+    to_centre = centre - place
+    distance = np.linalg.norm(to_centre, axis=1)
+    expected = (radius / distance) ** 2 * height / distance
+    on_floor = thing == 1
+    assert expected[on_floor].max() > 0.09
+    np.testing.assert_allclose(1 - open_share(seen, normal)[on_floor], expected[on_floor], atol=0.008)
+
+
+def test_a_ball_beside_another_hides_it_from_one_side_only():
+    left, right = Pose(np.eye(3), np.array([-1.1, 0, 6])), Pose(np.eye(3), np.array([1.1, 0, 6]))
+    mesh = mesh_of([ball(1.0, 4)])
+    seen, normal, thing = seen_by([mesh, mesh], [left, right])
+    away = ((thing == 1) & (normal[:, 0] < -0.5)) | ((thing == 2) & (normal[:, 0] > 0.5))
+    assert (seen[away] == 255).all()
+    assert open_share(seen, normal)[(thing == 1) & (normal[:, 0] > 0.7)].max() < 0.9
+
+
+def dented():
+    """A ball with a deep bowl in it that faces the viewer, and a knob in the bowl."""
+    shell = ball(1.0, 4)
+    x, y, z = shell.vertices.T
+    deep = np.where(z < -0.5, -1.0 - z, z)
+    shell.vertices = np.column_stack([x, y, deep])
+    return mesh_of([shell, at(ball(0.2, 3), 0.1, 0.2, -0.3)])
+
+
+def test_a_subset_of_points_does_for_all():
+    camera, pose = Camera(160, 160, 300.0, (80.0, 80.0)), Pose(np.eye(3), np.array([0.0, 0.0, 4.0]))
+    every, normal, _ = seen_by([dented()], [pose], camera=camera, most=10**6)
+    some, _, _ = seen_by([dented()], [pose], camera=camera, most=len(normal) // 8)
+    error = np.abs(open_share(every, normal) - open_share(some, normal))
+    assert open_share(every, normal).min() < 0.75
+    assert error.mean() < 0.01
+
+
+def test_distance_and_units_change_nothing():
+    pose = Pose(np.eye(3), np.array([0.3, 0.0, 4.0]))
+    one = seen_by([dented()], [pose])[0]
+    other = dented()
+    other = msgspec.structs.replace(other, vertices=1000 * (other.vertices + [3.0, -2.0, 1.0]))
+    moved = Pose(np.eye(3), 1000 * (pose.translation - [3.0, -2.0, 1.0]))
+    assert np.mean(one != seen_by([other], [moved])[0]) < 1e-3
+
+
+def with_visibility(name="kitchen", seed=0, count=64):
+    seen = observations(name, name)
+    random = np.random.default_rng(seed).integers(0, 2, (len(seen), count)) * 255
+    return msgspec.structs.replace(seen, visibility=random.astype(np.uint8))
+
+
+def test_visibility_is_kept_in_parquet_and_absent_where_everything_is_seen(tmp_path):
+    seen = with_visibility()
+    write_observations(tmp_path / "a.parquet", seen)
+    again = read_observations(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(again.visibility, seen.visibility)
+    write_observations(tmp_path / "b.parquet", again)
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    write_observations(tmp_path / "c.parquet", observations())
+    assert read_observations(tmp_path / "c.parquet").visibility is None
+
+
+def test_merged_visibility_is_the_weighted_mean():
+    seen = with_visibility()
+    merged = merge(seen, 8.0)
+    total = (seen.weight[:, None] * seen.visibility).sum(0)
+    np.testing.assert_allclose((merged.weight[:, None] * merged.visibility).sum(0), total, rtol=2e-3)
+
+
+def test_photos_without_hidden_directions_see_all_beside_others():
+    part = with_visibility("a")
+    both = concatenate([part, observations("b", "b")])
+    np.testing.assert_array_equal(both.visibility[both.photo == 0], part.visibility)
+    assert (both.visibility[both.photo == 1] == 255).all()
+
+
+def test_sets_of_different_directions_are_not_mixed():
+    with pytest.raises(InputError, match="64, 128"):
+        concatenate([with_visibility("a"), with_visibility("b", count=128)])
