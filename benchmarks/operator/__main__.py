@@ -1,92 +1,86 @@
-"""Error and time of every reflection operator, as JSON: `python -m benchmarks.operator [--samples 16384]`.
+"""Time, error and looks of every reflection operator: writes operator.json and figures to build/bench/operator.
 
-Errors are |R − S| / (S + E/100) over the distribution of `factorlib.reflection.samples`, those of gradients
-|∂R − ∂S| / (|∂S| + S + E/100).  Time is a core's, per (observation, lobe), of `response`: values and all gradients.
+`python -m benchmarks.operator [--docs]`; --docs also refreshes the figures and tables of docs/operator.md.
 """
 
 from __future__ import annotations
 
-import time
+import shutil
+from pathlib import Path
 from typing import Annotated
 
 import torch
 import typer
 
-from factorlib.jsonfile import json_text
-from factorlib.reflection import reflection_operator
-from factorlib.reflection.accuracy import diffuse_table, quantiles, specular_table
-from factorlib.reflection.lobe import lobe_integral
-from factorlib.reflection.samples import diffuse_samples, specular_inputs, specular_samples
+from benchmarks.markdown import refresh
+from benchmarks.operator import stability
+from benchmarks.operator.errors import diffuse_errors, gradient_errors, gradients, specular_errors
+from benchmarks.operator.figures import errors_by_input, time_against_error
+from benchmarks.operator.spheres import LIGHT, render, spheres_figure
+from benchmarks.operator.tables import as_tables
+from benchmarks.operator.timing import cuda_rates, microseconds
+from benchmarks.operator.variants import fast_names, of_dtype, variants
+from factorlib.jsonfile import write_json
+from factorlib.reflection import Operator
+from factorlib.reflection.reference import Reference
+from factorlib.reflection.samples import diffuse_samples, specular_samples
 
-OPERATORS = (
-    ("closed_form", "float32"),
-    ("closed_form", "float64"),
-    ("network", "float32"),
-    ("network", "float64"),
-    ("paper_network", "float32"),
-    ("reference", "float64"),
-)
-SLOPES = ("roughness", "log_sharpness", "no", "nz", "oz")
-
-
-def errors(operator, samples) -> dict:
-    a, lam, no, nz, oz = (t.to(operator.dtype) for t in samples.inputs())
-    with torch.no_grad():
-        value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0]
-    return specular_table((value.double() - samples.value) / samples.scale(), *samples.inputs())
+ROOT = Path(__file__).resolve().parents[2]
+TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, "reference": 1e-7}
+FIGURES = ("time_against_error.svg", "errors_by_input.svg", "spheres.svg")
 
 
-def diffuse_errors(operator, samples) -> dict:
-    sharpness, nz = (t.to(operator.dtype)[:, None] for t in (samples.sharpness, samples.nz))
-    with torch.no_grad():
-        value = operator.diffuse(sharpness, nz)[:, 0]
-    return diffuse_table((value.double() - samples.value) / samples.scale(), samples.sharpness, samples.nz)
+def measured(count: int, gradient_count: int = 512) -> dict:
+    """{"operators": {label: {"microseconds", "specular", "diffuse", "gradients"}}, "bfloat16": …, "cuda": …}."""
+    fast = variants()
+    references = {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
+    times = microseconds(fast | references, lambda label: 8 if label in references else 1024)
+    specular, diffuse = specular_samples(count, 99, tolerance=1e-7), diffuse_samples(count, 98)
+    exact = gradients(references["reference"], gradient_count)
+    rows: dict[str, dict] = {label: {"microseconds": times[label]} for label in times}
+    for label, operator in fast.items():
+        rows[label] |= {"specular": specular_errors(operator, specular), "diffuse": diffuse_errors(operator, diffuse)}
+        rows[label]["gradients"] = gradient_errors(operator, exact, gradient_count)
+    for label, operator in references.items():
+        if label != "reference":
+            rows[label]["specular"] = specular_errors(operator, specular)
+    return {
+        "operators": rows,
+        "bfloat16": bfloat16(specular, diffuse),
+        "cuda": cuda_rates({k: o for k, o in fast.items() if "torch" not in k}),
+    }
 
 
-def gradient_errors(operator, reference, count: int = 512) -> dict:
-    found, exact = (gradients(o, *specular_inputs(count, 5)) for o in (operator, reference))
-    scale = exact[0] + lobe_integral(specular_inputs(count, 5)[1]) / 100
-    return {name: quantiles((f - e) / (e.abs() + scale)) for name, f, e in zip(SLOPES, found[1:], exact[1:], strict=True)}
+def bfloat16(specular, diffuse) -> dict:
+    """Formulas and weights in bfloat16, inputs rounded to it, by torch."""
+    operators: dict[str, Operator] = {name: of_dtype(name, torch.bfloat16) for name in fast_names()}
+    return {name: {"specular": specular_errors(o, specular), "diffuse": diffuse_errors(o, diffuse)} for name, o in operators.items()}
 
 
-def gradients(operator, alpha, sharpness, no, nz, oz) -> list[torch.Tensor]:
-    """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
-    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), no, nz, oz)]
-    value = operator.specular(leaves[0], leaves[1].exp(), *leaves[2:])
-    return [t.detach()[:, 0].double() for t in (value, *torch.autograd.grad(value.sum(), leaves))]
-
-
-def microseconds(operator, rows: int, lobes: int = 64) -> float:
-    """Least of five repeats, processor time, after one that compiles."""
-    g = torch.Generator().manual_seed(0)
-    n, o, z = (torch.nn.functional.normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1) for k in (rows, rows, lobes))
-    o = torch.where(((n * o).sum(1) > 0)[:, None], o, -o)
-    point = (torch.tensor(0.4), torch.logspace(-0.5, 3.5, lobes), (n * o).sum(1), n @ z.T, o @ z.T)
-    point = tuple(t.to(operator.dtype) for t in point)
-    operator.response(*point)
-    taken = []
-    for _ in range(5):
-        start = time.process_time()
-        operator.response(*point)
-        taken.append(time.process_time() - start)
-    return min(taken) / (rows * lobes) * 1e6
-
-
-def main(samples: Annotated[int, typer.Option(help="of the reference")] = 16384) -> None:
+def main(
+    samples: Annotated[int, typer.Option(help="of the reference")] = 16384,
+    light: Annotated[Path, typer.Option(help="lat-long map in which spheres are shown")] = LIGHT,
+    docs: Annotated[bool, typer.Option(help="also refresh docs/operator.md and its figures")] = False,
+    out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "operator",
+) -> None:
     torch.set_num_threads(1)
-    specular, diffuse, reference = (
-        specular_samples(samples, 99, tolerance=1e-6),
-        diffuse_samples(samples, 98),
-        reflection_operator("reference"),
-    )
-    table = {}
-    for name, dtype in OPERATORS:
-        operator = reflection_operator(name, dtype=dtype)
-        row = table[f"{name} {dtype}"] = {"microseconds": microseconds(operator, 8 if name == "reference" else 2048)}
-        if name != "reference":
-            row |= {"specular": errors(operator, specular), "gradients": gradient_errors(operator, reference)}
-            row["diffuse"] = diffuse_errors(operator, diffuse)
-    print(json_text(table), end="")
+    out.mkdir(parents=True, exist_ok=True)
+    result = measured(samples)
+    write_json(out / "operator.json", result)
+    (out / FIGURES[0]).write_text(time_against_error(result["operators"]), encoding="utf-8")
+    (out / FIGURES[1]).write_text(errors_by_input(result["operators"]), encoding="utf-8")
+    spheres = render(light)
+    write_json(out / "spheres.json", spheres.scores)
+    (out / FIGURES[2]).write_text(spheres_figure(spheres), encoding="utf-8")
+    laws = stability.measured()
+    write_json(out / "stability.json", laws)
+    if docs:
+        folder = ROOT / "docs" / "operator"
+        folder.mkdir(exist_ok=True)
+        for name in FIGURES:
+            shutil.copy(out / name, folder / name)
+        refresh(stability.DOCS, as_tables(result, spheres.scores) | stability.as_tables(laws))
+    print(f"{out}: operator.json, stability.json, spheres.json, {', '.join(FIGURES)}")
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ class Pairs(msgspec.Struct, frozen=True):
 
 def case(name: str) -> Pairs:
     if name == ALL:
-        together = [changed for changed in CASES.values()]
+        together = list(CASES.values())
         choices = {key: tuple(dict.fromkeys(v for c in [*together, ORDINARY] for v in c.get(key, ()))) for key in ORDINARY}
     else:
         choices = ORDINARY | CASES[name]

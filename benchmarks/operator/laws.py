@@ -99,10 +99,14 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness=(0.0, 3.0)) -> 
         return torch.nn.functional.normalize(torch.randn(count, 3, generator=g, dtype=torch.float64), dim=1)
 
     light = SimpleNamespace(
-        axis=unit(lobes), sharpness=torch.logspace(*sharpness, lobes, dtype=torch.float64), weight=torch.rand(lobes, 3, generator=g).double()
+        axis=unit(lobes),
+        sharpness=torch.logspace(*sharpness, lobes, dtype=torch.float64),
+        weight=torch.rand(lobes, 3, generator=g).double(),
     )
     material = SimpleNamespace(
-        diffuse=torch.tensor([0.3, 0.2, 0.1]).double(), specular=torch.tensor([0.2, 0.3, 0.4]).double(), roughness=torch.tensor(0.4).double()
+        diffuse=torch.tensor([0.3, 0.2, 0.1]).double(),
+        specular=torch.tensor([0.2, 0.3, 0.4]).double(),
+        roughness=torch.tensor(0.4).double(),
     )
     normals = unit(points)
     return light, material, normals, torch.nn.functional.normalize(normals + 0.8 * unit(points), dim=1)

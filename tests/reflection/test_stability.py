@@ -154,7 +154,9 @@ TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no
 @pytest.mark.parametrize("bad", INPUTS)
 def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
     operator = FAST[name]
-    point = dict(zip(INPUTS, (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2), strict=True))
+    point = dict(
+        zip(INPUTS, (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2), strict=True)
+    )
     point = {key: t.to(operator.dtype).clone() for key, t in point.items()}
     point[bad].view(-1)[0] = math.nan
     expected = torch.zeros(2, 2, dtype=torch.bool)
@@ -219,5 +221,8 @@ def test_roughness_one_is_no_edge(name):
     point = torch.tensor([0.5]), torch.tensor([[0.6]]), torch.tensor([[0.3]])
     point = tuple(t.to(operator.dtype) for t in point)
     for lam in (1e-4, 10.0, 1e5):
-        near, end = (operator.specular(torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype), *point) for r in (0.9999, 1.0))
+        near, end = (
+            operator.specular(torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype), *point)
+            for r in (0.9999, 1.0)
+        )
         assert float(end / near) == pytest.approx(1, abs=1e-3)
