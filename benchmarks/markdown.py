@@ -45,8 +45,9 @@ def exact(value: float, digits: int = 2) -> str:
     """
     if value == 0:
         return "0"
+    value = float(f"{value:.{digits}g}")
     if 1e-3 <= abs(value) < 1e4:
-        text = f"{float(f'{value:.{digits}g}'):.10f}".rstrip("0").rstrip(".")
+        text = f"{value:.10f}".rstrip("0").rstrip(".")
         return re.sub(r"^(-?)0\.", r"\1.", text)
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}·10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"

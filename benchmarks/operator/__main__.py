@@ -21,7 +21,6 @@ from benchmarks.operator.tables import as_tables
 from benchmarks.operator.timing import cuda_rates, microseconds
 from benchmarks.operator.variants import fast_names, of_dtype, variants
 from factorlib.jsonfile import write_json
-from factorlib.reflection import Operator
 from factorlib.reflection.reference import Reference
 from factorlib.reflection.samples import diffuse_samples, specular_samples
 
@@ -53,7 +52,7 @@ def measured(count: int, gradient_count: int = 512) -> dict:
 
 def bfloat16(specular, diffuse) -> dict:
     """Formulas and weights in bfloat16, inputs rounded to it, by torch."""
-    operators: dict[str, Operator] = {name: of_dtype(name, torch.bfloat16) for name in fast_names()}
+    operators = {name: operator for name in fast_names() if (operator := of_dtype(name, torch.bfloat16)) is not None}
     return {name: {"specular": specular_errors(o, specular), "diffuse": diffuse_errors(o, diffuse)} for name, o in operators.items()}
 
 

@@ -37,7 +37,7 @@ def measured() -> dict:
     fast = variants(("float32", "float64"))
     shown = {label: operator for label, operator in fast.items() if "float64" not in label}
     rows = {name: _case(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
-    held = {law: {label: [float(f"{v:.3g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
+    held = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
     return {"cases": rows, "laws": held}
 
 
@@ -79,7 +79,9 @@ def as_tables(result: dict) -> dict[str, str]:
         for name, row in result["cases"].items()
     ]
     values = [[name, *cells(row, "value")] for name, row in result["cases"].items() if name != ALL]
-    held = [[law, *(" / ".join(exact(v, 3) for v in row[label]) for label in labels)] for law, row in result["laws"].items()]
+    held = [
+        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)] for law, row in result["laws"].items()
+    ]
     return {
         "stability": table(["changed", *head], rounding),
         "special values": table(["changed", *head], values),

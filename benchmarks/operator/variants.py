@@ -40,9 +40,11 @@ def variants(dtypes: tuple[str, ...] = ("float32", "float64")) -> dict[str, Oper
     return {label: operator for label, operator in found.items() if operator is not None}
 
 
-def of_dtype(name: str, dtype: torch.dtype) -> Operator:
+def of_dtype(name: str, dtype: torch.dtype) -> Operator | None:
     """The operator in a precision that `reflection_operator` does not offer: weights and inputs rounded to it."""
     operator = made(name, "float64")
+    if operator is None:
+        return None
     operator.dtype = dtype
     if hasattr(operator, "layers"):
         operator.layers = {part: layers.to(dtype) for part, layers in operator.layers.items()}
