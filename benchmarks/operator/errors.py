@@ -10,7 +10,7 @@ from factorlib.reflection.accuracy import diffuse_table, quantiles, specular_tab
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import DiffuseSamples, Samples, specular_inputs
 
-SLOPES = ("roughness", "log_sharpness", "nz", "oz")
+SLOPES = ("roughness", "log_sharpness", "no", "nz", "oz")
 
 
 def specular_errors(operator: Operator, samples: Samples) -> dict:
@@ -49,6 +49,6 @@ def gradient_errors(operator: Operator, exact: list[Tensor], count: int) -> dict
 def gradients(operator: Operator, count: int) -> list[Tensor]:
     """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
     alpha, sharpness, no, nz, oz = specular_inputs(count, 5)
-    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), nz, oz)]
-    value = operator.specular(leaves[0], leaves[1].exp(), no.to(operator.dtype), *leaves[2:])
+    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), no, nz, oz)]
+    value = operator.specular(leaves[0], leaves[1].exp(), *leaves[2:])
     return [t.detach()[:, 0].double() for t in (value, *torch.autograd.grad(value.sum(), leaves))]

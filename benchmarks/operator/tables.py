@@ -6,7 +6,7 @@ from benchmarks.markdown import exact, table
 from benchmarks.operator.figures import name_of, variant_of
 
 QUANTILES = ("median", "p95", "p99", "worst")
-SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "nz": "n·z", "oz": "o·z"}
+SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}
 
 
 def as_tables(result: dict, scores: dict[str, dict[str, float]]) -> dict[str, str]:
