@@ -9,7 +9,7 @@ from html import escape
 import msgspec
 
 WIDTH, HEIGHT = 560, 240
-LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 40
+LEFT, RIGHT, TOP, BOTTOM = 58, 20, 12, 40
 
 
 class Series(msgspec.Struct, frozen=True):
