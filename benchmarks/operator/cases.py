@@ -93,14 +93,15 @@ def directions(place: str, n: Float[Tensor, "3"], o: Float[Tensor, "3"]) -> Floa
 
 
 class Found(msgspec.Struct, frozen=True):
-    """What an operator says of pairs, float64: every field of its Response, and the specular gradient by the lobe's direction.
+    """What an operator says of pairs, float64: every field of its Response, and the specular gradient by three directions.
 
-    The gradient by n·z and o·z goes off the sphere too: what moves a lobe is its part across the axis, formed in the
-    operator's own precision, |P (∂ₙz n + ∂ₒz o)| with P = I − z zᵀ.
+    Derivatives by n·o, n·z and o·z mean little alone: at the mirror direction no unit vectors change one and not the
+    others.  What counts is how the value changes as lobe, view or normal turn, formed in the operator's own precision:
+    for the lobe |P (∂ₙz n + ∂ₒz o)|, P = I − z zᵀ.
     """
 
     fields: dict[str, Tensor]
-    turning: Float[Tensor, "k 3"]
+    turning: Float[Tensor, "k 3 3"]  # by lobe, view, normal
 
     def finite(self) -> bool:
         return all(bool(t.isfinite().all()) for t in (*self.fields.values(), self.turning))
@@ -108,18 +109,24 @@ class Found(msgspec.Struct, frozen=True):
 
 def found(operator: Operator, given: Pairs) -> Found:
     fields: dict[str, Tensor] = {}
-    turning = torch.empty(len(given), 3, dtype=torch.float64)
+    turning = torch.empty(len(given), 3, 3, dtype=torch.float64)
     n, o, z = (t.to(operator.dtype) for t in (given.normal, given.view, given.axis))
     no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
-    across_n, across_o = n - nz[:, None] * z, o - oz[:, None] * z
     for r, lam, rows in given.groups():
         roughness, sharpness = torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype)
         response = operator.response(roughness, sharpness, no[rows], nz[rows, None], oz[rows, None])
         for name in response.__struct_fields__:
             fields.setdefault(name, torch.empty(len(given), dtype=torch.float64))[rows] = getattr(response, name)[:, 0].double()
-        turned = response.specular_by_nz * across_n[rows] + response.specular_by_oz * across_o[rows]
-        turning[rows] = turned.double()
+        by_no, by_nz, by_oz = response.specular_by_no, response.specular_by_nz, response.specular_by_oz
+        turns = ((z, n, by_nz), (z, o, by_oz)), ((o, n, by_no), (o, z, by_oz)), ((n, o, by_no), (n, z, by_nz))
+        for k, parts in enumerate(turns):
+            turning[rows, k] = sum(slope * across(moved, other)[rows] for moved, other, slope in parts).double()
     return Found(fields, turning)
+
+
+def across(axis: Float[Tensor, "k 3"], vector: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
+    """What of a vector stands across a unit axis."""
+    return vector - (axis * vector).sum(1, keepdim=True) * axis
 
 
 def value_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, "k"]:
@@ -134,5 +141,5 @@ def gradient_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, "k"]:
     for name in ("diffuse_by_log_sharpness", "diffuse_by_nz", "specular_by_roughness", "specular_by_log_sharpness"):
         base = b.fields[name.partition("_")[0]] + given.scale()
         worst = worst.maximum((a.fields[name] - b.fields[name]).abs() / (b.fields[name].abs() + base))
-    size = b.turning.norm(dim=1) + b.fields["specular"] + given.scale()
-    return worst.maximum((a.turning - b.turning).norm(dim=1) / size)
+    size = b.turning.norm(dim=2) + (b.fields["specular"] + given.scale())[:, None]
+    return worst.maximum(((a.turning - b.turning).norm(dim=2) / size).amax(1))

@@ -1,6 +1,6 @@
 """Special cases and laws, measured: `python -m benchmarks.operator.stability [--docs]`; --docs refreshes docs/operator.md.
 
-Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), the lobe's direction moving on the sphere.
+Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), lobe, view and normal turning.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ cases = pytest.mark.parametrize("changed", [*CASES, ALL])
 
 # float32 against float64: |R − S| / (S + E/100), and of gradients
 ROUNDING = {
-    "view at n·o = 10⁻⁴": (3e-3, 0.01),
+    "view at n·o = 10⁻⁴": (3e-3, 0.03),
     "lobe along the mirror direction": (2e-4, 5e-3),
     "lobe along −o": (1e-3, 0.1),  # the half vector is 0 / 0 there
     ALL: (0.03, 0.8),
