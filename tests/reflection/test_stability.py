@@ -29,12 +29,12 @@ ROUNDING = {
     "view at n·o = 10⁻⁴": (3e-3, 0.03),
     "lobe along the mirror direction": (2e-4, 5e-3),
     "lobe along −o": (1e-3, 0.1),  # the half vector is 0 / 0 there
-    ALL: (0.03, 0.8),
+    ALL: (0.03, 2.0),
 }
 # |R − S| / (S + E/100) of the network against the reference, where it is far off its median of .1 %
-VALUE = {"view at n·o = 10⁻⁴": 0.7, "roughness .03": 0.1, "sharpness 10⁶": 0.1}
+VALUE = {"view at n·o = 10⁻⁴": 0.5, "roughness .03": 0.2}
 # largest S of a unit lobe, exactly at most 1, in `laws.USUAL`, `laws.WIDER`, `laws.WHOLE`
-BRIGHTEST = {"closed_form": (3.5, 3.5, 20.0), "network": (1.02, 1.5, 10.0)}
+BRIGHTEST = {"closed_form": (7.0, 15.0, 150.0), "network": (1.02, 1.05, 15.0)}
 
 
 @lru_cache(maxsize=256)
@@ -199,13 +199,12 @@ def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
 @fast
 def test_constant_light_comes_back_from_white(name):
     assert laws.white_lambert(FAST[name])[0] < 1e-3
-    assert laws.constant_light(FAST[name], 512)[1] < (3.5 if "closed" in name else 1.01)
+    assert laws.constant_light(FAST[name], 512)[1] < (6 if "closed" in name else 1.01)
 
 
-def test_point_lights_are_the_brdf():
-    """The network fades to the formula, whose half vectors end at 80° from the normal: a few cases in a thousand are far off."""
-    for name in ("closed_form", "network"):
-        assert laws.point_light(FAST[name])[0] < 0.02
+@fast
+def test_point_lights_are_the_brdf(name):
+    assert laws.point_light(FAST[name], 1024)[1] < 0.02
 
 
 @single
