@@ -35,6 +35,9 @@ test: .venv/ready
 	@.venv/bin/lint-imports --no-cache
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
 
+bench-%: .venv/ready
+	@OMP_NUM_THREADS=1 $(PY) -m benchmarks.$*
+
 data: .venv/ready
 	@$(PY) -m factorlib.generate synthetic
 	@$(PY) -m factorlib.generate eames
@@ -49,6 +52,7 @@ help:
 	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'
+	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'
 	@echo 'make data                            make data/ again'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 

@@ -9,6 +9,7 @@ the formula's limit: the correction fades as 1/√λ.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import msgspec
@@ -122,15 +123,18 @@ class Network(Operator):
         self.fused = {part: fused(part, layers) for part, layers in self.layers.items()} if dtype == torch.float32 else {}
 
     def _compiled(self, sharpness: Tensor, *others: Tensor) -> bool:
-        """Whether compiled code can answer: it is there, a lobe a column, on the CPU, and autograd does not listen."""
+        """Whether compiled code can answer: it is there, a lobe a column, on the CPU, finite, and autograd does not listen.
+
+        Compiled code takes NaN for a number; torch hands it on.
+        """
         if not self.fused or not all(self.fused.values()) or sharpness.ndim != 1:
             return False
         listening = torch.is_grad_enabled() and any(t.requires_grad for t in (sharpness, *others))
-        return not listening and all(t.device.type == "cpu" for t in (sharpness, *others))
+        return not listening and all(t.device.type == "cpu" and math.isfinite(t.sum()) for t in (sharpness, *others))
 
     def response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
         """As of every operator; in float32 by compiled code, where there is a compiler."""
-        if not self._compiled(sharpness.detach(), nz.detach()):
+        if not self._compiled(*(t.detach() for t in (sharpness, roughness, no, nz, oz))):
             return super().response(roughness, sharpness, no, nz, oz)
         diffuse, _, diffuse_by_log_sharpness, _, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
         return Response(diffuse, diffuse_by_log_sharpness, diffuse_by_nz, *self.fused["specular"](float(roughness), sharpness, no, nz, oz))

@@ -85,14 +85,14 @@ class Operator:
 
         lobes:     .axis [p, 3] unit, .sharpness [p], .weight [p, 3]
         material:  .diffuse [3], .specular [3], .roughness []
-        normals, views: unit, any common frame; surfaces that face away reflect nothing
+        normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
         """
         axis, sharpness, weight = (torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight))
         kd, ks, roughness = (torch.as_tensor(t).to(self.dtype) for t in (material.diffuse, material.specular, material.roughness))
         normals, views = (torch.as_tensor(t).to(self.dtype) for t in (normals, views))
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
         radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (self.specular(roughness, sharpness, no, nz, oz) @ weight)
-        return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
+        return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # so that NaN is not zero
 
 
 def columns(no: Tensor) -> Tensor:

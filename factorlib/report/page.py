@@ -31,7 +31,7 @@ CONTENTS = {
     "errors": "Errors",
     "solve": "Solve",
     "poses": "Poses",
-    "training": "Networks",
+    "training": "Reflection operator",
     "cost": "Cost",
 }
 

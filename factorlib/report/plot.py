@@ -9,7 +9,7 @@ from html import escape
 import msgspec
 
 WIDTH, HEIGHT = 560, 240
-LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 40
+LEFT, RIGHT, TOP, BOTTOM = 58, 20, 12, 40
 
 
 class Series(msgspec.Struct, frozen=True):
@@ -20,16 +20,22 @@ class Series(msgspec.Struct, frozen=True):
     y: Sequence[float]
 
 
-def line_plot(series: Sequence[Series], x_label: str, y_label: str, *, log_y: bool = False, steps: Sequence[float] = ()) -> str:
-    """An SVG of the series; empty text if there is nothing to draw.  `steps`: x of thin vertical rules."""
+def line_plot(
+    series: Sequence[Series], x_label: str, y_label: str, *, log_y: bool = False, steps: Sequence[float] = (), names: Sequence[str] = ()
+) -> str:
+    """An SVG of the series; empty text if there is nothing to draw.
+
+    steps: x of thin vertical rules;  names: what stands at x = 0, 1, … in place of numbers
+    """
     kept = [[(x, y) for x, y in zip(s.x, s.y, strict=True) if _drawable(y, log_y)] for s in series]
     points = [p for line in kept for p in line]
     if not points:
         return ""
     xs, ys = [p[0] for p in points], [math.log10(p[1]) if log_y else p[1] for p in points]
-    across, up = _scale(min(xs), max(xs), LEFT, WIDTH - RIGHT), _scale(*_padded(min(ys), max(ys)), HEIGHT - BOTTOM, TOP)
+    aside = 0.4 if names else 0.0
+    across, up = _scale(min(xs) - aside, max(xs) + aside, LEFT, WIDTH - RIGHT), _scale(*_padded(min(ys), max(ys)), HEIGHT - BOTTOM, TOP)
     parts = [f'<line class="rule" x1="{across(x):.1f}" x2="{across(x):.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>' for x in steps]
-    parts += _y_axis(up, min(ys), max(ys), log_y) + _x_axis(across, min(xs), max(xs))
+    parts += _y_axis(up, min(ys), max(ys), log_y) + _x_axis(across, min(xs), max(xs), names)
     parts += [_polyline(line, k, across, up, log_y) for k, line in enumerate(kept) if line]
     labels = (
         f'<text class="label" x="{(LEFT + WIDTH - RIGHT) / 2:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text>'
@@ -89,10 +95,11 @@ def _y_axis(up, low: float, high: float, log_y: bool) -> list[str]:
     return found
 
 
-def _x_axis(across, low: float, high: float) -> list[str]:
+def _x_axis(across, low: float, high: float, names: Sequence[str]) -> list[str]:
     base = HEIGHT - BOTTOM
+    marks = list(enumerate(names)) if names else [(v, f"{v:g}") for v in ticks(low, high, 8)]
     found = [f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{base}" y2="{base}"/>']
-    return found + [f'<text x="{across(v):.1f}" y="{base + 14}" text-anchor="middle">{v:g}</text>' for v in ticks(low, high, 8)]
+    return found + [f'<text x="{across(v):.1f}" y="{base + 14}" text-anchor="middle">{escape(text)}</text>' for v, text in marks]
 
 
 def _polyline(line: list[tuple[float, float]], k: int, across, up, log_y: bool) -> str:

@@ -173,8 +173,15 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     history = {"iteration": steps, "round": steps // 10, "lobes": 4 * (1 + steps // 10)}
     history |= {"loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02}
     pq.write_table(pa.table({**history, "phase": ["joint"] * 30}), folders["solve"] / "convergence.parquet")
-    bins = {"sharpness": {"3 to 30": {"median": 0.002, "samples": 7}, "30 to 300": {"median": 0.003}, "0.3 to 3": {"median": 0.001}}}
+    bins = {
+        "sharpness": {
+            "3 to 30": {"median": 0.002, "p95": 0.02, "samples": 7},
+            "30 to 300": {"median": 0.003},
+            "0.3 to 3": {"median": 0.001},
+        }
+    }
     summary = {"median": 0.001, "p95": 0.004, "samples": 100}
     write_json(folders["train"] / "accuracy.json", {"diffuse": summary, "specular": summary | bins})
-    curve = {"part": ["specular"] * 3 + ["diffuse"] * 3, "step": [100, 200, 300] * 2, "loss": [0.3, 0.2, 0.1] * 2}
-    pq.write_table(pa.table(curve | {"median": [0.1, 0.05, 0.02] * 2, "p95": [0.3, 0.2, 0.1] * 2}), folders["train"] / "training.parquet")
+    curve = {"part": ["specular"] * 3 + ["diffuse"] * 3, "step": [100, 200, 300] * 2, "training_loss": [0.3, 0.2, 0.1] * 2}
+    curve |= {"held_out_median_error": [0.1, 0.05, 0.02] * 2, "held_out_p95_error": [0.3, 0.2, 0.1] * 2}
+    pq.write_table(pa.table(curve), folders["train"] / "training.parquet")

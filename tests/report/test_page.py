@@ -126,6 +126,16 @@ def test_bins_of_the_networks_error_stand_in_order(made):
     assert order == sorted(order) and "0.20 %" in section
 
 
+def test_error_by_what_is_asked_and_the_training_curve_are_drawn(made):
+    section = made[2].split('id="training"')[1].split('id="cost"')[0]
+    plots = re.findall(r'<svg class="plot".*?</svg>', section)
+    assert [set(re.findall(r'class="label"[^>]*>([^<]*)<', p)) for p in plots] == [
+        {"sharpness", "relative error, %"}, {"training step", "relative error, %"}
+    ]  # fmt: skip
+    assert all(f">{name}</text>" in plots[0] for name in ("0.3 to 3", "3 to 30", "30 to 300"))
+    assert plots[1].count("<polyline") == 4 and "diffuse, 95th percentile" in section
+
+
 def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
     _, inputs, html = made
     again = page_of(msgspec.structs.replace(inputs, log=None), tmp_path / "again")

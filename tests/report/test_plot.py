@@ -24,6 +24,12 @@ def test_nothing_to_draw_gives_nothing():
     assert line_plot([], "x", "y") == ""
 
 
+def test_named_places_stand_in_for_numbers():
+    svg = line_plot([Series("a", [0, 1], [1.0, 2.0])], "x", "y", names=["few", "many & more"])
+    ET.fromstring(svg)
+    assert ">few</text>" in svg and ">many &amp; more</text>" in svg and ">0.2</text>" not in svg
+
+
 def test_larger_values_stand_higher():
     svg = line_plot([Series("a", [0, 1], [1.0, 2.0])], "x", "y")
     (x0, y0), (x1, y1) = (tuple(map(float, p.split(","))) for p in re.search(r'points="([^"]*)"', svg)[1].split())

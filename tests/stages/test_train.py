@@ -8,6 +8,7 @@ from safetensors import safe_open
 
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
+from factorlib.report.training import CURVES
 from factorlib.stage import Inputs, silent
 from stages import train
 
@@ -40,6 +41,10 @@ def test_a_brief_training_already_beats_the_formula(trained):
     accuracy = json.loads((trained[0] / "accuracy.json").read_text())["specular"]
     assert accuracy["median"] < 0.013  # the formula's own, see tests/reflection
     assert set(accuracy) >= {"roughness", "sharpness", "cosine of the view", "degrees from the mirror direction"}
+
+
+def test_the_report_finds_the_curve(trained):
+    assert set(CURVES) <= set(pq.read_schema(trained[0] / "training.parquet").names)
 
 
 def test_the_curve_falls(trained):

@@ -1,0 +1,53 @@
+"""Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from factorlib.errors import InputError
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown, its first column to the left.
+
+    >>> print(table(["case", "error"], [["all", "1 %"]]))
+    | case | error |
+    |---|---:|
+    | all | 1 % |
+    """
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("|" + "|".join(cells) + "|" if k == 1 else "| " + " | ".join(cells) + " |" for k, cells in enumerate(lines))
+
+
+def replaced(text: str, name: str, inner: str, file: Path | None = None) -> str:
+    """`text` with `inner` between the marks of `name`."""
+    pattern = re.compile(rf"(<!-- begin {re.escape(name)} -->\n).*?(<!-- end {re.escape(name)} -->)", re.DOTALL)
+    if not pattern.search(text):
+        raise InputError(f"no place for the table '{name}'", file=file, cure=f"add <!-- begin {name} --> and <!-- end {name} -->")
+    return pattern.sub(lambda found: f"{found[1]}{inner}\n{found[2]}", text)
+
+
+def refresh(path: Path, parts: dict[str, str]) -> None:
+    """Write each part between its marks in the file."""
+    text = path.read_text(encoding="utf-8")
+    for name, inner in parts.items():
+        text = replaced(text, name, inner, path)
+    path.write_text(text, encoding="utf-8")
+
+
+def exact(value: float, digits: int = 2) -> str:
+    """That many significant digits, powers of ten for what is tiny or huge.
+
+    >>> exact(0.00123), exact(0.000012), exact(0.0), exact(12.3), exact(48000.0)
+    ('.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
+    """
+    if value == 0:
+        return "0"
+    value = float(f"{value:.{digits}g}")
+    if 1e-3 <= abs(value) < 1e4:
+        text = f"{value:.10f}".rstrip("0").rstrip(".")
+        return re.sub(r"^(-?)0\.", r"\1.", text)
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}·10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"

@@ -1,0 +1,101 @@
+"""Special cases and laws, measured: `python -m benchmarks.operator.stability [--docs]`; --docs refreshes docs/operator.md.
+
+Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), lobe, view and normal turning.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from benchmarks.markdown import exact, refresh, table
+from benchmarks.operator import laws
+from benchmarks.operator.cases import ALL, CASES, Found, Pairs, case, found, gradient_error, value_error
+from benchmarks.operator.variants import REFERENCE, made, variants
+from factorlib.jsonfile import json_text
+from factorlib.reflection import Operator
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "operator.md"
+LAWS = {
+    "reflection of a unit lobe, at most 1: roughness ≥ .1, n·o ≥ .02": lambda o: laws.unit_lobes(o, laws.USUAL),
+    "… roughness ≥ .1, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WIDER),
+    "… roughness ≥ .03, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WHOLE),
+    "least of it, at least 0": laws.least_reflected,
+    "GGX of k_s = 1 under constant light, at most 1": laws.constant_light,
+    "white Lambert under constant light, distance from 1": laws.white_lambert,
+    "point light (λ = 10⁶), distance from the BRDF": laws.point_light,
+    "everything turned: change over the largest radiance": laws.turned,
+    "weights times 10⁶: relative change of radiance / 10⁶": laws.scaled,
+}
+
+
+def measured() -> dict:
+    """{"cases": {case: {operator: {measure: number}}}, "laws": {law: {operator: [p99, worst] or [worst]}}}."""
+    fast = variants(("float32", "float64"))
+    shown = {label: operator for label, operator in fast.items() if "float64" not in label}
+    rows = {name: _case(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
+    held = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
+    return {"cases": rows, "laws": held}
+
+
+def _case(given: Pairs, shown: dict[str, Operator], fast: dict[str, Operator], with_reference: bool) -> dict:
+    exactly = {name: found(fast[f"{name} float64"], given) for name in {label.split()[0] for label in shown} if f"{name} float64" in fast}
+    true = _values(given) if with_reference else None
+    return {label: _measures(found(operator, given), exactly.get(label.split()[0]), true, given) for label, operator in shown.items()}
+
+
+def _values(given: Pairs) -> dict[str, torch.Tensor]:
+    """Diffuse and specular of the reference."""
+    reference = made(REFERENCE, "float64")
+    n, o, z = given.normal, given.view, given.axis
+    no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
+    with torch.no_grad():
+        specular = reference.specular(given.roughness[:, None], given.sharpness[:, None], no, nz, oz)
+        return {"diffuse": reference.diffuse(given.sharpness[:, None], nz)[:, 0], "specular": specular[:, 0]}
+
+
+def _measures(told: Found, exactly: Found | None, true: dict | None, given: Pairs) -> dict:
+    measures: dict = {"pairs": len(given), "finite": told.finite()}
+    if exactly is not None:
+        measures |= {"value_rounding": value_error(told, exactly, given), "gradient_rounding": gradient_error(told, exactly, given)}
+    if true is not None:
+        measures["value"] = value_error(told, Found(true, told.turning), given)
+    return {k: float(f"{float(v.max()):.3g}") if torch.is_tensor(v) else v for k, v in measures.items()}
+
+
+def as_tables(result: dict) -> dict[str, str]:
+    labels = list(next(iter(result["cases"].values())))
+    head = [label.replace("_", " ").replace(" float32", "") for label in labels]
+
+    def cells(row: dict, *names: str) -> list[str]:
+        return [" / ".join(exact(row[label][n]) if n in row[label] else "–" for n in names) for label in labels]
+
+    finite = {name: ["" if row[label]["finite"] else " **not finite**" for label in labels] for name, row in result["cases"].items()}
+    rounding = [
+        [name, *(a + b for a, b in zip(cells(row, "value_rounding", "gradient_rounding"), finite[name], strict=True))]
+        for name, row in result["cases"].items()
+    ]
+    values = [[name, *cells(row, "value")] for name, row in result["cases"].items() if name != ALL]
+    held = [
+        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)] for law, row in result["laws"].items()
+    ]
+    return {
+        "stability": table(["changed", *head], rounding),
+        "special values": table(["changed", *head], values),
+        "laws": table(["law", *head], held),
+    }
+
+
+def main(docs: Annotated[bool, typer.Option(help="also refresh the tables in docs/operator.md")] = False) -> None:
+    torch.set_num_threads(1)
+    result = measured()
+    print(json_text(result), end="")
+    if docs:
+        refresh(DOCS, as_tables(result))
+
+
+if __name__ == "__main__":
+    typer.run(main)

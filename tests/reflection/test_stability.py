@@ -1,0 +1,227 @@
+"""Values and gradients hold where formulas break: finite, within stated bounds, and NaN never comes out as a number."""
+
+import math
+from functools import lru_cache
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.operator import laws
+from benchmarks.operator.cases import ALL, CASES, case, found, gradient_error, value_error
+from benchmarks.operator.variants import made
+from factorlib.reflection import reflection_operator
+
+COMPILED, TORCH = reflection_operator("network"), made("network", "float32", compiled=False) or reflection_operator("network")
+FAST = {
+    "closed_form": reflection_operator("closed_form"), "network": COMPILED, "network in torch": TORCH,
+    "closed_form float64": reflection_operator("closed_form", dtype="float64"), "network float64": reflection_operator("network", dtype="float64"),
+}  # fmt: skip
+REFERENCE = reflection_operator("reference")
+fast = pytest.mark.parametrize("name", FAST)
+single = pytest.mark.parametrize("name", ["closed_form", "network", "network in torch"])
+cases = pytest.mark.parametrize("changed", [*CASES, ALL])
+
+# float32 against float64: |R − S| / (S + E/100), and of gradients
+ROUNDING = {
+    "view at n·o = 10⁻⁴": (3e-3, 0.03),
+    "lobe along the mirror direction": (2e-4, 5e-3),
+    "lobe along −o": (1e-3, 0.1),  # the half vector is 0 / 0 there
+    ALL: (0.03, 2.0),
+}
+# |R − S| / (S + E/100) of the network against the reference, where it is far off its median of .1 %
+VALUE = {"view at n·o = 10⁻⁴": 0.5, "roughness .03": 0.2}
+# largest S of a unit lobe, exactly at most 1, in `laws.USUAL`, `laws.WIDER`, `laws.WHOLE`
+BRIGHTEST = {"closed_form": (7.0, 15.0, 150.0), "network": (1.02, 1.05, 15.0)}
+
+
+@lru_cache(maxsize=256)
+def told_by(name: str, changed: str):
+    return found(FAST[name], case(changed))
+
+
+@fast
+@cases
+def test_everything_is_finite_and_not_negative(name, changed):
+    told = told_by(name, changed)
+    assert told.finite()
+    assert all((told.fields[part] >= 0).all() for part in ("diffuse", "specular"))
+
+
+@single
+@cases
+def test_single_precision_is_enough(name, changed):
+    given = case(changed)
+    told, exactly = told_by(name, changed), told_by(f"{name.split()[0]} float64", changed)
+    value, gradient = ROUNDING.get(changed, (1e-4, 1e-3))
+    assert value_error(told, exactly, given).max() < value
+    assert gradient_error(told, exactly, given).max() < gradient
+
+
+@cases
+def test_the_reference_is_finite_and_within_its_law(changed):
+    given, some = case(changed), slice(0, None, 397 if changed == ALL else 31)
+    true = reference_values(given, some)
+    assert all(t.isfinite().all() and (t >= 0).all() and (t <= 1 + 1e-6).all() for t in true.values())
+
+
+@pytest.mark.parametrize("changed", CASES)
+def test_the_network_is_near_the_reference(changed):
+    given, some = case(changed), slice(0, None, 23)
+    told, true = told_by("network", changed), reference_values(given, some)
+    for part in true:
+        error = (told.fields[part][some] - true[part]).abs() / (true[part] + given.scale()[some])
+        assert error.max() < VALUE.get(changed, 0.08), part
+
+
+def reference_values(given, some) -> dict:
+    n, o, z = given.normal[some], given.view[some], given.axis[some]
+    no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
+    sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
+    with torch.no_grad():
+        return {"diffuse": REFERENCE.diffuse(sharpness, nz)[:, 0], "specular": REFERENCE.specular(roughness, sharpness, no, nz, oz)[:, 0]}
+
+
+# gradients of the call ------------------------------------------------------------------------------------------------
+
+PLACES = ("n", "−n", "mirror", "o", "−o", "anywhere")
+vector = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 1e-3)
+
+
+def leaves_of(light, material, normals, views, dtype) -> dict[str, torch.Tensor]:
+    named = vars(light) | vars(material) | {"normals": normals, "views": views}
+    return {key: t.detach().to(dtype).clone().requires_grad_() for key, t in named.items()}
+
+
+def called(operator, leaves):
+    light, material = (
+        SimpleNamespace(**{k: leaves[k] for k in keys}) for keys in (("axis", "sharpness", "weight"), ("diffuse", "specular", "roughness"))
+    )
+    return operator(light, material, leaves["normals"], leaves["views"])
+
+
+def gradients(operator, leaves) -> dict[str, torch.Tensor]:
+    radiance = called(operator, leaves)
+    return {"radiance": radiance.detach()} | dict(zip(leaves, torch.autograd.grad(radiance.sum(), list(leaves.values())), strict=True))
+
+
+@fast
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    normal=vector, view=vector, axis=vector, place=st.sampled_from(PLACES), roughness=st.floats(0.03, 1), weight=st.sampled_from([0.0, 1.0, 1e6]),
+    log_sharpness=st.floats(math.log(1e-4), math.log(1e6)), cosine=st.sampled_from([None, 1e-4, 1.0]),
+)  # fmt: skip
+def test_radiance_and_every_gradient_are_finite(name, normal, view, axis, place, roughness, weight, log_sharpness, cosine):
+    operator = FAST[name]
+    n, o, z = (torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in (normal, view, axis))
+    if cosine is not None:
+        across = torch.nn.functional.normalize(torch.linalg.cross(n, o) + 1e-12, dim=0)
+        o = cosine * n + math.sqrt(1 - cosine**2) * across
+    z = {"n": n, "−n": -n, "mirror": 2 * (n @ o) * n - o, "o": o, "−o": -o, "anywhere": z}[place]
+    light = SimpleNamespace(axis=z[None], sharpness=torch.tensor([math.exp(log_sharpness)]), weight=torch.full((1, 3), weight))
+    material = SimpleNamespace(diffuse=torch.full((3,), 0.5), specular=torch.full((3,), 0.5), roughness=torch.tensor(roughness))
+    slopes = gradients(operator, leaves_of(light, material, n[None], o[None], operator.dtype))
+    assert all(t.isfinite().all() for t in slopes.values()), {k: t for k, t in slopes.items() if not t.isfinite().all()}
+    assert (slopes["radiance"] >= 0).all()
+    assert slopes["radiance"].max() <= 0.5 * weight * (1.01 + BRIGHTEST[name.split()[0]][2])
+
+
+@fast
+@pytest.mark.parametrize("sharpness", [(-4, 0), (0, 3), (3, 6)], ids=["wide", "ordinary", "sharp"])
+def test_gradients_obey_the_laws_of_the_radiance(name, sharpness):
+    """Linear in weight, and in k: Euler's Σ w ∂R/∂w = R.  Nothing changes when all turns: Σ x × ∂R/∂x = 0."""
+    operator = FAST[name]
+    leaves = leaves_of(*laws.scene(3, sharpness=sharpness), operator.dtype)
+    slopes = gradients(operator, leaves)
+    total, most = slopes["radiance"].sum(), {torch.float32: 1e-5, torch.float64: 1e-10}[operator.dtype]
+    for keys in (("weight",), ("diffuse", "specular")):
+        euler = sum((leaves[k].detach() * slopes[k]).sum() for k in keys)
+        assert abs(float(euler / total) - 1) < most
+    torque = [torch.linalg.cross(leaves[k].detach(), slopes[k]) for k in ("axis", "normals", "views")]
+    size = sum(t.norm(dim=1).sum() for t in torque) + total
+    assert float(sum(t.sum(0) for t in torque).norm() / size) < 30 * most
+
+
+# what is not a number -------------------------------------------------------------------------------------------------
+
+INPUTS = ("roughness", "sharpness", "no", "nz", "oz")
+TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no": ("specular",), "nz": ("diffuse", "specular"), "oz": ("specular",)}  # fmt: skip
+
+
+@fast
+@pytest.mark.parametrize("bad", INPUTS)
+def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
+    operator = FAST[name]
+    point = dict(
+        zip(INPUTS, (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2), strict=True)
+    )
+    point = {key: t.to(operator.dtype).clone() for key, t in point.items()}
+    point[bad].view(-1)[0] = math.nan
+    expected = torch.zeros(2, 2, dtype=torch.bool)
+    expected[{"roughness": (slice(None), slice(None)), "sharpness": (slice(None), 0), "no": (0, slice(None))}.get(bad, (0, 0))] = True
+    response = operator.response(**point)
+    with torch.no_grad():
+        values = {"diffuse": operator.diffuse(point["sharpness"], point["nz"]), "specular": operator.specular(**point)}
+    for part in ("diffuse", "specular"):
+        touched = expected if part in TOUCHED[bad] else torch.zeros_like(expected)
+        assert torch.equal(getattr(response, part).isnan(), touched), part
+        assert torch.equal(values[part].isnan(), touched), part
+
+
+@fast
+@pytest.mark.parametrize("bad", ["axis", "sharpness", "weight", "diffuse", "specular", "roughness", "normals", "views"])
+def test_nan_in_a_call_is_nan_in_its_radiance(name, bad):
+    operator = FAST[name]
+    leaves = {key: t.detach() for key, t in leaves_of(*laws.scene(1, points=4), operator.dtype).items()}
+    leaves[bad].view(-1)[0] = math.nan
+    radiance = called(operator, leaves)
+    if bad in ("normals", "views"):
+        assert radiance[0].isnan().all() and not radiance[1:].isnan().any()
+    elif bad in ("weight", "diffuse", "specular"):
+        assert radiance[:, 0].isnan().all() and not radiance[:, 1:].isnan().any()
+    else:
+        assert radiance.isnan().all()
+
+
+# laws -----------------------------------------------------------------------------------------------------------------
+
+
+@single
+@pytest.mark.parametrize("domain", [laws.USUAL, laws.WIDER, laws.WHOLE], ids=["usual", "wider", "whole"])
+def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
+    which = (laws.USUAL, laws.WIDER, laws.WHOLE).index(domain)
+    assert laws.unit_lobes(FAST[name], domain, 1024)[1] < BRIGHTEST[name.split()[0]][which]
+    assert laws.least_reflected(FAST[name], 1024)[0] >= 0
+
+
+@fast
+def test_constant_light_comes_back_from_white(name):
+    assert laws.white_lambert(FAST[name])[0] < 1e-3
+    assert laws.constant_light(FAST[name], 512)[1] < (6 if "closed" in name else 1.01)
+
+
+@fast
+def test_point_lights_are_the_brdf(name):
+    assert laws.point_light(FAST[name], 1024)[1] < 0.02
+
+
+@single
+def test_turning_and_scaling_change_nothing_else(name):
+    assert laws.turned(FAST[name])[0] < 3e-6
+    assert laws.scaled(FAST[name])[0] < 3e-6
+
+
+@fast
+def test_roughness_one_is_no_edge(name):
+    """The last step to roughness 1, where k = (1 − α²)/α² vanishes, changes no more than any other."""
+    operator = FAST[name]
+    point = torch.tensor([0.5]), torch.tensor([[0.6]]), torch.tensor([[0.3]])
+    point = tuple(t.to(operator.dtype) for t in point)
+    for lam in (1e-4, 10.0, 1e5):
+        near, end = (
+            operator.specular(torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype), *point)
+            for r in (0.9999, 1.0)
+        )
+        assert float(end / near) == pytest.approx(1, abs=1e-3)
