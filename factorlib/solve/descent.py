@@ -59,13 +59,15 @@ def descend(
         materials = Materials.of_vector(current.materials.vector() + step.materials)
         lights = [light.moved(by) for light, by in zip(current.lights, step.lights, strict=True)]
         trial = evaluated(blocks, materials, lights, operator, loss, map_)
-        if trial.loss < current.loss:
-            idle = idle + 1 if current.loss - trial.loss < descent.tolerance * current.loss else 0
-            current, damping = trial, max(damping / 5, 1e-9)
+        gained = current.loss - trial.loss
+        trust = gained / max(step.promised, 1e-300)
+        if gained > 0:
+            idle = idle + 1 if gained < descent.tolerance * current.loss else 0
+            current = trial
             report(iteration, current)
         else:
-            damping *= 6
             idle += damping > 1e6
+        damping = max(damping / 10, 1e-9) if trust > 0.6 else damping if trust > 0.2 else damping * 6
         if idle >= 2:
             break
     return current

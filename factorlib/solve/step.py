@@ -21,32 +21,81 @@ from scipy.linalg import cho_factor, cho_solve
 from factorlib.solve.normal_equations import System
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Light, Materials
 
+ROUNDS = 12
+MOST_WIDTHS, MOST_TURN, MOST_LOG_SHARPNESS = 0.7, 0.3, 0.7  # of a lobe in one step: its own widths, radians
 FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
 
 
 class Step(msgspec.Struct, frozen=True):
+    """A step of all unknowns, and by how much the quadratic model falls with it."""
+
     materials: Float[np.ndarray, "7m"]
     lights: list[Float[np.ndarray, "l"]]
+    promised: float
 
 
 def damped_step(systems: Sequence[System], materials: Materials, lights: Sequence[Light], damping: float) -> Step:
-    """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation."""
+    """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation.
+
+    Solved again, at most `ROUNDS` times, while it makes a weight negative (which is then held at zero) or takes a lobe
+    farther than the quadratic model is good for (which is then damped more, that lobe alone).
+    """
     gradient = np.sum([s.material_gradient for s in systems], axis=0)
     hessian = np.sum([s.material_hessian for s in systems], axis=0)
     free = ~held_materials(materials, gradient)
+    bounds = [Bounds(s, light) for s, light in zip(systems, lights, strict=True)]
+    for _ in range(ROUNDS):
+        by_material, by_light = _solved(systems, gradient, hessian, free, bounds, damping)
+        if not any([bound.tighten(step) for bound, step in zip(bounds, by_light, strict=True)]):
+            break
+    promised = -by_material @ (2 * gradient + hessian @ by_material)
+    for s, step in zip(systems, by_light, strict=True):
+        promised -= step @ (2 * s.light_gradient + s.light_hessian @ step + 2 * s.cross_hessian.T @ by_material)
+    return Step(by_material, by_light, float(promised))
+
+
+class Bounds:
+    """What a light's step must keep to: unknowns that are not free take `fixed`; `extra` is their own damping."""
+
+    def __init__(self, s: System, light: Light):
+        self.light, self.diagonal = light, np.diag(s.light_hessian)
+        self.free = ~held_unknowns(light, s.light_gradient)
+        self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
+
+    def tighten(self, step: Float[np.ndarray, "l"]) -> bool:
+        """Whether the step went too far and bounds were changed."""
+        p = len(self.light)
+        weight = self.light.weight.T.reshape(-1)
+        negative = np.zeros(len(step), bool)
+        negative[3 * p : 6 * p] = self.free[3 * p : 6 * p] & (weight + step[3 * p : 6 * p] < 0)
+        self.free &= ~negative
+        self.fixed[3 * p : 6 * p][negative[3 * p : 6 * p]] = -weight[negative[3 * p : 6 * p]]
+        turn = np.hypot(step[:p], step[p : 2 * p]) / np.minimum(MOST_WIDTHS / np.sqrt(self.light.sharpness), MOST_TURN)
+        far = np.zeros(len(step), bool)
+        far[: 2 * p] = np.tile(turn > 1, 2)
+        far[2 * p : 3 * p] = np.abs(step[2 * p : 3 * p]) > MOST_LOG_SHARPNESS
+        self.extra[far] = np.maximum(6 * self.extra[far], 1e-3 * self.diagonal[far])
+        return bool(negative.any() or far.any())
+
+
+def _solved(systems: Sequence[System], gradient, hessian, free, bounds: Sequence[Bounds], damping: float):
     reduced, right = damped(hessian, damping), -gradient
     eliminated = []
-    for s, light in zip(systems, lights, strict=True):
-        loose = ~held_unknowns(light, s.light_gradient)
-        factor = cho_factor(masked(damped(s.light_hessian, damping), loose), check_finite=False)
+    for s, bound in zip(systems, bounds, strict=True):
+        loose = bound.free
+        factor = cho_factor(masked(damped(s.light_hessian, damping) + np.diag(bound.extra), loose), check_finite=False)
         cross = s.cross_hessian * loose
-        solved = cho_solve(factor, np.column_stack([cross.T, s.light_gradient * loose]), check_finite=False)
+        light_gradient = (s.light_gradient + s.light_hessian @ bound.fixed) * loose
+        solved = cho_solve(factor, np.column_stack([cross.T, light_gradient]), check_finite=False)
         reduced -= cross @ solved[:, :-1]
-        right += cross @ solved[:, -1]
+        right += cross @ solved[:, -1] - s.cross_hessian @ bound.fixed
         eliminated.append((solved, loose))
     by_material = np.linalg.solve(masked(reduced, free), np.where(free, right, 0.0))
-    by_light = [-(solved[:, -1] + solved[:, :-1] @ by_material) * loose for solved, loose in eliminated]
-    return Step(by_material, by_light)
+    by_light = [
+        bound.fixed - (solved[:, -1] + solved[:, :-1] @ by_material) * loose
+        for bound, (solved, loose) in zip(bounds, eliminated, strict=True)
+    ]
+    return by_material, by_light
 
 
 def schur_complement(systems: Sequence[System], materials: Materials, lights: Sequence[Light]) -> Float[np.ndarray, "7m 7m"]:
