@@ -24,6 +24,7 @@ from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
+from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
 from factorlib.stage import Inputs, Progress
@@ -83,7 +84,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             spread,
             _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))),
         )
-    _write(out, materials, blocks, joint, operator)
+    _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator)
 
 
 def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:

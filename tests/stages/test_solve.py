@@ -79,6 +79,8 @@ def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, li
     assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
     evidence = models["auto"]["self_shadowing_chosen_by"]
     assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"]
+    for file in ("lobes.parquet", "uncertainty.json"):
+        assert (tmp_path / "auto" / "out" / file).read_bytes() == (tmp_path / "off" / "out" / file).read_bytes(), file
     assert set(models["on"]["self_shadowing_chosen_by"]) == {"held_out_loss_with"}
 
 
