@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.operator import diffuse_errors, errors, microseconds
+from benchmarks.operator.errors import diffuse_errors, specular_errors
+from benchmarks.operator.timing import microseconds
 from factorlib.conventions import FRONT, half_of_normal_and_view
 from factorlib.generate.lobe_spheres import Pixels, Spheres, random_spheres, rendered
 from factorlib.jsonfile import write_json
@@ -68,7 +69,7 @@ def accuracy() -> dict:
     operator = reflection_operator("paper_network")
     return {
         "diffuse": diffuse_errors(operator, diffuse_samples(16384, 98)),
-        "specular": errors(operator, specular_samples(16384, 99, tolerance=1e-6)),
+        "specular": specular_errors(operator, specular_samples(16384, 99, tolerance=1e-6)),
     }
 
 
@@ -78,4 +79,4 @@ if __name__ == "__main__":
     write_json(SHIPPED / "paper_accuracy.json", found)
     for part, table in found.items():
         print(part, {name: table[name] for name in ("median", "p95", "p99", "worst")})
-    print("microseconds", microseconds(reflection_operator("paper_network"), 2048))
+    print("microseconds", microseconds({"paper_network": reflection_operator("paper_network")}, lambda _: 1024)["paper_network"])

@@ -48,7 +48,7 @@ def time_against_error(operators: dict[str, dict]) -> str:
 def _legend(shown: dict[str, dict], labels: list[str], y: float = 44) -> list[str]:
     """Colours of operators, and what full and hollow mean."""
     first = {name_of(label): label for label in reversed(shown)}
-    parts = [text(740, y, "full: median, hollow: 95th percentile", "end", "soft")]
+    parts = [text(740, y - 22, "full: median, hollow: p95", "end", "soft")]
     for k, label in enumerate(dict.fromkeys(first[name_of(other)] for other in shown)):
         words = name_of(label) + (", by its tolerance" if label.startswith("reference") else "")
         parts += [dot(90 + 110 * k, y - 4, colour_of(label, labels)), text(100 + 110 * k, y, words)]

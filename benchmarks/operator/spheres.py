@@ -13,7 +13,6 @@ Lobes           Fibonacci lattices of three widths, and sharp ones at the bright
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -203,16 +202,18 @@ def frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 
 def balls_by_operator(operator, lobes: Lobes, normals: Float[np.ndarray, "n 3"]) -> Balls:
-    views = np.broadcast_to(VIEW, normals.shape).copy()
-    white, black = torch.ones(3), torch.zeros(3)
+    n, axis, weight, view = (torch.as_tensor(t).to(operator.dtype) for t in (normals, lobes.axis, lobes.weight, VIEW))
+    sharpness, oz = torch.as_tensor(lobes.sharpness).to(operator.dtype), (axis @ view)[None]
 
-    def ball(diffuse, specular, roughness: float) -> Float[np.ndarray, "n 3"]:
-        material = SimpleNamespace(diffuse=diffuse, specular=specular, roughness=torch.tensor(roughness))
+    def ball(reflected) -> Float[np.ndarray, "n 3"]:
         with torch.no_grad():
-            parts = [operator(lobes, material, n, v) for n, v in zip(*(np.array_split(a, 16) for a in (normals, views)), strict=True)]
-        return torch.cat(parts).double().numpy()
+            return torch.cat([reflected(part, part @ axis.T) @ weight for part in n.split(128)]).double().numpy()
 
-    return {name_of(r): ball(black, white, r) for r in ROUGHNESS} | {DIFFUSE: ball(white, black, 0.5)}
+    def specular(roughness: float):
+        alike = torch.tensor(roughness, dtype=operator.dtype)
+        return lambda part, nz: operator.specular(alike, sharpness, part @ view, nz, oz.expand(nz.shape).contiguous())
+
+    return {name_of(r): ball(specular(r)) for r in ROUGHNESS} | {DIFFUSE: ball(lambda part, nz: operator.diffuse(sharpness, nz))}
 
 
 # how far apart --------------------------------------------------------------------------------------------------------
