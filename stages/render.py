@@ -34,7 +34,7 @@ RING = (255, 255, 255)
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """tail: share of a pixel's radiance, of its faintest highlights, that is left to the closed form (0: none)."""
 
-    operator: Literal["network", "closed_form", "reference"] = "network"
+    operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
     tail: Annotated[float, msgspec.Meta(ge=0, le=0.1)] = TAIL
     ball_size: Size = 128
     map_size: Size = 64

@@ -44,7 +44,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
-    operator: Literal["network", "closed_form", "reference"] = "network"
+    operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
     merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
     lobes: Annotated[int, Meta(ge=1, le=1024)] = 48
     insert: Annotated[int, Meta(ge=1, le=64)] = 12

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from factorlib.reflection.diffuse import diffuse
 from factorlib.reflection.filtering import filtered_specular
-from factorlib.reflection.operator import Operator, columns
+from factorlib.reflection.operator import MOST, Operator, columns
 
 
 class ClosedForm(Operator):
@@ -18,4 +18,4 @@ class ClosedForm(Operator):
         return diffuse(sharpness, nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
-        return filtered_specular(*torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)).value
+        return filtered_specular(*torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)).value.clamp_max(MOST)

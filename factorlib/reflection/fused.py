@@ -28,6 +28,7 @@ from factorlib.reflection.diffuse import diffuse_of_moments
 from factorlib.reflection.filtering import filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.network import LARGEST, Layers, diffuse_columns, fading, specular_columns
+from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value
 
 log = logging.getLogger("factorlib.reflection")
@@ -94,11 +95,12 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     t = torch.tanh(tape.input("net") / LARGEST)
     grown = torch.exp(fade * LARGEST * t)
     result = formula * grown
-    by_net = result * fade * (1 - t * t)
-    seeds = [(formula, grown), (fade, result * LARGEST * t), *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns))]
+    inside = tape.apply("above", MOST, result)  # beyond, the result is MOST and its derivatives are nil
+    by_net = inside * result * fade * (1 - t * t)
+    seeds = [(formula, inside * grown), (fade, inside * result * LARGEST * t), *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns))]
     by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)])
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
-    results = (result, by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
+    results = (result.clamp_max(MOST), by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
     places = PLACES | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
     backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
     text = (Path(__file__).parent / "kernel.c").read_text()

@@ -25,7 +25,7 @@ from factorlib.jsonfile import json_text
 from factorlib.reflection import diffuse as diffuse_form
 from factorlib.reflection.filtering import Filtered, filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
-from factorlib.reflection.operator import Operator, Response, columns
+from factorlib.reflection.operator import MOST, Operator, Response, columns
 
 SHIPPED = Path(__file__).parent / "weights"
 FEATURES = {"diffuse": 8, "specular": 24}
@@ -152,7 +152,8 @@ class Network(Operator):
             return self.fused["specular"](float(roughness), sharpness, no, nz, oz)[0]
         alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         form = filtered_specular(alpha, sharpness, no, nz, oz)
-        return form.value * torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))
+        grown = torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))
+        return (form.value * grown).clamp_max(MOST)
 
 
 def write_layers(path: Path, layers: Layers, dtype: torch.dtype = torch.float32, **metadata: str) -> None:

@@ -21,6 +21,7 @@ MODULES = {
     "network": ("network", "Network"),
     "paper_network": ("paper_network", "PaperNetwork"),
 }
+MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
 CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
 
 

@@ -67,7 +67,7 @@ def descend(
             report(iteration, current)
         else:
             idle += damping > 1e6
-        damping = max(damping / 10, 1e-9) if trust > 0.6 else damping if trust > 0.2 else damping * 6
+        damping = max(damping / 2.5, 1e-9) if trust > 0.6 else damping if trust > 0.2 else damping * 1.75
         if idle >= 2:
             break
     return current

@@ -22,7 +22,7 @@ from factorlib.solve.normal_equations import System
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Light, Materials
 
 ROUNDS = 12
-MOST_WIDTHS, MOST_TURN, MOST_LOG_SHARPNESS = 0.7, 0.3, 0.7  # of a lobe in one step: its own widths, radians
+MOST_WIDTHS, MOST_TURN, MOST_LOG_SHARPNESS = 0.25, 0.3, 0.25  # of a lobe in one step: its own widths, radians
 FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
 
 
@@ -46,7 +46,8 @@ def damped_step(systems: Sequence[System], materials: Materials, lights: Sequenc
     bounds = [Bounds(s, light) for s, light in zip(systems, lights, strict=True)]
     for _ in range(ROUNDS):
         by_material, by_light = _solved(systems, gradient, hessian, free, bounds, damping)
-        if not any([bound.tighten(step) for bound, step in zip(bounds, by_light, strict=True)]):
+        changed = [bound.tighten(step) for bound, step in zip(bounds, by_light, strict=True)]
+        if not any(changed):
             break
     promised = -by_material @ (2 * gradient + hessian @ by_material)
     for s, step in zip(systems, by_light, strict=True):

@@ -33,8 +33,7 @@ ROUNDING = {
 }
 # |R − S| / (S + E/100) of the network against the reference, where it is far off its median of .1 %
 VALUE = {"view at n·o = 10⁻⁴": 0.5, "roughness .03": 0.2}
-# largest S of a unit lobe, exactly at most 1, in `laws.USUAL`, `laws.WIDER`, `laws.WHOLE`
-BRIGHTEST = {"closed_form": (7.0, 15.0, 150.0), "network": (1.02, 1.05, 15.0)}
+BRIGHTEST = 1.0  # S of a unit lobe is at most that, exactly: the operators hold it there
 
 
 @lru_cache(maxsize=256)
@@ -125,7 +124,7 @@ def test_radiance_and_every_gradient_are_finite(name, normal, view, axis, place,
     slopes = gradients(operator, leaves_of(light, material, n[None], o[None], operator.dtype))
     assert all(t.isfinite().all() for t in slopes.values()), {k: t for k, t in slopes.items() if not t.isfinite().all()}
     assert (slopes["radiance"] >= 0).all()
-    assert slopes["radiance"].max() <= 0.5 * weight * (1.01 + BRIGHTEST[name.split()[0]][2])
+    assert slopes["radiance"].max() <= 0.5 * weight * (1.01 + BRIGHTEST)
 
 
 @fast
@@ -191,15 +190,14 @@ def test_nan_in_a_call_is_nan_in_its_radiance(name, bad):
 @single
 @pytest.mark.parametrize("domain", [laws.USUAL, laws.WIDER, laws.WHOLE], ids=["usual", "wider", "whole"])
 def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
-    which = (laws.USUAL, laws.WIDER, laws.WHOLE).index(domain)
-    assert laws.unit_lobes(FAST[name], domain, 1024)[1] < BRIGHTEST[name.split()[0]][which]
+    assert laws.unit_lobes(FAST[name], domain, 1024)[1] <= BRIGHTEST
     assert laws.least_reflected(FAST[name], 1024)[0] >= 0
 
 
 @fast
 def test_constant_light_comes_back_from_white(name):
     assert laws.white_lambert(FAST[name])[0] < 1e-3
-    assert laws.constant_light(FAST[name], 512)[1] < (6 if "closed" in name else 1.01)
+    assert laws.constant_light(FAST[name], 512)[1] < 1.01
 
 
 @fast
