@@ -57,7 +57,7 @@ def descend(
     for iteration in range(descent.iterations):
         step = damped_step(current.systems, current.materials, current.lights, damping)
         materials = Materials.of_vector(current.materials.vector() + step.materials)
-        lights = [light.moved(by) for light, by in zip(current.lights, step.lights, strict=True)]
+        lights = [light.moved(by, current.materials.blur) for light, by in zip(current.lights, step.lights, strict=True)]
         trial = evaluated(blocks, materials, lights, operator, loss, map_)
         gained = current.loss - trial.loss
         trust = gained / max(step.promised, 1e-300)

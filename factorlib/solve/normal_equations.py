@@ -96,7 +96,7 @@ def robust_loss(residual: Float[np.ndarray, "n 3"], scale: float) -> tuple[float
 def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:
     """The loss of one illumination over what is not held out, prior included."""
     residual = residuals(block, predicted_radiance(block, light, materials, operator))[~block.held_out]
-    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0]
+    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss, materials.blur)[0]
 
 
 def system(
@@ -116,10 +116,10 @@ def system(
         response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[index], operator))
         own = None if clusters is None else (scores, clusters[rows])
         total += _add_rows(hessian, gradient, own, block, rows, light, materials, index, response, loss)
-    prior, prior_gradient, prior_hessian = _prior(block, light, loss)
-    weights = slice(7 * m + 3 * p, 7 * m + 6 * p)
-    gradient[weights] += prior_gradient
-    hessian[weights, weights] += prior_hessian
+    prior, prior_gradient, prior_hessian = _prior(block, light, loss, materials.blur)
+    lobes = slice(7 * m + 2 * p, 7 * m + 6 * p)
+    gradient[lobes] += prior_gradient
+    hessian[lobes, lobes] += prior_hessian
     k = 7 * m
     return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:], scores)
 
@@ -158,7 +158,8 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
     by_tangent = [(normal @ t.T, view @ t.T) for t in tangents]
     r = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
     r, turning = shadowed_response(r, block, rows, light, materials.roughness[m])
-    weight = torch.from_numpy(light.weight)
+    weight, spread = torch.from_numpy(light.weight), torch.from_numpy(light.spread)
+    by_s, weight_by_s = (torch.from_numpy(slope) for slope in light.sharpness_slopes(materials.blur))
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
     photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure))[:, 1:].double()
     geometry, exposures = np.arange(first, first + 3 * p), np.arange(first + 6 * p, first + 6 * p + len(light.log_exposure) - 1)
@@ -171,7 +172,8 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
         if turning is not None:
             shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(turning.diffuse, turning.specular, strict=True)]
             columns = [column + also for column, also in zip(columns, shading, strict=True)]
-        columns += [(kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]) * weight[:, c], basis]
+        by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
+        columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / spread]
         predicted = basis @ weight[:, c]
         own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]
         jacobian = torch.cat([*columns, photos * predicted[:, None], torch.stack(own, 1)], 1)
@@ -187,14 +189,13 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
         yield Channel(places, jacobian * (precision * pull)[:, None], residual * pull, lost)
 
 
-def _prior(block: Block, light: Light, loss: Loss):
-    """The tint prior over the lobes' weights [w_R, w_G, w_B] × p, with the mean W̄ held: value, gradient, Hessian."""
-    p = len(light)
+def _prior(block: Block, light: Light, loss: Loss, blur: float):
+    """The tint prior over the unknowns [s, e_R, e_G, e_B] × p, with the mean W̄ held: value, gradient, Hessian."""
     strength = loss.prior * int((~block.held_out).sum()) / 3
     sums = light.weight.sum(0)
-    mean = max(float(sums.mean()), 1e-30)
-    centre = (np.eye(3) - 1 / 3) / mean
+    centre = (np.eye(3) - 1 / 3) / max(float(sums.mean()), 1e-30)
     residual = centre @ sums
-    gram = centre.T @ centre * strength
-    gradient = np.repeat(centre.T @ residual * strength, p)
-    return strength * float(residual @ residual), gradient, np.kron(gram, np.ones((p, p)))
+    _, weight_by_s = light.sharpness_slopes(blur)
+    by_lobes = np.hstack([(light.weight * weight_by_s[:, None]).T, np.kron(np.eye(3), 1 / light.spread)])  # of the sums
+    jacobian = centre @ by_lobes
+    return strength * float(residual @ residual), strength * jacobian.T @ residual, strength * jacobian.T @ jacobian

@@ -22,7 +22,7 @@ from factorlib.solve.normal_equations import System
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Light, Materials
 
 ROUNDS = 12
-MOST_WIDTHS, MOST_TURN, MOST_LOG_SHARPNESS = 0.25, 0.3, 0.25  # of a lobe in one step: its own widths, radians
+MOST_WIDTHS, MOST_TURN, MOST_S = 0.4, 0.3, 0.25  # of a lobe in one step: its own widths, radians
 FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
 
 
@@ -37,13 +37,13 @@ class Step(msgspec.Struct, frozen=True):
 def damped_step(systems: Sequence[System], materials: Materials, lights: Sequence[Light], damping: float) -> Step:
     """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation.
 
-    Solved again, at most `ROUNDS` times, while it makes a weight negative (which is then held at zero) or takes a lobe
+    Solved again, at most `ROUNDS` times, while it takes a weight or a sharpness out of bounds (which is then held there) or a lobe
     farther than the quadratic model is good for (which is then damped more, that lobe alone).
     """
     gradient = np.sum([s.material_gradient for s in systems], axis=0)
     hessian = np.sum([s.material_hessian for s in systems], axis=0)
     free = ~held_materials(materials, gradient)
-    bounds = [Bounds(s, light) for s, light in zip(systems, lights, strict=True)]
+    bounds = [Bounds(s, light, materials.blur) for s, light in zip(systems, lights, strict=True)]
     for _ in range(ROUNDS):
         by_material, by_light = _solved(systems, gradient, hessian, free, bounds, damping)
         changed = [bound.tighten(step) for bound, step in zip(bounds, by_light, strict=True)]
@@ -58,25 +58,29 @@ def damped_step(systems: Sequence[System], materials: Materials, lights: Sequenc
 class Bounds:
     """What a light's step must keep to: unknowns that are not free take `fixed`; `extra` is their own damping."""
 
-    def __init__(self, s: System, light: Light):
+    def __init__(self, s: System, light: Light, blur: float):
         self.light, self.diagonal = light, np.diag(s.light_hessian)
         self.free = ~held_unknowns(light, s.light_gradient)
         self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
+        p = len(light)
+        self.low, self.high = np.full(len(self.free), -np.inf), np.full(len(self.free), np.inf)
+        self.low[3 * p : 6 * p] = -light.energy.T.reshape(-1)
+        s_now, s_low, s_high = (-np.log(1 / sharpness + blur) for sharpness in (light.sharpness, *SHARPNESS))
+        self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
 
     def tighten(self, step: Float[np.ndarray, "l"]) -> bool:
         """Whether the step went too far and bounds were changed."""
         p = len(self.light)
-        weight = self.light.weight.T.reshape(-1)
-        negative = np.zeros(len(step), bool)
-        negative[3 * p : 6 * p] = self.free[3 * p : 6 * p] & (weight + step[3 * p : 6 * p] < 0)
-        self.free &= ~negative
-        self.fixed[3 * p : 6 * p][negative[3 * p : 6 * p]] = -weight[negative[3 * p : 6 * p]]
+        outside = self.free & ((step < self.low) | (step > self.high))
+        self.free &= ~outside
+        self.fixed[outside] = np.clip(step, self.low, self.high)[outside]
         turn = np.hypot(step[:p], step[p : 2 * p]) / np.minimum(MOST_WIDTHS / np.sqrt(self.light.sharpness), MOST_TURN)
         far = np.zeros(len(step), bool)
         far[: 2 * p] = np.tile(turn > 1, 2)
-        far[2 * p : 3 * p] = np.abs(step[2 * p : 3 * p]) > MOST_LOG_SHARPNESS
+        far[2 * p : 3 * p] = np.abs(step[2 * p : 3 * p]) > MOST_S
+        far &= self.free
         self.extra[far] = np.maximum(6 * self.extra[far], 1e-3 * self.diagonal[far])
-        return bool(negative.any() or far.any())
+        return bool(outside.any() or far.any())
 
 
 def _solved(systems: Sequence[System], gradient, hessian, free, bounds: Sequence[Bounds], damping: float):

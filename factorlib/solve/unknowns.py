@@ -1,10 +1,21 @@
-"""What is solved for: materials (shared), and lights with their lobes and exposures (one per illumination)."""
+"""What is solved for: materials (shared), and lights with their lobes and exposures (one per illumination).
+
+A lobe's unknowns are chosen so that what the data hold fixed stays put while another unknown moves: its energy
+e = w/λ' rather than its peak w, λ' = λ/(1 − e^{−2λ}), and
+
+    s = −log(1/λ + b),      b = 2 min α²
+
+rather than log λ.  A reflection widens a lobe's variance 1/λ by about b, so the sum is what is seen: a rougher surface
+under a sharper lobe looks the same along a line of s, which steps in log λ would only follow in small ones.
+"""
 
 from __future__ import annotations
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
+
+from factorlib.light.lobes import lobe_integral
 
 ROUGHNESS = (0.1, 1.0)  # the operators' domain
 SHARPNESS = (0.1, 2000.0)  # from nearly constant to 1.3° wide, about a texel of the exported map
@@ -24,6 +35,11 @@ class Materials(msgspec.Struct, frozen=True):
     def vector(self) -> Float[np.ndarray, "7m"]:
         """Seven unknowns a material: diffuse RGB, specular RGB, roughness."""
         return np.column_stack([self.diffuse, self.specular, self.roughness]).reshape(-1)
+
+    @property
+    def blur(self) -> float:
+        """b: by how much the least rough material widens a lobe's variance, about."""
+        return 2 * float(self.roughness.min()) ** 4
 
     @staticmethod
     def of_vector(vector: Float[np.ndarray, "7m"]) -> Materials:
@@ -55,17 +71,34 @@ class Light(msgspec.Struct, frozen=True):
         first /= np.linalg.norm(first, axis=1, keepdims=True)
         return first, np.cross(self.axis, first)
 
-    def moved(self, step: Float[np.ndarray, "6p+f-1"]) -> Light:
-        """Apply a step in the unknowns [tangent 1, tangent 2, log λ, w_R, w_G, w_B] × p, then exposures 1…f−1."""
+    @property
+    def spread(self) -> Float[np.ndarray, "p"]:
+        """1/λ': energy of a lobe of unit weight over 2π, steradians."""
+        return lobe_integral(self.sharpness) / (2 * np.pi)
+
+    @property
+    def energy(self) -> Float[np.ndarray, "p 3"]:
+        return self.weight * self.spread[:, None]
+
+    def sharpness_slopes(self, blur: float) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+        """∂ log λ/∂s and, the energy held, ∂ log w/∂s."""
+        by_s = 1 + blur * self.sharpness
+        doubled = np.maximum(2 * self.sharpness, 1e-9)
+        return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
+
+    def moved(self, step: Float[np.ndarray, "6p+f-1"], blur: float) -> Light:
+        """Apply a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, then exposures 1…f−1; blur is b."""
         p = len(self)
         by = step[: 6 * p].reshape(6, p)
         first, second = self.tangents()
         turn = np.clip(by[:2], -0.3, 0.3)
         axis = self.axis + turn[0][:, None] * first + turn[1][:, None] * second
+        variance = (1 / self.sharpness + blur) * np.exp(-np.clip(by[2], -1, 1)) - blur
+        log_sharpness = -np.log(np.clip(variance, 1 / SHARPNESS[1], 1 / SHARPNESS[0]))
         return Light(
             axis / np.linalg.norm(axis, axis=1, keepdims=True),
-            np.clip(self.log_sharpness + np.clip(by[2], -1, 1), *np.log(SHARPNESS)),
-            np.maximum(self.weight + by[3:].T, 0.0),
+            log_sharpness,
+            np.maximum(self.energy + by[3:].T, 0.0) / (lobe_integral(np.exp(log_sharpness))[:, None] / (2 * np.pi)),
             self.log_exposure + np.concatenate([[0.0], np.clip(step[6 * p :], -1, 1)]),
         )
 

@@ -18,13 +18,13 @@ from factorlib.solve.unknowns import Light
 def refitted_weights(light: Light, equations: System) -> Light:
     """The non-negative weights that minimise the quadratic model of `equations` with all else held."""
     p = len(light)
-    weight = light.weight.copy()
+    energy = light.energy
     for c in range(3):
         own = slice((3 + c) * p, (4 + c) * p)
         hessian = equations.light_hessian[own, own]
-        target = hessian @ light.weight[:, c] - equations.light_gradient[own]
-        weight[:, c] = nonnegative_minimum(hessian, target)
-    return Light(light.axis, light.log_sharpness, weight, light.log_exposure)
+        target = hessian @ energy[:, c] - equations.light_gradient[own]
+        energy[:, c] = nonnegative_minimum(hessian, target)
+    return Light(light.axis, light.log_sharpness, energy / light.spread[:, None], light.log_exposure)
 
 
 def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:

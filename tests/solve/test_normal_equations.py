@@ -37,7 +37,7 @@ def test_gradient_by_light_is_the_finite_difference(problem):
     # the prior holds W̄, so it is left out of the difference and tested on its own below
     loss = Loss(robust_scale=3.0, prior=0.0)
     found = system(data, light, MATERIALS, OPERATOR, loss)
-    expected = derivative(lambda d: fit_loss(data, light.moved(d), MATERIALS, OPERATOR, loss), size)
+    expected = derivative(lambda d: fit_loss(data, light.moved(d, MATERIALS.blur), MATERIALS, OPERATOR, loss), size)
     np.testing.assert_allclose(found.light_gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
 
 

@@ -99,7 +99,7 @@ def test_gradients_are_finite_differences(problem):
     found, step = system(data, light, MATERIALS, OPERATOR, LOSS), 2e-3
 
     def by_light(move):
-        return fit_loss(data, light.moved(move), MATERIALS, OPERATOR, LOSS)
+        return fit_loss(data, light.moved(move, MATERIALS.blur), MATERIALS, OPERATOR, LOSS)
 
     def by_material(move):
         return fit_loss(data, light, Materials.of_vector(MATERIALS.vector() + move), OPERATOR, LOSS)
