@@ -140,6 +140,8 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "lobes": {block.name: len(light) for block, light in zip(blocks, joint.solution.lights, strict=True)},
         "lobes_chosen_by": "held-out loss per round, see convergence.parquet",
         "held_out_loss": [event.held_out for event in joint.history if event.phase == "round"],
+        "specular": {name: not bool(joint.matte[m]) for m, name in enumerate(names)},
+        "specular_chosen_by": {name: msgspec.to_builtins(told) for name, told in zip(names, joint.specular, strict=False)},
         "self_shadowing": joint.self_shadowing,
         "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }

@@ -17,7 +17,9 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from jaxtyping import Bool
 
+from factorlib.solve.choice import Specular, matte_where_it_may_be
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.gauge import in_gauge
 from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
@@ -25,8 +27,10 @@ from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance,
 from factorlib.solve.problem import Block, of_rows, sampled
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.start import starting_light, starting_materials
-from factorlib.solve.unknowns import Light
+from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
+
+FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
 
 
 class Bundle(msgspec.Struct, frozen=True):
@@ -43,6 +47,7 @@ class Bundle(msgspec.Struct, frozen=True):
     start_roughness: float = 0.4
     start_specular_share: float = 0.2
     self_shadowing: Literal["auto", "on", "off"] = "auto"
+    choose_specular: bool = True
     loss: Loss = Loss()
     seed: int = 0
 
@@ -64,7 +69,8 @@ Report = Callable[[Event], None]
 class Joint(msgspec.Struct, frozen=True):
     """The answer, in the gauge of `solve.gauge`: materials, one light per block, how it was reached, and the last loss.
 
-    self_shadowing: whether visibility was used;  held_out: the held-out loss with and without it, of what was tried
+    self_shadowing: whether visibility was used;  held_out: the held-out loss with and without it, of what was tried;
+    matte: materials without specular part;  specular: what decided about each
     """
 
     solution: Solution
@@ -72,6 +78,8 @@ class Joint(msgspec.Struct, frozen=True):
     loss: Loss
     self_shadowing: bool = False
     held_out: dict[str, float] = {}
+    matte: Bool[np.ndarray, "m"] | None = None
+    specular: list[Specular] = []
 
 
 class Fit(msgspec.Struct, frozen=True):
@@ -82,14 +90,40 @@ class Fit(msgspec.Struct, frozen=True):
     loss: Loss
     history: list[Event]
 
+    def held_out_at(self, number: int) -> float:
+        """The held-out loss of a round, of the best one where there were fewer."""
+        rounds = [event.held_out for event in self.history if event.phase == "round"]
+        return rounds[number] if number < len(rounds) else self.held_out
+
 
 def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
     """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
     models = candidates(blocks, bundle.self_shadowing)
-    fits = {name: best_round(model, materials, operator, bundle, map_, report) for name, model in models.items()}
+    fits: dict[str, Fit] = {}
+    for name, model in models.items():
+        fits[name] = best_round(model, materials, operator, bundle, map_, report, rivals=list(fits.values()))
     chosen = min(fits, key=lambda name: fits[name].held_out)
-    solution, history = polished(models[chosen], fits[chosen], operator, bundle, map_, report)
-    return Joint(solution, history, fits[chosen].loss, chosen == "with", {name: fit.held_out for name, fit in fits.items()})
+    fit, matte, specular = with_specular_chosen(models[chosen], fits[chosen], operator, bundle, map_)
+    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte)
+    found = solution.materials
+    specular_or_none = np.where(matte[:, None], 0.0, found.specular)
+    solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
+    held_out = {name: fit.held_out for name, fit in fits.items()}
+    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, specular)
+
+
+def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable):
+    """The fit without needless specular parts, which materials are matte, and the evidence."""
+    blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
+    start = evaluated(blocks, fit.solution.materials, fit.solution.lights, operator, fit.loss, map_)
+    if not bundle.choose_specular or not any(block.held_out.any() for block in blocks):
+        return fit, np.zeros(len(start.materials), bool), []
+
+    def held_out(s: Solution) -> float:
+        return held_out_loss(blocks, s.materials, s.lights, operator, bundle.loss)
+
+    solution, matte, evidence = matte_where_it_may_be(blocks, start, operator, fit.loss, held_out, map_)
+    return msgspec.structs.replace(fit, solution=solution), matte, evidence
 
 
 def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[Block]]:
@@ -110,8 +144,10 @@ def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Los
     return record
 
 
-def best_round(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Fit:
-    """Rounds on a sample of the observations, as long as they gain."""
+def best_round(
+    blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report, rivals: Sequence[Fit] = ()
+) -> Fit:
+    """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
     blocks, history = [sampled(block, bundle.sample, bundle.seed) for block in blocks], []
     record = _recorder(blocks, history, operator, bundle.loss, report)
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
@@ -129,18 +165,23 @@ def best_round(blocks: Sequence[Block], materials: int, operator, bundle: Bundle
         gained = best_held - held
         if held < best_held:
             best, best_held = current, held
-        if gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
+        outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
+        if outdone or gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
             break
     return Fit(best, best_held, loss, history)
 
 
-def polished(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report) -> tuple[Solution, list[Event]]:
+def polished(
+    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, matte=None
+) -> tuple[Solution, list[Event]]:
     """The best round brought to rest on all observations, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     history, number, loss = list(fit.history), fit.history[-1].round, fit.loss
     record = _recorder(everything, history, operator, loss, report)
     best = evaluated(everything, fit.solution.materials, fit.solution.lights, operator, loss, map_)
-    best = descend(everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s))
+    best = descend(
+        everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s), matte
+    )
     return _tidied(everything, best, operator, loss, map_), history
 
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import msgspec
+import numpy as np
+from jaxtyping import Bool
 
 from factorlib.solve.normal_equations import Loss, System, system
 from factorlib.solve.problem import Block
@@ -51,11 +53,12 @@ def descend(
     descent: Descent,
     map_: Callable,
     report: Callable[[int, Solution], None] = lambda iteration, solution: None,
+    matte: Bool[np.ndarray, "m"] | None = None,
 ) -> Solution:
-    """Lower the loss from `start`; every accepted point is reported."""
+    """Lower the loss from `start`; every accepted point is reported.  Materials that are `matte` keep what specular part they have."""
     current, damping, idle = start, descent.damping, 0
     for iteration in range(descent.iterations):
-        step = damped_step(current.systems, current.materials, current.lights, damping)
+        step = damped_step(current.systems, current.materials, current.lights, damping, matte)
         materials = Materials.of_vector(current.materials.vector() + step.materials)
         lights = [light.moved(by, current.materials.blur) for light, by in zip(current.lights, step.lights, strict=True)]
         trial = evaluated(blocks, materials, lights, operator, loss, map_)

@@ -34,7 +34,13 @@ class Step(msgspec.Struct, frozen=True):
     promised: float
 
 
-def damped_step(systems: Sequence[System], materials: Materials, lights: Sequence[Light], damping: float) -> Step:
+def damped_step(
+    systems: Sequence[System],
+    materials: Materials,
+    lights: Sequence[Light],
+    damping: float,
+    matte: Bool[np.ndarray, "m"] | None = None,
+) -> Step:
     """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation.
 
     Solved again, at most `ROUNDS` times, while it takes a weight or a sharpness out of bounds (which is then held there) or a lobe
@@ -42,7 +48,7 @@ def damped_step(systems: Sequence[System], materials: Materials, lights: Sequenc
     """
     gradient = np.sum([s.material_gradient for s in systems], axis=0)
     hessian = np.sum([s.material_hessian for s in systems], axis=0)
-    free = ~held_materials(materials, gradient)
+    free = ~held_materials(materials, gradient, matte)
     bounds = [Bounds(s, light, materials.blur) for s, light in zip(systems, lights, strict=True)]
     for _ in range(ROUNDS):
         by_material, by_light = _solved(systems, gradient, hessian, free, bounds, damping)
@@ -114,12 +120,16 @@ def schur_complement(systems: Sequence[System], materials: Materials, lights: Se
     return (reduced + reduced.T) / 2
 
 
-def held_materials(materials: Materials, gradient: Float[np.ndarray, "7m"]) -> Bool[np.ndarray, "7m"]:
-    """Unknowns of the materials at a bound that the loss pushes beyond."""
+def held_materials(
+    materials: Materials, gradient: Float[np.ndarray, "7m"], matte: Bool[np.ndarray, "m"] | None = None
+) -> Bool[np.ndarray, "7m"]:
+    """Unknowns of the materials at a bound that the loss pushes beyond, and the specular ones of matte materials."""
     values = materials.vector().reshape(-1, 7)
     low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
     high = np.column_stack([np.zeros_like(values[:, :6], bool), values[:, 6] >= ROUGHNESS[1]]).reshape(-1)
-    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0)
+    specular = np.zeros_like(values, bool)
+    specular[:, 3:] = False if matte is None else matte[:, None]
+    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0) | specular.reshape(-1)
 
 
 def held_unknowns(light: Light, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:

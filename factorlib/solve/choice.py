@@ -1,0 +1,66 @@
+"""Which materials have a specular part: those that held-out observations are explained worse without.
+
+A matte material would lend its specular part to errors of normals and lights.  Each material in turn, the least specular
+first, loses its specular part; the rest of the problem is brought to rest again, and if the held-out loss has not risen by
+more than `LEAST_GAIN` of itself, the specular part stays away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool
+
+from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.problem import Block
+from factorlib.solve.unknowns import LEAST_REFLECTANCE, Materials
+
+LEAST_GAIN = 0.03  # of the held-out loss, that a specular part must be worth
+HOPELESS = 1.3  # times the held-out loss after `GLANCE` iterations: the specular part is needed, and no more is tried
+GLANCE, ITERATIONS = 3, 9
+
+
+class Specular(msgspec.Struct, frozen=True):
+    """What decided about a material: held-out loss with and without its specular part."""
+
+    kept: bool
+    held_out_loss_with: float
+    held_out_loss_without: float
+
+
+def matte_where_it_may_be(
+    blocks: Sequence[Block], start: Solution, operator, loss, held_out: Callable[[Solution], float], map_: Callable
+) -> tuple[Solution, Bool[np.ndarray, "m"], list[Specular]]:
+    """The solution with needless specular parts gone, which materials those are, and the evidence for every material."""
+    matte, chosen = np.zeros(len(start.materials), bool), start
+    seen = np.isin(np.arange(len(matte)), np.concatenate([block.material for block in blocks]))
+    base = start.materials  # all are brought to rest from here alike: held-out loss changes with iterations, too
+
+    def rested(materials: Materials, which: Bool[np.ndarray, "m"], most: float) -> Solution:
+        trial = evaluated(blocks, materials, start.lights, operator, loss, map_)
+        trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
+        return trial if held_out(trial) > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
+
+    best = held_out(rested(base, matte, np.inf))
+    evidence = [Specular(True, best, best)] * len(matte)
+    for m in np.argsort(base.specular.mean(1), kind="stable"):
+        if not seen[m]:
+            continue
+        without = without_specular(base, m)
+        trial = rested(without, matte | (np.arange(len(matte)) == m), HOPELESS * best)
+        score = held_out(trial)
+        needed = score > (1 + LEAST_GAIN) * best
+        evidence[m] = Specular(bool(needed), best, score)
+        if not needed:
+            base, chosen, best, matte[m] = without, trial, score, True
+    return chosen, matte, evidence
+
+
+def without_specular(materials: Materials, m: int) -> Materials:
+    """Material m with what it reflected specularly given to its diffuse part."""
+    diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
+    diffuse[m] += specular[m]
+    specular[m] = LEAST_REFLECTANCE
+    return Materials(diffuse, specular, materials.roughness)
