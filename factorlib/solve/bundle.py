@@ -119,8 +119,8 @@ def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bu
     if not bundle.choose_specular or not any(block.held_out.any() for block in blocks):
         return fit, np.zeros(len(start.materials), bool), []
 
-    def held_out(s: Solution) -> float:
-        return held_out_loss(blocks, s.materials, s.lights, operator, bundle.loss)
+    def held_out(s: Solution, m: int | None = None) -> float:
+        return held_out_loss(blocks, s.materials, s.lights, operator, bundle.loss, m)
 
     solution, matte, evidence = matte_where_it_may_be(blocks, start, operator, fit.loss, held_out, map_)
     return msgspec.structs.replace(fit, solution=solution), matte, evidence
@@ -185,11 +185,13 @@ def polished(
     return _tidied(everything, best, operator, loss, map_), history
 
 
-def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
-    """Mean robust loss per held-out channel value."""
+def held_out_loss(
+    blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, m: int | None = None
+) -> float:
+    """Mean robust loss per held-out channel value, of all observations or those of material m."""
     total, count = 0.0, 0
     for block, light in zip(blocks, lights, strict=True):
-        held = of_rows(block, block.held_out)
+        held = of_rows(block, block.held_out if m is None else block.held_out & (block.material == m))
         total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
         count += 3 * len(held)
     return total / max(count, 1)

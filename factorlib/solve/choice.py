@@ -1,8 +1,8 @@
 """Which materials have a specular part: those that held-out observations are explained worse without.
 
 A matte material would lend its specular part to errors of normals and lights.  Each material in turn, the least specular
-first, loses its specular part; the rest of the problem is brought to rest again, and if the held-out loss has not risen by
-more than `LEAST_GAIN` of itself, the specular part stays away.
+first, loses its specular part; the rest of the problem is brought to rest again, and if neither its own held-out loss nor
+that of all observations has risen by more than `LEAST_GAIN` of itself, the specular part stays away.
 """
 
 from __future__ import annotations
@@ -23,17 +23,21 @@ GLANCE, ITERATIONS = 3, 9
 
 
 class Specular(msgspec.Struct, frozen=True):
-    """What decided about a material: held-out loss with and without its specular part."""
+    """What decided about a material: the held-out loss of its own observations with and without its specular part,
+    None where it has none."""
 
     kept: bool
-    held_out_loss_with: float
-    held_out_loss_without: float
+    held_out_loss_with: float | None
+    held_out_loss_without: float | None
 
 
 def matte_where_it_may_be(
-    blocks: Sequence[Block], start: Solution, operator, loss, held_out: Callable[[Solution], float], map_: Callable
+    blocks: Sequence[Block], start: Solution, operator, loss, held_out: Callable[..., float], map_: Callable
 ) -> tuple[Solution, Bool[np.ndarray, "m"], list[Specular]]:
-    """The solution with needless specular parts gone, which materials those are, and the evidence for every material."""
+    """The solution with needless specular parts gone, which materials those are, and the evidence for every material.
+
+    held_out: held-out loss of a solution, or (solution, m) of a material's own observations
+    """
     matte, chosen = np.zeros(len(start.materials), bool), start
     seen = np.isin(np.arange(len(matte)), np.concatenate([block.material for block in blocks]))
     base = start.materials  # all are brought to rest from here alike: held-out loss changes with iterations, too
@@ -43,18 +47,19 @@ def matte_where_it_may_be(
         trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
         return trial if held_out(trial) > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
 
-    best = held_out(rested(base, matte, np.inf))
-    evidence = [Specular(True, best, best)] * len(matte)
+    rest = rested(base, matte, np.inf)
+    best = held_out(rest)
+    evidence = [Specular(True, None, None)] * len(matte)
     for m in np.argsort(base.specular.mean(1), kind="stable"):
         if not seen[m]:
             continue
         without = without_specular(base, m)
         trial = rested(without, matte | (np.arange(len(matte)) == m), HOPELESS * best)
-        score = held_out(trial)
-        needed = score > (1 + LEAST_GAIN) * best
-        evidence[m] = Specular(bool(needed), best, score)
+        score, own, own_without = held_out(trial), held_out(rest, m), held_out(trial, m)
+        needed = score > (1 + LEAST_GAIN) * best or own_without > (1 + LEAST_GAIN) * own
+        evidence[m] = Specular(bool(needed), own, own_without)
         if not needed:
-            base, chosen, best, matte[m] = without, trial, score, True
+            base, rest, chosen, best, matte[m] = without, trial, trial, score, True
     return chosen, matte, evidence
 
 

@@ -27,7 +27,7 @@ from scipy.linalg import cho_factor, cho_solve
 from factorlib.solve.normal_equations import Loss, System, predicted_radiance, residuals, system
 from factorlib.solve.problem import Block, connected_components, mirror_cells
 from factorlib.solve.step import damped, held_unknowns, masked, schur_complement
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 CONDITION = 1e-10  # smaller eigenvalues of the scaled information are directions the data do not see
@@ -38,6 +38,7 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     """Standard error of every material unknown, and the residual's standard deviation in units of the noise model.
 
     solution: a `descent.Solution` of these blocks;  loss: that it minimises
+    An unknown that the data do not see, as the roughness of a matte material, has the width of its range.
     """
     materials, lights = solution.materials, solution.lights
     sigma = residual_deviation(blocks, materials, lights, operator)
@@ -49,7 +50,9 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     count = max(len(scores), 2)
     sandwich = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
     variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in (inverse * sigma**2, sandwich)]
-    errors = np.sqrt(np.maximum(*variances).clip(0)).reshape(-1, 7)
+    unseen = np.diag(inverse) == 0
+    errors = np.where(unseen, np.inf, np.sqrt(np.maximum(*variances).clip(0))).reshape(-1, 7)
+    errors = np.minimum(errors, [1.0] * 6 + [ROUGHNESS[1] - ROUGHNESS[0]])
     return Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma
 
 
