@@ -145,10 +145,11 @@ def polished(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: 
 
 
 def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
-    """Mean robust loss per held-out channel value."""
+    """Mean robust loss per held-out channel value; of all values where none is held out."""
     total, count = 0.0, 0
+    none = not any(block.held_out.any() for block in blocks)
     for block, light in zip(blocks, lights, strict=True):
-        held = of_rows(block, block.held_out)
+        held = of_rows(block, block.held_out | none)
         total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
         count += 3 * len(held)
     return total / max(count, 1)
