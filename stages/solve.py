@@ -23,8 +23,9 @@ from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
 from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
-from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
+from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable
 from factorlib.solve.shadowing import without_shadows
+from factorlib.solve.told import untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
 from factorlib.stage import Inputs, Progress
@@ -64,7 +65,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
-    seen = concatenate([merge(read_observations(path), params.merge_degrees) for path in sorted(inputs["urm"].glob("*.parquet"))])
+    read = [read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))]
+    seen = concatenate([merge(usable(part), params.merge_degrees) for part in read])
+    _warn_of_unusable(read)
     blocks = blocks_of_observations(
         seen,
         Noise(params.noise_absolute, params.noise_relative),
@@ -73,6 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         seed=params.seed,
     )
     _warn_of_gaps(materials, blocks, seen)
+    _warn(untold_by_observations(materials, blocks))
     operator = reflection_operator(params.operator, weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
@@ -113,6 +117,21 @@ def _to_progress(progress: Progress, params: Params, models: int):
     return report
 
 
+def _warn(sentences: list[str]) -> None:
+    for sentence in sentences:
+        log.warning("%s", sentence)
+
+
+def _warn_of_unusable(read: list[Observations]) -> None:
+    for part in read:
+        left_out = len(part) - len(usable(part))
+        if left_out:
+            log.warning(
+                "photo '%s': %d of %d observations are left out, their radiance, normal or view not finite or their weight not positive",
+                ", ".join(part.photos), left_out, len(part),
+            )  # fmt: skip
+
+
 def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations) -> None:
     """Say what the observations cannot tell: unseen materials, unseen photos, sets that are not linked."""
     observed = {int(m) for block in blocks for m in np.unique(block.material)}
@@ -133,6 +152,7 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
 
 def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator) -> None:
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
+    _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
     found, components = joint.solution.materials, connected_components(blocks, len(names))
     component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
     model = {

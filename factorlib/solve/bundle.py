@@ -188,10 +188,12 @@ def polished(
 def held_out_loss(
     blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, m: int | None = None
 ) -> float:
-    """Mean robust loss per held-out channel value, of all observations or those of material m."""
+    """Mean robust loss per held-out channel value, of all observations or those of material m; of all values where none is held out."""
     total, count = 0.0, 0
+    none = not any(block.held_out.any() for block in blocks)
     for block, light in zip(blocks, lights, strict=True):
-        held = of_rows(block, block.held_out if m is None else block.held_out & (block.material == m))
+        own = block.held_out | none
+        held = of_rows(block, own if m is None else own & (block.material == m))
         total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
         count += 3 * len(held)
     return total / max(count, 1)

@@ -59,7 +59,7 @@ def operator_inputs(block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpnes
 def material_slices(block: Block) -> list[tuple[int, slice]]:
     """(material, rows) of runs of one material, of at most CHUNK rows."""
     starts = np.flatnonzero(np.diff(block.material, prepend=-1))
-    ends = np.append(starts[1:], len(block))
+    ends = np.append(starts, len(block))[1:]
     return [
         (int(block.material[a]), slice(i, min(i + CHUNK, b)))
         for a, b in zip(starts.tolist(), ends.tolist(), strict=True)

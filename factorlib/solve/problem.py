@@ -61,37 +61,45 @@ def blocks_of_observations(
     world_from_camera: Mapping[str, Float[np.ndarray, "3 3"]] | None = None,
     seed: int = 0,
 ) -> list[Block]:
-    """One block per illumination, in order of names; observations that are not finite are dropped.
+    """One block per illumination, in order of names; observations that are not `usable` are dropped.
 
     world_from_camera: rotation of each photo whose illumination is fixed to the world
     held_out:          share of observations kept for choosing the model
-    Raises InputError where nothing is left.
+    Raises InputError where nothing is left, or nothing but black.
     """
-    finite = np.isfinite(observations.radiance).all(1) & np.isfinite(observations.normal).all(1) & np.isfinite(observations.view).all(1)
-    usable = observations.take(finite & (observations.weight > 0))
-    if len(usable) == 0:
+    seen = usable(observations)
+    if len(seen) == 0:
         raise InputError("no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap")
+    if (seen.radiance <= 0).all():
+        raise InputError("every observation is black", cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks")
     rotations = world_from_camera or {}
     blocks = [
-        _block(usable.take(usable.illumination == i), name, noise, held_out, rotations, seed)
-        for i, name in enumerate(usable.illuminations)
-        if (usable.illumination == i).any()
+        _block(seen.take(seen.illumination == i), name, noise, held_out, rotations, seed)
+        for i, name in enumerate(seen.illuminations)
+        if (seen.illumination == i).any()
     ]
     return sorted(blocks, key=lambda block: block.name)
 
 
+def usable(observations: Observations) -> Observations:
+    """Those whose radiance and directions are finite, whose directions have a length, and that weigh something."""
+    vectors = np.stack([observations.radiance, observations.normal, observations.view])
+    directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
+    return observations.take(np.isfinite(vectors).all((0, 2)) & directed & (observations.weight > 0) & np.isfinite(observations.weight))
+
+
 def _block(seen: Observations, name: str, noise: Noise, held_out: float, rotations: Mapping, seed: int) -> Block:
-    order = np.lexsort((seen.x, seen.y, seen.photo, seen.material))
-    seen = seen.take(order)
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
+    order = np.lexsort((seen.x, seen.y, local, seen.material))
+    seen, local = seen.take(order), local[order]
     normal, view = _in_frame(seen.normal, seen, rotations), _in_frame(seen.view, seen, rotations)
     radiance = seen.radiance.astype(float)
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
     scaled = radiance / unit
     sigma = np.sqrt(noise.absolute**2 + (noise.relative * scaled) ** 2)
     weight = seen.weight / (1 + seen.weight / noise.most_weight)
-    chosen = _held_out(normal, view, held_out, seed)
+    chosen = _held_out(normal, view, seen.material, held_out, seed)
     return Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), np.sqrt(weight)[:, None] / sigma,
         seen.material.astype(np.int64), local, chosen, *_visibility(seen, photos, rotations),
@@ -107,14 +115,15 @@ def _visibility(seen: Observations, photos: Sequence[str], rotations: Mapping) -
     return seen.visibility, np.stack([directions @ frame.T for frame in frames])
 
 
-def _held_out(normal: np.ndarray, view: np.ndarray, share: float, seed: int) -> Bool[np.ndarray, "n"]:
-    """About a `share` of the observations: all whose mirror direction lies in one of randomly chosen cells.
+def _held_out(normal: np.ndarray, view: np.ndarray, material: np.ndarray, share: float, seed: int) -> Bool[np.ndarray, "n"]:
+    """About a `share` of the observations: all whose mirror direction lies in one of randomly chosen cells.  Never all of a material.
 
     Neighbouring pixels err alike, so single pixels would not tell a lobe that the light needs from one that explains
     the error of a place.
     """
     names, cell = np.unique(mirror_cells(normal, view, HELD_OUT_CELL), return_inverse=True)
-    return (np.random.default_rng(seed).random(len(names)) < share)[cell.reshape(-1)]
+    chosen = (np.random.default_rng(seed).random(len(names)) < share)[cell.reshape(-1)]
+    return chosen & np.isin(material, material[~chosen])
 
 
 def mirror_cells(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n"]:

@@ -1,0 +1,100 @@
+"""What cannot be told: of materials and lights, from the observations alone, and from the answer's standard errors.
+
+Every message names what is not determined, why, and which photo would help.  None stops the solve: what is determined
+is still found.  A factor per channel between reflectances and lights, and links between photos, are `solve.gauge`'s and
+the stage's matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.solve.problem import Block, connected_components
+from factorlib.solve.unknowns import ROUGHNESS, Materials
+
+FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
+FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
+CLIPPED = 0.5  # share of channel values
+ROUGHNESS_ERROR = 0.1  # one standard error that leaves matte and glossy apart
+SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
+
+
+def untold_by_observations(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
+    """What no solve can find, as sentences.
+
+    names: of all materials;  a material that no block shows is left out
+    """
+    said = [f"illumination '{b.name}' is black in every photo: it tells nothing" for b in blocks if (b.radiance <= 0).all()]
+    for m, name in enumerate(names):
+        shown = [(block, block.material == m) for block in blocks if (block.material == m).any()]
+        said += _of_material(name, shown) if shown else []
+    for members, lights in connected_components(blocks, len(names)):
+        if len(members) == 1 and lights:
+            said.append(_alone(names[members[0]], lights))
+    return said
+
+
+def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]) -> Iterator[str]:
+    count = sum(int(rows.sum()) for _, rows in shown)
+    if count < FEW:
+        yield (
+            f"material '{name}' has {count} observations, fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
+            "A photo from nearer would help"
+        )
+    if all(_spread(block, rows) < FLAT_DEG for block, rows in shown):
+        yield (
+            f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of it is specular "
+            "cannot be told. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
+        )
+    clipped = np.concatenate([block.clipped[rows] for block, rows in shown]).mean()
+    if clipped >= CLIPPED:
+        yield (
+            f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance is uncertain. "
+            "A photo of shorter exposure would help"
+        )
+
+
+def _spread(block: Block, rows: Bool[np.ndarray, "n"]) -> float:
+    """Largest angle between a mirror direction and their mean, degrees."""
+    normal, view = block.normal[rows], block.view[rows]
+    mirror = 2 * np.sum(normal * view, axis=1, keepdims=True) * normal - view
+    mean = mirror.mean(0)
+    return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
+
+
+def _alone(name: str, lights: Sequence[str]) -> str:
+    said = f"material '{name}' shares no light with another: its colour and brightness are told from the light's by convention only"
+    if len(lights) == 1:
+        said += ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
+    else:
+        said += ". A photo"
+    return said + " that shows another material too would help"
+
+
+def untold_by_answer(names: Sequence[str], blocks: Sequence[Block], found: Materials, errors: Materials) -> list[str]:
+    """What the data left open, by the standard `errors` of what was `found`, as sentences; of materials that are seen."""
+    seen = sorted({int(m) for block in blocks for m in np.unique(block.material)})
+    return [sentence for m in seen for sentence in _of_answer(names[m], _row(found, m), _row(errors, m))]
+
+
+def _row(materials: Materials, m: int) -> Float[np.ndarray, "7"]:
+    return materials.vector()[7 * m : 7 * m + 7]
+
+
+def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+    whole = found[:3] + found[3:6]
+    if not error[:6].max() <= SHARE_ERROR * whole.max():
+        yield (
+            f"the reflectance of material '{name}' is told to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
+            "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
+        )
+    if not error[6] <= ROUGHNESS_ERROR:
+        yield (
+            f"the roughness of material '{name}' cannot be told (±{error[6]:.2g}): no highlight stands out. "
+            "A photo in light with a small bright source would help"
+        )
+    elif found[6] <= ROUGHNESS[0] + 1e-9:
+        yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
