@@ -41,7 +41,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
     illumination that choose the lobes, before all of them polish the answer;  self_shadowing: whether what the meshes
-    hide is taken to be dark, `auto` where held-out pixels are explained better so;  prior: weight of the paper's tint
+    hide is taken to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
+    has a specular part, `auto` those whose held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
@@ -57,6 +58,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
     self_shadowing: Literal["auto", "on", "off"] = "auto"
+    specular: Literal["auto", "on"] = "auto"
     prior: Annotated[float, Meta(ge=0)] = 1e-4
     noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
     noise_relative: Annotated[float, Meta(ge=0)] = 0.05
@@ -99,7 +101,19 @@ def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
 def _bundle(params: Params) -> Bundle:
     same = {
         name: getattr(params, name)
-        for name in ("lobes", "insert", "rounds", "iterations", "polish", "sample", "tolerance", "least_gain", "self_shadowing", "seed")
+        for name in (
+            "lobes",
+            "insert",
+            "rounds",
+            "iterations",
+            "polish",
+            "sample",
+            "tolerance",
+            "least_gain",
+            "self_shadowing",
+            "specular",
+            "seed",
+        )
     }
     return Bundle(loss=Loss(prior=params.prior), **same)
 

@@ -47,7 +47,7 @@ class Bundle(msgspec.Struct, frozen=True):
     start_roughness: float = 0.4
     start_specular_share: float = 0.2
     self_shadowing: Literal["auto", "on", "off"] = "auto"
-    choose_specular: bool = True
+    specular: Literal["auto", "on"] = "auto"
     loss: Loss = Loss()
     seed: int = 0
 
@@ -64,6 +64,7 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
+Watch = Callable[[Event, Solution], None]
 
 
 class Joint(msgspec.Struct, frozen=True):
@@ -96,15 +97,26 @@ class Fit(msgspec.Struct, frozen=True):
         return rounds[number] if number < len(rounds) else self.held_out
 
 
-def solve(blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report) -> Joint:
-    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
+def solve(
+    blocks: Sequence[Block],
+    materials: int,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    watch: Watch = lambda event, solution: None,
+) -> Joint:
+    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers.
+
+    report, watch: are told every accepted point, `watch` with the solution
+    """
     models = candidates(blocks, bundle.self_shadowing)
     fits: dict[str, Fit] = {}
     for name, model in models.items():
-        fits[name] = best_round(model, materials, operator, bundle, map_, report, rivals=list(fits.values()))
+        fits[name] = best_round(model, materials, operator, bundle, map_, report, watch, list(fits.values()))
     chosen = min(fits, key=lambda name: fits[name].held_out)
     fit, matte, specular = with_specular_chosen(models[chosen], fits[chosen], operator, bundle, map_)
-    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte)
+    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, watch, matte)
     found = solution.materials
     specular_or_none = np.where(matte[:, None], 0.0, found.specular)
     solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
@@ -116,7 +128,7 @@ def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bu
     """The fit without needless specular parts, which materials are matte, and the evidence."""
     blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
     start = evaluated(blocks, fit.solution.materials, fit.solution.lights, operator, fit.loss, map_)
-    if not bundle.choose_specular or not any(block.held_out.any() for block in blocks):
+    if bundle.specular == "on" or not any(block.held_out.any() for block in blocks):
         return fit, np.zeros(len(start.materials), bool), []
 
     def held_out(s: Solution, m: int | None = None) -> float:
@@ -133,23 +145,31 @@ def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[B
     return models | ({"with": list(blocks)} if shadows else {})
 
 
-def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report) -> Callable:
+def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report, watch: Watch) -> Callable:
     def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
         held = held_out_loss(blocks, solution.materials, solution.lights, operator, loss) if iteration < 0 else np.nan
         fitted = sum(int((~b.held_out).sum()) * 3 for b in blocks)
         history.append(Event(round_, phase, iteration, solution.loss / fitted, held, sum(map(len, solution.lights))))
         report(history[-1])
+        watch(history[-1], solution)
         return held
 
     return record
 
 
 def best_round(
-    blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report, rivals: Sequence[Fit] = ()
+    blocks: Sequence[Block],
+    materials: int,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    watch: Watch,
+    rivals: Sequence[Fit] = (),
 ) -> Fit:
     """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
     blocks, history = [sampled(block, bundle.sample, bundle.seed) for block in blocks], []
-    record = _recorder(blocks, history, operator, bundle.loss, report)
+    record = _recorder(blocks, history, operator, bundle.loss, report, watch)
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
     current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
     current = _refitted(blocks, current, operator, bundle.loss, map_)
@@ -172,12 +192,12 @@ def best_round(
 
 
 def polished(
-    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, matte=None
+    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, watch: Watch, matte=None
 ) -> tuple[Solution, list[Event]]:
     """The best round brought to rest on all observations, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     history, number, loss = list(fit.history), fit.history[-1].round, fit.loss
-    record = _recorder(everything, history, operator, loss, report)
+    record = _recorder(everything, history, operator, loss, report, watch)
     best = evaluated(everything, fit.solution.materials, fit.solution.lights, operator, loss, map_)
     best = descend(
         everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s), matte

@@ -48,5 +48,5 @@ def test_a_matte_scene_ends_without_specular_and_with_few_lobes():
 
 
 def test_nothing_is_chosen_where_it_is_not_asked_for():
-    joint = chosen(MIXED, [0, 1, 2], choose_specular=False)
+    joint = chosen(MIXED, [0, 1, 2], specular="on")
     assert not joint.matte.any() and joint.specular == []
