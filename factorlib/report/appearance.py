@@ -31,6 +31,8 @@ class LightRow(msgspec.Struct, frozen=True):
     """An environment map: `white` is the radiance shown as white, `peak` the brightest texel in units of it.
 
     overflow: share of the sphere that is brighter than white, outlined; energy: its share of the light.
+    known: share of the sphere where the light's standard error is below its mean radiance; known_uri: that error as grey,
+    white where it is nil, black where it is many times the mean.
     """
 
     name: str
@@ -42,6 +44,8 @@ class LightRow(msgspec.Struct, frozen=True):
     overflow: float
     energy: float
     true_uri: str | None
+    known_uri: str | None
+    known: float | None
     spheres: str | None
     errors: dict | None
 
@@ -114,12 +118,15 @@ def light_row(run: Artifacts, name: str, photos: list[str], errors: dict | None)
     exposure = exposure_of(radiance, percentile=95.0)
     brightest, area = radiance.max(axis=-1) * exposure, lat_long_solid_angles(*radiance.shape[:2])[:, None]
     over, energy = brightest > 1, radiance.sum(axis=-1) * area
-    true = run.true_illumination(name)
+    true, known = run.true_illumination(name), run.coverage(name)
+    error = None if known is None else known.mean(axis=-1)
     return LightRow(
         name=name, photos=photos, white=1 / exposure, peak=float(brightest.max()),
         uri=data_uri(_outlined(picture(radiance, exposure), over)), dark_uri=data_uri(picture(radiance, exposure / 16)),
         overflow=float((over * area).sum() / (4 * np.pi)), energy=float((energy * over).sum() / max(energy.sum(), 1e-30)),
         true_uri=None if true is None else data_uri(_true_map(true, radiance, exposure)),
+        known_uri=None if error is None else data_uri(np.rint(255 / (1 + np.repeat(error[..., None], 3, -1))).astype(np.uint8)),
+        known=None if error is None else float(((error < 1) * area).sum() / (4 * np.pi)),
         spheres=_spheres(run, name), errors=errors,
     )  # fmt: skip
 

@@ -81,6 +81,9 @@ class Artifacts(msgspec.Struct, frozen=True):
     def illumination(self, name: str) -> Picture | None:
         return self._rgb(self.folders["export"] / "illumination" / f"{name}.exr")
 
+    def coverage(self, name: str) -> Picture | None:
+        return self._rgb(self.folders["export"] / "coverage" / f"{name}.exr")
+
     def true_illumination(self, name: str) -> Picture | None:
         return self._rgb(self.folders["evaluate"] / "illumination" / f"{name}.exr")
 

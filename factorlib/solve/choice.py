@@ -2,7 +2,9 @@
 
 A matte material would lend its specular part to errors of normals and lights.  Each material in turn, the least specular
 first, loses its specular part; the rest of the problem is brought to rest again, and if neither its own held-out loss nor
-that of all observations has risen by more than `LEAST_GAIN` of itself, the specular part stays away.
+that of all observations has risen by more than `LEAST_GAIN` of itself, the specular part stays away.  A material that
+reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out highlights
+better than the right one, and a dark glossy material would lose all it shows.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ GLANCE, ITERATIONS = 3, 9
 
 class Specular(msgspec.Struct, frozen=True):
     """What decided about a material: the held-out loss of its own observations with and without its specular part,
-    None where it has none."""
+    None where it has none or was not tried."""
 
     kept: bool
     held_out_loss_with: float | None
@@ -51,7 +53,7 @@ def matte_where_it_may_be(
     best = held_out(rest)
     evidence = [Specular(True, None, None)] * len(matte)
     for m in np.argsort(base.specular.mean(1), kind="stable"):
-        if not seen[m]:
+        if not seen[m] or base.specular[m].mean() > base.diffuse[m].mean():
             continue
         without = without_specular(base, m)
         trial = rested(without, matte | (np.arange(len(matte)) == m), HOPELESS * best)
