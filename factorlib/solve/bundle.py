@@ -3,8 +3,9 @@
     round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
             descend on everything (descent), prune, fix the gauge
             (all on a sample of the observations, which finds the lobes as well as all of them do)
-    stop:   when a round lowers the held-out loss by less than `least_gain`, at `lobes` lobes per light, or after
-            `rounds`; the best round by held-out loss is kept and polished on all observations.
+    stop:   when a round lowers the held-out loss by less than `least_gain` and does not halve the fitted one (few held-out
+            pixels are a noisy vote), at `lobes` lobes per light, or after `rounds`; the best round by held-out loss is
+            kept and polished on all observations.
 
 Where observations see past something, the rounds are run with and without that (self_shadowing = auto), and what
 explains the held-out pixels better is polished.
@@ -31,6 +32,7 @@ from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
 
 FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
+HALVED = 0.5  # a round that lowers the fitted loss to this share is not the last, whatever held-out observations say
 
 
 class Bundle(msgspec.Struct, frozen=True):
@@ -173,7 +175,7 @@ def best_round(
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
     current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
     current = _refitted(blocks, current, operator, bundle.loss, map_)
-    best, best_held = current, np.inf
+    best, best_held, fitted = current, np.inf, np.inf
     for number in range(bundle.rounds):
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
@@ -182,11 +184,12 @@ def best_round(
         )
         current = _tidied(blocks, current, operator, loss, map_)
         held = record(number, "round", -1, current)
-        gained = best_held - held
+        gained, halved = best_held - held, current.loss < HALVED * fitted
+        fitted = current.loss
         if held < best_held:
             best, best_held = current, held
         outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
-        if outdone or gained < bundle.least_gain * held or max(map(len, current.lights)) >= bundle.lobes:
+        if outdone or (gained < bundle.least_gain * held and not halved) or max(map(len, current.lights)) >= bundle.lobes:
             break
     return Fit(best, best_held, loss, history)
 

@@ -91,7 +91,7 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
             f"the reflectance of material '{name}' is told to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
             "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
         )
-    if not error[6] <= ROUGHNESS_ERROR:
+    if not (error[6] <= ROUGHNESS_ERROR and (found[3:6] > 2 * error[3:6]).any()):
         yield (
             f"the roughness of material '{name}' cannot be told (±{error[6]:.2g}): no highlight stands out. "
             "A photo in light with a small bright source would help"

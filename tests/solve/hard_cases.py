@@ -1,12 +1,12 @@
 """The hard cases of the joint solve: what is seen, what is true, and how far the answer is from it.
 
-Observations of spheres under lights made of a few lobes, rendered by the operator that solves, go the way of the stage:
-`blocks_of_observations`, `solve`, standard errors.
+Observations of spheres under lights made of a few lobes, rendered by the operator that solves, with 2 % noise, go the way of
+the stage: `blocks_of_observations`, `solve`, standard errors, what cannot be told.  `CASES` are worse in one way each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -15,107 +15,238 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, Joint, solve
 from factorlib.solve.normal_equations import predicted_radiance
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
+from factorlib.solve.told import untold_by_answer, untold_by_observations
+from factorlib.solve.uncertainty import standard_errors
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.stage import serial_map
 from factorlib.urm.observations import Observations
 from tests.solve.problems import sphere_normals
 
 OPERATOR = reflection_operator("network")
-QUICK = Bundle(lobes=8, insert=4, rounds=3, iterations=8, polish=20, tolerance=1e-4)
-TRUTH = Materials(
+QUICK = Bundle(lobes=10, insert=5, rounds=4, iterations=12, polish=20, tolerance=1e-3)
+FIVE = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2], [0.3, 0.3, 0.05], [0.25, 0.2, 0.3]]),
-    specular=np.array([[0.05, 0.05, 0.05], [0.2, 0.2, 0.2], [0.4, 0.35, 0.3], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]),
+    specular=np.array([[0.12, 0.12, 0.12], [0.2, 0.2, 0.2], [0.4, 0.35, 0.3], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]),
     roughness=np.array([0.7, 0.4, 0.25, 0.5, 0.3]),
 )
 NAMES = ("red", "green", "blue", "yellow", "violet")
-FRONT = np.array([0.0, 0.0, -1.0])
+ALL, FRONT = (0, 1, 2), np.array([0.0, 0.0, -1.0])
+GLOSSY = 0.02  # specular reflectance below which a true roughness shows in nothing
+SKY, SUN = 1.0, 1e4  # radiances
+
+
+class Case(msgspec.Struct, frozen=True):
+    """What is `seen`, what would be without noise and harm (`clean`), and the materials it was made with."""
+
+    seen: Observations
+    clean: Observations
+    truth: Materials
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """What came out of a case.
+    """What came out of a case, and what was said with it.
 
     k:         mean error of diffuse and specular reflectance over the mean of their sum, after one factor per channel and component
-    roughness: largest error
-    seen:      RMS error of the radiance of the noiseless observations, over their mean
+    roughness: largest error, of materials that have a highlight
+    radiance:  RMS error of re-synthesis of the clean observations, each over its radiance plus their mean
     """
 
     k: float
     roughness: float
-    seen: float
+    radiance: float
+    said: list[str]
     joint: Joint
-    blocks: list[Block]
 
     @property
     def materials(self) -> Materials:
         return self.joint.solution.materials
 
-    def finite(self) -> bool:
-        arrays = [self.materials.vector()]
-        for light in self.joint.solution.lights:
-            arrays += [light.axis, light.log_sharpness, light.weight, light.log_exposure]
-        return all(np.isfinite(array).all() for array in arrays)
+
+def chosen(rows: Sequence[int]) -> Materials:
+    return Materials(FIVE.diffuse[list(rows)], FIVE.specular[list(rows)], FIVE.roughness[list(rows)])
 
 
-def lamps(seed: int, lobes: int = 3, sharpness=(0.5, 60.0)) -> Light:
+THREE = chosen(ALL)
+
+
+def lamps(seed: int, lobes: int = 3) -> Light:
     """A broad lobe and a few lamps."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(lobes, 3)) + FRONT
-    log_sharpness = np.concatenate([[np.log(sharpness[0])], np.log(sharpness[1]) * rng.uniform(0.5, 1, lobes - 1)])
+    log_sharpness = np.concatenate([[np.log(0.5)], np.log(60.0) * rng.uniform(0.5, 1, lobes - 1)])
     weight = rng.lognormal(0, 0.3, (lobes, 1)) * rng.lognormal(0, 0.1, (lobes, 3)) * np.exp(log_sharpness * 0.8)[:, None]
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
 
 
-def observed(truth: Materials, lights: Sequence[Light], shown: Sequence[Sequence[int]], normals=None, view=FRONT) -> Observations:
-    """A sphere, or any `normals`, of each material that photo i shows, in light i."""
-    normals = sphere_normals(14) if normals is None else normals
+def light(*lobes: tuple[tuple[float, float, float], float, float]) -> Light:
+    """Of grey lobes (axis, sharpness, weight)."""
+    axis, sharpness, weight = (np.array(column, dtype=float) for column in zip(*lobes, strict=True))
+    return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.log(sharpness), np.repeat(weight[:, None], 3, 1), np.zeros(1))
+
+
+ROOMS = [lamps(seed) for seed in range(5)]
+POINT = light(((0.3, -0.5, -0.8), 2000.0, 3000.0))
+CONSTANT = light(((0.0, 0.0, -1.0), 1e-4, 1.0))
+SUNNY = light(((0.0, -1.0, -0.2), 0.1, SKY), ((0.6, -0.5, -0.6), 2000.0, SUN))
+FLAT = np.tile(np.array([[0.3, 0.1, -1.0]]) / np.sqrt(1.1), (60, 1))
+
+
+def observed(truth: Materials, lights: Sequence[Light], shown: Sequence[Sequence[int]], normals=None) -> Observations:
+    """A sphere, or any `normals`, of each material that photo i shows, in light i, without noise."""
+    normals = sphere_normals(10) if normals is None else normals
     parts = [(i, m) for i, materials in enumerate(shown) for m in materials]
-    n, count = len(normals), len(parts)
-    names = tuple(f"room{i}" for i in range(len(lights)))
-    empty = Observations(
-        normal=np.tile(normals, (count, 1)), view=np.tile(view, (n * count, 1)), radiance=np.ones((n * count, 3)),
-        clipped=np.zeros((n * count, 3), bool), material=np.repeat([m for _, m in parts], n), photo=np.repeat([i for i, _ in parts], n),
-        illumination=np.repeat([i for i, _ in parts], n), x=np.arange(n * count), y=np.zeros(n * count, int), weight=np.ones(n * count),
+    n, count, names = len(normals), len(parts), tuple(f"room{i}" for i in range(len(lights)))
+    photo = np.repeat([i for i, _ in parts], n)
+    seen = Observations(
+        normal=np.tile(normals, (count, 1)), view=np.tile(FRONT, (n * count, 1)), radiance=np.ones((n * count, 3)),
+        clipped=np.zeros((n * count, 3), bool), material=np.repeat([m for _, m in parts], n), photo=photo, illumination=photo,
+        x=np.arange(n * count), y=np.zeros(n * count, int), weight=np.ones(n * count),
         materials=NAMES[: len(truth)], photos=names, illuminations=names,
     )  # fmt: skip
-    radiance = np.ones((n * count, 3))
-    for block in blocks_of_observations(empty, Noise(), held_out=0.0):
-        i = names.index(block.name)
-        order = np.flatnonzero(empty.illumination == i)
-        order = order[np.lexsort((empty.x[order], empty.y[order], empty.photo[order], empty.material[order]))]
-        radiance[order] = predicted_radiance(block, lights[i], truth, OPERATOR)
-    return msgspec.structs.replace(empty, radiance=radiance)
+    radiance = seen.radiance.copy()
+    for block, lobes in zip(blocks_of_observations(seen, Noise()), lights, strict=True):  # their rows are those of `parts`
+        radiance[photo == names.index(block.name)] = predicted_radiance(block, lobes, truth, OPERATOR)
+    return msgspec.structs.replace(seen, radiance=radiance)
 
 
-def solved(seen: Observations, truth: Materials, clean: Observations | None = None, bundle: Bundle = QUICK, operator=OPERATOR) -> Answer:
-    """The answer, held against the `clean` observations (default: those that were seen)."""
-    blocks = blocks_of_observations(seen, Noise(), seed=bundle.seed)
-    joint = solve(blocks, len(truth), operator, bundle, serial_map, lambda event: None)
-    found = joint.solution
-    k, roughness = material_errors(found.materials, truth, blocks)
-    return Answer(k, roughness, reseen(joint, blocks, seen if clean is None else clean, operator), joint, blocks)
+def noisy(seen: Observations, seed: int = 0, share: float = 0.02) -> Observations:
+    random = np.random.default_rng(seed).normal(size=seen.radiance.shape)
+    return msgspec.structs.replace(seen, radiance=seen.radiance * (1 + share * random))
+
+
+def tilted(seen: Observations, degrees: np.ndarray, seed: int) -> Observations:
+    """Each normal turned by its own angle toward a random side."""
+    side = np.cross(seen.normal, np.random.default_rng(seed).normal(size=seen.normal.shape))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    angle = np.radians(degrees)[:, None]
+    return msgspec.structs.replace(seen, normal=np.cos(angle) * seen.normal + np.sin(angle) * side)
+
+
+def case(truth: Materials, lights: Sequence[Light], shown=None, normals=None) -> Callable[[int], Case]:
+    def of(seed: int) -> Case:
+        clean = observed(truth, lights, [range(len(truth))] * len(lights) if shown is None else shown, normals)
+        return Case(noisy(clean, seed), clean, truth)
+
+    return of
+
+
+ORDINARY = case(THREE, ROOMS[:2])
+
+
+def harmed(harm: Callable[[Observations, int], Observations]) -> Callable[[int], Case]:
+    """The ordinary case after `harm(seen, seed)`."""
+
+    def of(seed: int) -> Case:
+        ordinary = ORDINARY(seed)
+        return msgspec.structs.replace(ordinary, seen=harm(ordinary.seen, seed))
+
+    return of
+
+
+def of_brightness(factor: float) -> Callable[[int], Case]:
+    def of(seed: int) -> Case:
+        seen, clean = (msgspec.structs.replace(o, radiance=o.radiance * factor) for o in (ORDINARY(seed).seen, ORDINARY(seed).clean))
+        return Case(seen, clean, THREE)
+
+    return of
+
+
+def clipped(seen: Observations, seed: int, share: float = 0.5) -> Observations:
+    limit = np.quantile(seen.radiance, 1 - share)
+    return msgspec.structs.replace(seen, radiance=np.minimum(seen.radiance, limit), clipped=seen.radiance >= limit)
+
+
+def with_wrong_normals(seen: Observations, seed: int) -> Observations:
+    wrong = np.random.default_rng(seed).random(len(seen)) < 0.2
+    return tilted(seen, 40.0 * wrong, seed)
+
+
+def with_noise_on_normals(degrees: float) -> Callable[[int], Case]:
+    return harmed(lambda seen, seed: tilted(seen, degrees * np.abs(np.random.default_rng(seed).normal(size=len(seen))), seed + 1))
+
+
+def with_invalid(seen: Observations, seed: int) -> Observations:
+    radiance, normal, view = seen.radiance.copy(), seen.normal.copy(), seen.view.copy()
+    radiance[::11, 0], radiance[1::11, 1], radiance[2::11, 2], normal[3::11, 0], view[4::11] = np.nan, np.inf, -np.inf, np.nan, 0
+    return msgspec.structs.replace(seen, radiance=radiance, normal=normal, view=view)
+
+
+def _with(diffuse=THREE.diffuse, specular=THREE.specular, roughness=THREE.roughness) -> Materials:
+    return Materials(np.array(diffuse), np.array(specular), np.array(roughness))
+
+
+def _shiny() -> Materials:
+    return _with(THREE.diffuse * 0.05, THREE.specular + 0.3, np.full(3, 0.1))
+
+
+BLACK = _with(THREE.diffuse * [[1], [1], [0]], THREE.specular * [[1], [1], [0]])
+PATCH = sphere_normals(10)[::2][:30]
+
+CASES: dict[str, Callable[[int], Case]] = {
+    "ordinary: 3 materials × 2 lights": ORDINARY,
+    "1 material × 1 light": case(chosen([1]), ROOMS[:1]),
+    "1 material × 5 lights": case(chosen([1]), ROOMS),
+    "5 materials × 1 light": case(FIVE, ROOMS[:1]),
+    "unconnected: 2 × 1 and 3 × 1": case(FIVE, ROOMS[:2], [[0, 1], [2, 3, 4]]),
+    "flat objects": case(THREE, ROOMS[:2], normals=FLAT),
+    "an object of 30 pixels": case(chosen([1]), ROOMS[:1], normals=PATCH),
+    "a single pixel": case(chosen([1]), ROOMS[:1], normals=FLAT[:1]),
+    "all matte": case(_with(specular=THREE.specular * 0), ROOMS[:2]),
+    "all mirror-like: roughness .1": case(_shiny(), ROOMS[:2]),
+    "a black material": case(BLACK, ROOMS[:2]),
+    "a light of one point": case(THREE, [POINT]),
+    "constant light": case(THREE, [CONSTANT, CONSTANT]),
+    "radiances × 10⁻⁴": of_brightness(1e-4),
+    "radiances × 10⁴": of_brightness(1e4),
+    "sun 10⁴ × the sky": case(THREE, [SUNNY, ROOMS[1]]),
+    "half the values clipped": harmed(clipped),
+    "all values clipped": harmed(lambda seen, seed: clipped(seen, seed, 1.0)),
+    "20 % of normals wrong by 40°": harmed(with_wrong_normals),
+    "normals with noise of 1°": with_noise_on_normals(1),
+    "normals with noise of 2°": with_noise_on_normals(2),
+    "normals with noise of 5°": with_noise_on_normals(5),
+    "normals with noise of 10°": with_noise_on_normals(10),
+    "two equal materials": case(chosen([0, 1, 1]), ROOMS[:2]),
+    "a material without pixels": case(THREE, ROOMS[:2], [[0, 2], [0, 2]]),
+    "NaN, infinite, no direction": harmed(with_invalid),
+}
+
+
+def answered(given: Case, bundle: Bundle = QUICK, operator=OPERATOR) -> Answer:
+    """The answer, held against the clean observations."""
+    blocks = blocks_of_observations(given.seen, Noise(), seed=bundle.seed)
+    said = untold_by_observations(given.seen.materials, blocks)
+    joint = solve(blocks, len(given.truth), operator, bundle, serial_map, lambda event: None)
+    errors, _ = standard_errors(blocks, joint.solution, operator, joint.loss)
+    said += untold_by_answer(given.seen.materials, blocks, joint.solution.materials, errors)
+    k, roughness = material_errors(joint.solution.materials, given.truth, blocks)
+    return Answer(k, roughness, radiance_error(joint, blocks, given.clean, operator), said, joint)
+
+
+def is_finite(answer: Answer) -> bool:
+    lights = [getattr(found, name) for found in answer.joint.solution.lights for name in found.__struct_fields__]
+    return all(np.isfinite(array).all() for array in (answer.materials.vector(), *lights))
 
 
 def material_errors(found: Materials, truth: Materials, blocks: Sequence[Block]) -> tuple[float, float]:
     """Errors of reflectance and roughness, of the materials that were seen."""
-    errors, of, rough = [], [], []
+    errors, whole, rough = [], [], [0.0]
     for members, lights in connected_components(blocks, len(truth)):
-        rows = list(members)
         if not lights:
             continue
+        rows = list(members)
         f, t = (np.stack([m.diffuse[rows], m.specular[rows]]) for m in (found, truth))
         factor = t.sum((0, 1)) / f.sum((0, 1))
         errors.append(np.abs(f * factor - t).ravel())
-        of.append(t.sum(0).ravel())
-        rough.append(np.abs(found.roughness[rows] - truth.roughness[rows]))
-    return float(np.concatenate(errors).mean() / np.concatenate(of).mean()), float(np.concatenate(rough).max())
+        whole.append(t.sum(0).ravel())
+        rough += [abs(found.roughness[m] - truth.roughness[m]) for m in rows if truth.specular[m].max() > GLOSSY]
+    return float(np.concatenate(errors).mean() / np.concatenate(whole).mean()), float(max(rough))
 
 
-def reseen(joint: Joint, blocks: Sequence[Block], clean: Observations, operator) -> float:
-    """Error of re-synthesis."""
-    square, mean, count = 0.0, 0.0, 0
-    for true in blocks_of_observations(clean, Noise(), held_out=0.0):
-        index = [block.name for block in blocks].index(true.name)
-        scale = blocks[index].unit / true.unit
-        error = scale * predicted_radiance(true, joint.solution.lights[index], joint.solution.materials, operator) - true.radiance
-        square, mean, count = square + (error**2).sum(), mean + np.abs(true.radiance).sum(), count + error.size
-    return float(np.sqrt(square / count) / (mean / count))
+def radiance_error(joint: Joint, blocks: Sequence[Block], clean: Observations, operator) -> float:
+    names, relative = [block.name for block in blocks], []
+    for true in blocks_of_observations(clean, Noise()):
+        i = names.index(true.name)
+        found = predicted_radiance(true, joint.solution.lights[i], joint.solution.materials, operator) * blocks[i].unit / true.unit
+        relative.append((found - true.radiance) / (true.radiance + 1))
+    return float(np.sqrt(np.mean(np.concatenate(relative) ** 2)))
