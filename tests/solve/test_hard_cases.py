@@ -9,11 +9,26 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.reflection import reflection_operator
+from factorlib.solve.bundle import held_out_loss
+from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import write_observations
 from stages import solve as stage
-from tests.solve.hard_cases import BOUNDS, CASES, FLAT, ROOMS, Answer, Case, answered, chosen, is_finite, observed, of_random_starts
+from tests.solve.hard_cases import (
+    BOUNDS,
+    CASES,
+    FLAT,
+    OPERATOR,
+    ROOMS,
+    Answer,
+    Case,
+    answered,
+    chosen,
+    is_finite,
+    observed,
+    of_random_starts,
+)
 
 ONE = "1 material × 1 light"
 
@@ -145,6 +160,15 @@ def test_what_cannot_be_told_is_in_the_log_of_the_stage(tmp_path, caplog):
 
 def test_nothing_held_out_is_solved_too(tmp_path):
     assert np.isfinite(numbers(run_stage(tmp_path, CASES[ONE](0).seen, held_out=0.0))).all()
+
+
+def test_where_nothing_is_held_out_fitted_observations_choose_the_round():
+    given = CASES[ONE](0)
+    all_, none = (blocks_of_observations(given.seen, Noise(), held_out=share) for share in (1e-9, 0.0))
+    everything = [msgspec.structs.replace(block, held_out=np.ones(len(block), bool)) for block in all_]
+    light = [msgspec.structs.replace(ROOMS[0], weight=ROOMS[0].weight / none[0].unit)]
+    losses = [held_out_loss(blocks, given.truth, light, OPERATOR, Loss()) for blocks in (everything, none)]
+    assert losses[0] == losses[1] > 0
 
 
 def test_no_material_is_held_out_whole():
