@@ -10,8 +10,8 @@ from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import held_out_loss
-from factorlib.solve.normal_equations import Loss
-from factorlib.solve.problem import Noise, blocks_of_observations
+from factorlib.solve.normal_equations import Loss, material_slices
+from factorlib.solve.problem import Noise, blocks_of_observations, of_rows
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import write_observations
 from stages import solve as stage
@@ -132,11 +132,11 @@ def test_single_precision_of_the_operator_is_enough():
 def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp_path, caplog):
     given = CASES["NaN, infinite, no direction"](0)
     with caplog.at_level(logging.WARNING):
-        found = run_stage(tmp_path / "harmed", given.seen, merge_degrees=5.0)
+        found = run_stage(tmp_path / "harmed", given.seen, merge_degrees=20.0)
     assert "observations are left out" in caplog.text
     assert np.isfinite(numbers(found)).all()
     kept = np.isfinite(given.seen.radiance).all(1) & np.isfinite(given.seen.normal).all(1) & (given.seen.view != 0).any(1)
-    assert found == run_stage(tmp_path / "whole", given.seen.take(kept), merge_degrees=5.0)
+    assert found == run_stage(tmp_path / "whole", given.seen.take(kept), merge_degrees=20.0)
 
 
 def test_black_photos_are_named_and_nothing_but_black_is_an_error(tmp_path, caplog):
@@ -169,6 +169,18 @@ def test_where_nothing_is_held_out_fitted_observations_choose_the_round():
     light = [msgspec.structs.replace(ROOMS[0], weight=ROOMS[0].weight / none[0].unit)]
     losses = [held_out_loss(blocks, given.truth, light, OPERATOR, Loss()) for blocks in (everything, none)]
     assert losses[0] == losses[1] > 0
+
+
+def test_one_bad_vote_of_held_out_observations_does_not_end_a_solve_that_still_finds_lobes(monkeypatch):
+    votes = iter([1.0, 1.2] + [0.5] * 100)
+    monkeypatch.setattr("factorlib.solve.bundle.held_out_loss", lambda *_: next(votes))
+    history = answered(CASES[ONE](0)).joint.history
+    assert [event.held_out for event in history if event.phase == "round"][:3] == [1.0, 1.2, 0.5]
+
+
+def test_a_block_of_no_rows_has_no_slices():
+    (block,) = blocks_of_observations(CASES[ONE](0).seen, Noise())
+    assert material_slices(of_rows(block, np.zeros(len(block), bool))) == []
 
 
 def test_no_material_is_held_out_whole():
