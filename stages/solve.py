@@ -25,7 +25,7 @@ from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable
 from factorlib.solve.shadowing import without_shadows
-from factorlib.solve.told import untold_by_answer, untold_by_observations
+from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
 from factorlib.stage import Inputs, Progress
@@ -167,6 +167,7 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
 def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator) -> None:
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
+    _warn(ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator))
     found, components = joint.solution.materials, connected_components(blocks, len(names))
     component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
     model = {

@@ -1,4 +1,4 @@
-"""What cannot be told: of materials and lights, from the observations alone, and from the answer's standard errors.
+"""What cannot be told: from the observations alone, from the answer's standard errors, and where it explains too little.
 
 Every message names what is not determined, why, and which photo would help.  None stops the solve: what is determined
 is still found.  A factor per channel between reflectances and lights, and links between photos, are `solve.gauge`'s and
@@ -12,14 +12,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from factorlib.solve.normal_equations import predicted_radiance, residuals
 from factorlib.solve.problem import Block, connected_components
-from factorlib.solve.unknowns import ROUGHNESS, Materials
+from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
 
 FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
 FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
 CLIPPED = 0.5  # share of channel values
 ROUGHNESS_ERROR = 0.1  # one standard error that leaves matte and glossy apart
 SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
+DARK = 0.1  # a bound on reflectance that still says 'dark'
+OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
 
 
 def untold_by_observations(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
@@ -41,7 +44,7 @@ def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]
     count = sum(int(rows.sum()) for _, rows in shown)
     if count < FEW:
         yield (
-            f"material '{name}' has {count} observations, fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
+            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
             "A photo from nearer would help"
         )
     if all(_spread(block, rows) < FLAT_DEG for block, rows in shown):
@@ -86,7 +89,12 @@ def _row(materials: Materials, m: int) -> Float[np.ndarray, "7"]:
 
 def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
     whole = found[:3] + found[3:6]
-    if not error[:6].max() <= SHARE_ERROR * whole.max():
+    if whole.max() < error[:6].max() <= DARK:
+        yield (
+            f"material '{name}' is so dark that of its reflectance only a bound, about {whole.max() + 2 * error[:6].max():.2g}, can be told. "
+            "A photo of longer exposure would help"
+        )
+    elif not error[:6].max() <= SHARE_ERROR * whole.max():
         yield (
             f"the reflectance of material '{name}' is told to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
             "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
@@ -98,3 +106,17 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
         )
     elif found[6] <= ROUGHNESS[0] + 1e-9:
         yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
+
+
+def ill_explained(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator) -> list[str]:
+    """Illuminations whose observations the answer does not explain to the noise model, as sentences."""
+    said = []
+    for block, light in zip(blocks, lights, strict=True):
+        residual = residuals(block, predicted_radiance(block, light, materials, operator)) * (block.precision > 0)
+        share = float((np.abs(residual) > OUTLIER).mean())
+        if share > OUTLIERS:
+            said.append(
+                f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than {OUTLIER:g} times their noise. "
+                "Look at what `align` drew: wrong normals, poses or masks there make every material in it wrong"
+            )
+    return said
