@@ -1,0 +1,89 @@
+"""Standard errors of materials, and of the light in every direction."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.reflection import reflection_operator
+from factorlib.solve.coverage import LARGEST, relative_standard_errors
+from factorlib.solve.descent import Descent, descend, evaluated
+from factorlib.solve.normal_equations import Loss, system
+from factorlib.solve.problem import of_rows
+from factorlib.solve.uncertainty import clusters_of, reduced_scores, standard_errors
+from factorlib.stage import serial_map
+from tests.solve.problems import MATERIALS, block, random_light
+
+OPERATOR, LOSS = reflection_operator("network"), Loss()
+NOISE = 0.5
+
+
+def noisy(seed: int):
+    """Two lights of few lobes with independent noise, and the answer next to the truth."""
+    rng = np.random.default_rng(seed)
+    lights, blocks = [random_light(rng, 3) for _ in range(2)], []
+    for k, light in enumerate(lights):
+        data = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=20)
+        radiance = data.radiance + NOISE * rng.normal(size=data.radiance.shape) / data.precision
+        blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=np.zeros(len(data), bool)))
+    scaled = [msgspec.structs.replace(light, weight=light.weight / data.unit) for light, data in zip(lights, blocks, strict=True)]
+    start = evaluated(blocks, MATERIALS, scaled, OPERATOR, LOSS, serial_map)
+    return blocks, descend(blocks, start, OPERATOR, LOSS, Descent(25, 1e-7), serial_map)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return noisy(0)
+
+
+def test_scores_of_clusters_sum_to_the_gradient(solved):
+    blocks, solution = solved
+    data, light = blocks[0], solution.lights[0]
+    whole = system(data, light, MATERIALS, OPERATOR, Loss(prior=0.0), clusters_of(data))
+    np.testing.assert_allclose(whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8)
+    assert len(whole.scores) > 20
+    assert reduced_scores(whole, light).shape == (len(whole.scores), 21)
+
+
+def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():
+    inside = []
+    for seed in range(8):
+        blocks, solution = noisy(seed)
+        errors, sigma = standard_errors(blocks, solution, OPERATOR, LOSS)
+        found = solution.materials
+        factor = (MATERIALS.diffuse + MATERIALS.specular).sum(0) / (found.diffuse + found.specular).sum(0)
+        assert sigma == pytest.approx(NOISE, rel=0.1)
+        for own, true, error in (
+            (found.diffuse * factor, MATERIALS.diffuse, errors.diffuse * factor),
+            (found.specular * factor, MATERIALS.specular, errors.specular * factor),
+            (found.roughness, MATERIALS.roughness, errors.roughness),
+        ):
+            inside += (np.abs(own - true) < error).ravel().tolist()
+    assert 0.58 < np.mean(inside) < 0.85, np.mean(inside)
+
+
+def test_noise_twice_as_large_doubles_the_errors(solved):
+    blocks, solution = solved
+    louder = [
+        msgspec.structs.replace(b, radiance=b.radiance + (b.radiance - predicted) / 1.0)
+        for b, predicted in zip(blocks, predictions(blocks, solution), strict=True)
+    ]
+    again = evaluated(louder, solution.materials, solution.lights, OPERATOR, LOSS, serial_map)
+    once, twice = (standard_errors(b, s, OPERATOR, Loss(robust_scale=1e3))[0] for b, s in ((blocks, solution), (louder, again)))
+    np.testing.assert_allclose(twice.roughness, 2 * once.roughness, rtol=0.05)
+
+
+def predictions(blocks, solution):
+    from factorlib.solve.normal_equations import predicted_radiance
+
+    return [predicted_radiance(b, light, solution.materials, OPERATOR) for b, light in zip(blocks, solution.lights, strict=True)]
+
+
+def test_directions_that_no_observation_mirrors_are_told_less(solved):
+    blocks, solution = solved
+    upper = of_rows(blocks[0], blocks[0].normal[:, 1] < -0.2)  # camera frame: y down, so normals that face upward
+    errors = relative_standard_errors(upper, solution.lights[0], solution.materials, OPERATOR, LOSS, 0.5)
+    directions = lat_long_directions(*errors.shape[:2]) @ YUP_FROM_CAMERA
+    above, below = errors[directions[..., 1] < -0.6], errors[directions[..., 1] > 0.8]
+    assert (errors > 0).all() and (errors <= LARGEST).all()
+    assert np.median(below) > 5 * np.median(above)
