@@ -1,8 +1,8 @@
 """Which directions of a light the data constrain: the standard error of its radiance there.
 
-Let a be the whitened response of a further lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian of
-everything that is solved for (the light's lobes, exposures, the materials).  What the data say about that lobe's weight
-beyond what J could imitate is the Schur complement
+Let a be the whitened response of a lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian of what is
+solved for besides the lobes (materials, exposures).  What the data say about the light's weight there, all that J could
+imitate left out and the light of other directions given, is the Schur complement
 
     i_d = aᵀa − aᵀJ (JᵀJ)⁻¹ Jᵀa = ‖a‖² − ‖Qᵀa‖²,       Q an orthonormal basis of J's columns,                  (1)
 
@@ -63,7 +63,7 @@ def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n
 
 
 def _jacobians(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
-    """Of each channel, in the order of the block's rows; robust weights left out, since a lobe's atoms have none."""
+    """Of each channel by all but the lobes, in the order of the block's rows; robust weights left out, since a lobe's atoms have none."""
     unknowns = 7 * len(materials) + 6 * len(light) + len(light.log_exposure) - 1
     whole = [np.zeros((len(block), unknowns)) for _ in range(3)]
     plain = msgspec.structs.replace(loss, robust_scale=1e6)
@@ -71,4 +71,6 @@ def _jacobians(block: Block, light: Light, materials: Materials, operator, loss:
         response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[m], operator))
         for c, channel in enumerate(whitened_rows(block, rows, light, materials, m, response, plain)):
             whole[c][rows, channel.places] = channel.jacobian.numpy()
-    return [jacobian[:, np.abs(jacobian).max(0) > 0] for jacobian in whole]
+    first = 7 * len(materials)
+    others = np.r_[0:first, first + 6 * len(light) : unknowns]
+    return [jacobian[:, others] for jacobian in whole]
