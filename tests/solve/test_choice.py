@@ -12,8 +12,8 @@ from tests.solve.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
 MIXED = Materials(
-    diffuse=np.array([[0.6, 0.3, 0.2], [0.2, 0.3, 0.4], [0.1, 0.1, 0.12]]),
-    specular=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.3, 0.3]]),
+    diffuse=np.array([[0.6, 0.3, 0.2], [0.2, 0.3, 0.4], [0.35, 0.3, 0.4]]),
+    specular=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]),
     roughness=np.array([0.5, 0.5, 0.35]),
 )
 
@@ -50,3 +50,9 @@ def test_a_matte_scene_ends_without_specular_and_with_few_lobes():
 def test_nothing_is_chosen_where_it_is_not_asked_for():
     joint = chosen(MIXED, [0, 1, 2], specular="on")
     assert not joint.matte.any() and joint.specular == []
+
+
+def test_what_shines_more_than_it_scatters_is_not_tried():
+    glossy = Materials(MIXED.diffuse / np.array([[1], [1], [5]]), MIXED.specular, MIXED.roughness)
+    joint = chosen(glossy, [0, 1, 2])
+    assert not joint.matte[2] and joint.specular[2].held_out_loss_without is None
