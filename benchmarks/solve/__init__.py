@@ -1,0 +1,1 @@
+"""Speed against error of the joint solve, on spheres whose every truth is known."""
