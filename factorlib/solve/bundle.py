@@ -66,7 +66,11 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Watch = Callable[[Event, Solution], None]
+Snapshot = Callable[[Event, Solution], None]  # is handed every accepted point itself
+
+
+def unwatched(event: Event, solution: Solution) -> None:
+    """Nobody asked for snapshots."""
 
 
 class Joint(msgspec.Struct, frozen=True):
@@ -100,25 +104,16 @@ class Fit(msgspec.Struct, frozen=True):
 
 
 def solve(
-    blocks: Sequence[Block],
-    materials: int,
-    operator,
-    bundle: Bundle,
-    map_: Callable,
-    report: Report,
-    watch: Watch = lambda event, solution: None,
+    blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report, snapshot: Snapshot = unwatched
 ) -> Joint:
-    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers.
-
-    report, watch: are told every accepted point, `watch` with the solution
-    """
+    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
     models = candidates(blocks, bundle.self_shadowing)
     fits: dict[str, Fit] = {}
     for name, model in models.items():
-        fits[name] = best_round(model, materials, operator, bundle, map_, report, watch, list(fits.values()))
+        fits[name] = best_round(model, materials, operator, bundle, map_, report, list(fits.values()), snapshot)
     chosen = min(fits, key=lambda name: fits[name].held_out)
     fit, matte, specular = with_specular_chosen(models[chosen], fits[chosen], operator, bundle, map_)
-    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, watch, matte)
+    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte, snapshot)
     found = solution.materials
     specular_or_none = np.where(matte[:, None], 0.0, found.specular)
     solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
@@ -147,13 +142,13 @@ def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[B
     return models | ({"with": list(blocks)} if shadows else {})
 
 
-def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report, watch: Watch) -> Callable:
+def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report, snapshot: Snapshot) -> Callable:
     def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
         held = held_out_loss(blocks, solution.materials, solution.lights, operator, loss) if iteration < 0 else np.nan
         fitted = sum(int((~b.held_out).sum()) * 3 for b in blocks)
         history.append(Event(round_, phase, iteration, solution.loss / fitted, held, sum(map(len, solution.lights))))
         report(history[-1])
-        watch(history[-1], solution)
+        snapshot(history[-1], solution)
         return held
 
     return record
@@ -166,12 +161,12 @@ def best_round(
     bundle: Bundle,
     map_: Callable,
     report: Report,
-    watch: Watch,
     rivals: Sequence[Fit] = (),
+    snapshot: Snapshot = unwatched,
 ) -> Fit:
     """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
     blocks, history = [sampled(block, bundle.sample, bundle.seed) for block in blocks], []
-    record = _recorder(blocks, history, operator, bundle.loss, report, watch)
+    record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
     current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
     current = _refitted(blocks, current, operator, bundle.loss, map_)
@@ -195,12 +190,12 @@ def best_round(
 
 
 def polished(
-    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, watch: Watch, matte=None
+    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, matte=None, snapshot: Snapshot = unwatched
 ) -> tuple[Solution, list[Event]]:
     """The best round brought to rest on all observations, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     history, number, loss = list(fit.history), fit.history[-1].round, fit.loss
-    record = _recorder(everything, history, operator, loss, report, watch)
+    record = _recorder(everything, history, operator, loss, report, snapshot)
     best = evaluated(everything, fit.solution.materials, fit.solution.lights, operator, loss, map_)
     best = descend(
         everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s), matte

@@ -1,0 +1,95 @@
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from factorlib.reflection import reflection_operator
+from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.paper import Paper, Problem, drawn, inverse_hessian_times, solve
+from factorlib.stage import serial_map
+from tests.solve.problems import MATERIALS, block, factor_between, random_light
+
+OPERATOR = reflection_operator("closed_form", dtype="float64")
+QUICK = Paper(lobes=12, samplings=120, subset=300)
+
+
+def rooms(photos=1, size=16):
+    rng = np.random.default_rng(3)
+    return [block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=i) for i in range(2)]
+
+
+def run(blocks, paper=QUICK, operator=OPERATOR):
+    return solve(blocks, 3, operator, paper, serial_map, lambda event: None)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    blocks = rooms()
+    return blocks, run(blocks)
+
+
+def test_roughly_recovers_the_materials_it_was_rendered_with(solved):
+    found = solved[1].solution.materials
+    factor = factor_between(found, MATERIALS)
+    np.testing.assert_allclose(found.roughness, MATERIALS.roughness, atol=0.15)
+    np.testing.assert_allclose(found.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.03)
+
+
+def test_resynthesises_what_it_was_shown(solved):
+    blocks, joint = solved
+    for data, light in zip(blocks, joint.solution.lights, strict=True):
+        error = predicted_radiance(data, light, joint.solution.materials, OPERATOR) - data.radiance
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.quantile(data.radiance, 0.99)
+
+
+def test_lights_are_not_negative_and_finite(solved):
+    for light in solved[1].solution.lights:
+        assert len(light) == QUICK.lobes
+        assert (light.weight >= 0).all()
+        assert np.isfinite(light.weight).all() and np.isfinite(light.sharpness).all()
+        np.testing.assert_allclose(np.linalg.norm(light.axis, axis=1), 1)
+
+
+def test_the_same_seed_gives_the_same_answer():
+    short = msgspec.structs.replace(QUICK, samplings=3)
+    blocks = rooms()
+    one, other = run(blocks, short), run(blocks, short)
+    np.testing.assert_array_equal(one.solution.materials.vector(), other.solution.materials.vector())
+    np.testing.assert_array_equal(one.solution.lights[0].weight, other.solution.lights[0].weight)
+
+
+def test_scaling_a_photo_scales_its_light_alone():
+    short = msgspec.structs.replace(QUICK, samplings=3)
+    blocks = rooms()
+    one, other = run(blocks, short), run([msgspec.structs.replace(blocks[0], unit=7 * blocks[0].unit), blocks[1]], short)
+    np.testing.assert_array_equal(one.solution.materials.vector(), other.solution.materials.vector())
+    np.testing.assert_array_equal(one.solution.lights[0].weight, other.solution.lights[0].weight)  # in units of the block
+
+
+def test_gradient_is_the_finite_difference():
+    blocks = rooms(photos=2, size=8)
+    problem = Problem(blocks, 3, OPERATOR, Paper(lobes=3))
+    subset = drawn([np.arange(len(b)) for b in blocks], 60, np.random.default_rng(0))
+    x = problem.start() + 0.3 * torch.randn(sum(problem.sizes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    _, gradient = problem.objective(x, subset)
+    moves = torch.eye(len(x), dtype=torch.float64) * 1e-6
+    expected = [(problem.objective(x + d, subset)[0] - problem.objective(x - d, subset)[0]) / 2e-6 for d in moves]
+    np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+
+
+def test_each_observation_is_drawn_as_often_as_asked():
+    rows, random = [np.arange(40), np.arange(10, 70)], np.random.default_rng(0)
+    counts = np.zeros(70)
+    for _ in range(100):
+        parts = drawn(rows, 20, random)
+        assert sum(map(len, parts)) == 20
+        np.add.at(counts, parts[1], 1)
+    assert counts[:10].sum() == 0
+    np.testing.assert_allclose(counts[10:].mean(), 20, rtol=0.1)
+
+
+def test_pairs_of_a_quadratic_give_its_newton_step():
+    hessian = torch.diag(torch.tensor([1.0, 4.0, 9.0], dtype=torch.float64))
+    pairs = [(step, hessian @ step) for step in torch.eye(3, dtype=torch.float64)]
+    gradient = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(inverse_hessian_times(gradient, pairs), torch.linalg.solve(hessian, gradient))
