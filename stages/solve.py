@@ -5,6 +5,7 @@ Writes materials.json, lobes.parquet, exposures.json, convergence.parquet, uncer
 
 import logging
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,6 +24,8 @@ from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
 from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
+from factorlib.solve.paper import REPORTS, Paper
+from factorlib.solve.paper import solve as solve_as_the_paper
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
@@ -37,7 +40,9 @@ Meta = msgspec.Meta
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """operator: how a lobe's reflection is computed;  merge_degrees: observations this near are merged before solving.
+    """solver: `paper` is the baseline, with lobes, samplings of each observation and a prior of its own (paper_…);
+    operator: how a lobe's reflection is computed, `auto` being `network`, and `paper_network` for the paper's solver;
+    merge_degrees: observations this near are merged before solving.
 
     lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
     illumination that choose the lobes, before all of them polish the answer;  self_shadowing: whether what the meshes
@@ -46,7 +51,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
 
-    operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
+    solver: Literal["bundle", "paper"] = "bundle"
+    operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
     merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
     lobes: Annotated[int, Meta(ge=1, le=1024)] = 72
     insert: Annotated[int, Meta(ge=1, le=64)] = 12
@@ -62,6 +68,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prior: Annotated[float, Meta(ge=0)] = 1e-4
     noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
     noise_relative: Annotated[float, Meta(ge=0)] = 0.05
+    paper_lobes: Annotated[int, Meta(ge=1, le=1024)] = 32
+    paper_samplings: Annotated[float, Meta(gt=0)] = 5.0
+    paper_prior: Annotated[float, Meta(ge=0)] = 0.1
     seed: Annotated[int, Meta(ge=0)] = 0
 
 
@@ -79,18 +88,26 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
     _warn_of_gaps(materials, blocks, seen)
     _warn(untold_by_observations(materials, blocks))
-    operator = reflection_operator(params.operator, weights=inputs["train"])
+    operator = reflection_operator(operator_of(params), weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        joint = solve(
-            blocks,
-            len(materials),
-            operator,
-            _bundle(params),
-            spread,
-            _to_progress(progress, params, len(candidates(blocks, params.self_shadowing))),
-        )
-    _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator)
+        joint = _solved(params, blocks, len(materials), operator, spread, progress)
+    _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator, params.solver)
+
+
+def operator_of(params: Params) -> str:
+    """The name of the operator that the solver takes."""
+    automatic = {"bundle": "network", "paper": "paper_network"}[params.solver]
+    return automatic if params.operator == "auto" else params.operator
+
+
+def _solved(params: Params, blocks: list[Block], materials: int, operator, spread: Callable, progress: Progress) -> Joint:
+    if params.solver == "paper":
+        paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
+        said = lambda event: progress(event.round + 1, REPORTS + 1, f"subset {event.iteration}: loss {event.loss:.3g}")  # noqa: E731
+        return solve_as_the_paper(blocks, materials, operator, paper, spread, said)
+    models = len(candidates(blocks, params.self_shadowing))
+    return solve(blocks, materials, operator, _bundle(params), spread, _to_progress(progress, params, models))
 
 
 def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
@@ -164,17 +181,17 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
         )  # fmt: skip
 
 
-def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator) -> None:
+def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator, solver: str) -> None:
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
     _warn(ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator))
     found, components = joint.solution.materials, connected_components(blocks, len(names))
     component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
     model = {
-        "solver": "bundle",
+        "solver": solver,
         "lobes": {block.name: len(light) for block, light in zip(blocks, joint.solution.lights, strict=True)},
-        "lobes_chosen_by": "held-out loss per round, see convergence.parquet",
-        "held_out_loss": [event.held_out for event in joint.history if event.phase == "round"],
+        "lobes_chosen_by": {"bundle": "held-out loss per round, see convergence.parquet", "paper": "given"}[solver],
+        "held_out_loss": [event.held_out for event in joint.history if event.phase in ("round", "subset")],
         "specular": {name: not bool(joint.matte[m]) for m, name in enumerate(names)},
         "specular_chosen_by": {name: msgspec.to_builtins(told) for name, told in zip(names, joint.specular, strict=False)},
         "self_shadowing": joint.self_shadowing,

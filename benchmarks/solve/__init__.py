@@ -1,1 +1,1 @@
-"""Speed against error of the joint solve on spheres whose materials, lights and normals are known exactly."""
+"""Speed against error of the joint solve, on spheres whose every truth is known."""

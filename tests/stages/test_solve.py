@@ -118,3 +118,20 @@ def test_a_material_nobody_saw_is_named(tmp_path, caplog, linked):
 def test_nothing_to_see_is_an_error_that_says_where_to_look(tmp_path, linked):
     with pytest.raises(InputError, match="no valid observation"):
         run(tmp_path, {"a": linked["a"].take(np.zeros(0, int))})
+
+
+def test_the_papers_solver_writes_the_same_artifacts(tmp_path, linked):
+    out = run(tmp_path, linked, solver="paper", paper_lobes=3, paper_samplings=1.0)
+    found = read_json(out / "materials.json")
+    assert found["model"]["solver"] == "paper"
+    assert found["model"]["lobes"] == {"a": 3, "b": 3}
+    assert set(found["materials"]) == set(NAMES)
+    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
+
+
+@pytest.mark.parametrize(
+    "solver, operator, taken",
+    [("bundle", "auto", "network"), ("paper", "auto", "paper_network"), ("paper", "network", "network")],
+)
+def test_each_solver_has_an_operator_of_its_own(solver, operator, taken):
+    assert solve.operator_of(solve.Params(solver=solver, operator=operator)) == taken
