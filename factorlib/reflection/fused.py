@@ -1,7 +1,7 @@
 """The reflection networks' values and gradients as C functions, compiled on first use.
 
 The formulas stay where they are, in torch: they are run once on a `Tape`, which knows their derivatives and writes both
-as C into kernel.c.  The network's derivative by its features comes between: with t = tanh(net/s) the result is
+as C into kernel.c, which can leave the derivatives out.  The network's derivative by its features comes between: with t = tanh(net/s) the result is
 R = formula · exp(fade · s · t), so that BACKWARD is seeded by ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
 
 Without a C compiler (`cc`, or what CC says) torch computes the same, an order of magnitude slower.
@@ -49,13 +49,21 @@ class Fused:
 
     def __call__(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
         """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""
+        out = self._filled(6, roughness, sharpness, no, nz, oz)
+        out[1] *= 2 * roughness
+        return out
+
+    def value(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
+        """The value alone, in about a third of the time."""
+        return self._filled(1, roughness, sharpness, no, nz, oz)[0]
+
+    def _filled(self, count: int, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
         no, nz, oz = (t.detach().float().contiguous() for t in (no, nz, oz))
-        out = [torch.empty_like(nz) for _ in range(6)]
-        pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))
+        out = [torch.empty_like(nz) for _ in range(count)]
+        pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # the rest are null
         lobes = _lobe_table(sharpness)
         arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
         self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
-        out[1] *= 2 * roughness
         return out
 
 
@@ -101,15 +109,18 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)])
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
     results = (result.clamp_max(MOST), by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
-    places = PLACES | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
+    places = PLACES | {"formula": "formula[l]"} | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
     backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
+    value = tape.c_code({"result[0][l]": (tape.input("formula") * grown).clamp_max(MOST)}, places)
     text = (Path(__file__).parent / "kernel.c").read_text()
     before, after = text.split("      FORWARD\n")
-    middle, end = after.split("      BACKWARD\n")
+    middle, after = after.split("        BACKWARD\n")
+    between, end = after.split("        VALUE\n")
     sizes = f"#define FEATURES {features}\n#define WIDTH {width}\n#define DEPTH {depth}\n#define MOMENTS {len(MOMENTS)}\n"
     for name in ("expf", "logf", "log1pf", "erfcf"):
-        forward, backward = ([line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward))
-    return sizes + before + "\n".join(forward) + "\n" + middle + "\n".join(backward) + "\n" + end
+        forward, backward, value = ([line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward, value))
+    forward, backward, value = ("\n".join(lines) + "\n" for lines in (forward, backward, value))
+    return sizes + before + forward + middle + backward + between + value + end
 
 
 @lru_cache(maxsize=8)

@@ -2,7 +2,8 @@
 
    FORWARD and BACKWARD are written by factorlib/reflection/fused.py from the formulas in torch: FORWARD sets feature[f][l]
    and formula[l], BACKWARD the derivatives, given those of the result by each feature in slope[f][l].
-   FEATURES, WIDTH and DEPTH are the network's; MOMENTS is the number of facts about a lobe. */
+   FEATURES, WIDTH and DEPTH are the network's; MOMENTS is the number of facts about a lobe.  Where no derivatives are asked
+   for (out[1] is null), BACKWARD's are not computed: VALUE sets result[0] alone. */
 
 #include <math.h>
 #include <string.h>
@@ -67,9 +68,9 @@ static inline void silu(int count, lanes *restrict x, lanes *restrict derivative
     }
 }
 
-/* The network and its derivative by each feature.  w: for each layer its weights [out, in], then, for all layers but the
+/* The network and, unless `slope` is null, its derivative by each feature.  w: for each layer its weights [out, in], then, for all layers but the
    last, the transposed ones [in, out] in the same order; features are standardised within the first. */
-static void network(const float *w, const float *b, const float *wt, lanes *feature, float *result, lanes *slope) {
+static inline void network(const float *w, const float *b, const float *wt, lanes *feature, float *result, lanes *slope) {
   static const float zero[WIDTH > FEATURES ? WIDTH : FEATURES];
   lanes x[2][WIDTH], derivative[DEPTH][WIDTH];
   int ins = FEATURES;
@@ -82,6 +83,7 @@ static void network(const float *w, const float *b, const float *wt, lanes *feat
   for (int l = 0; l < LANES; l++) result[l] = b[0];
   for (int j = 0; j < WIDTH; j++)
     for (int l = 0; l < LANES; l++) result[l] += w[j] * last[j][l], back[j][l] = w[j];
+  if (!slope) return;
   for (int k = DEPTH - 1; k >= 0; k--) {
     for (int j = 0; j < WIDTH; j++)
       for (int l = 0; l < LANES; l++) back[j][l] *= derivative[k][j][l];
@@ -108,11 +110,16 @@ void response(long rows, long p, float alpha, const float *lobes, const float *n
     for (int l = 0; l < LANES; l++) {
       FORWARD
     }
-    network(w, b, wt, feature, net, slope);
-    for (int l = 0; l < LANES; l++) {
-      BACKWARD
-    }
+    network(w, b, wt, feature, net, out[1] ? slope : 0);
+    if (out[1])
+      for (int l = 0; l < LANES; l++) {
+        BACKWARD
+      }
+    else
+      for (int l = 0; l < LANES; l++) {
+        VALUE
+      }
     long count = size - start < LANES ? size - start : LANES;
-    for (int k = 0; k < 6; k++) memcpy(out[k] + start, result[k], count * sizeof(float));
+    for (int k = 0; k < (out[1] ? 6 : 1); k++) memcpy(out[k] + start, result[k], count * sizeof(float));
   }
 }

@@ -141,7 +141,7 @@ class Network(Operator):
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         if self._compiled(sharpness, nz):
-            return self.fused["diffuse"](0.0, sharpness, nz.new_ones(len(nz)), nz, nz)[0]
+            return self.fused["diffuse"].value(0.0, sharpness, nz.new_ones(len(nz)), nz, nz)
         nz = nz.clamp(-1, 1)
         return diffuse_form.diffuse(sharpness, nz) * torch.exp(
             correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness)
@@ -149,7 +149,7 @@ class Network(Operator):
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
         if roughness.ndim == 0 and no.ndim == 1 and self._compiled(sharpness, no, nz, oz, roughness):
-            return self.fused["specular"](float(roughness), sharpness, no, nz, oz)[0]
+            return self.fused["specular"].value(float(roughness), sharpness, no, nz, oz)
         alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         form = filtered_specular(alpha, sharpness, no, nz, oz)
         grown = torch.exp(correction(self.layers["specular"], specular_features(alpha, no, nz, oz, form), sharpness))

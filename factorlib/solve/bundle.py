@@ -31,6 +31,7 @@ from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
 
+MANY = 4  # times `sample` observations bring the best round to rest, before all of them settle it
 FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
 HALVED = 0.5  # a round that lowers the fitted loss to this share is not the last, whatever held-out observations say
 
@@ -43,6 +44,7 @@ class Bundle(msgspec.Struct, frozen=True):
     rounds: int = 12
     iterations: int = 12
     polish: int = 20
+    settle: int = 4
     sample: int = 1500
     tolerance: float = 1e-4
     least_gain: float = 0.01
@@ -192,14 +194,15 @@ def best_round(
 def polished(
     blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, matte=None, snapshot: Snapshot = unwatched
 ) -> tuple[Solution, list[Event]]:
-    """The best round brought to rest on all observations, and the whole history."""
+    """The best round brought to rest on many observations, then on all, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
-    history, number, loss = list(fit.history), fit.history[-1].round, fit.loss
-    record = _recorder(everything, history, operator, loss, report, snapshot)
-    best = evaluated(everything, fit.solution.materials, fit.solution.lights, operator, loss, map_)
-    best = descend(
-        everything, best, operator, loss, _descent(bundle, bundle.polish), map_, lambda i, s: record(number, "polish", i, s), matte
-    )
+    many = [sampled(b, MANY * bundle.sample, bundle.seed) for b in everything]
+    history, number, loss, best = list(fit.history), fit.history[-1].round, fit.loss, fit.solution
+    phases = [(many, bundle.polish), (everything, min(bundle.settle, bundle.polish))]
+    for of, iterations in phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]:
+        record = _recorder(of, history, operator, loss, report, snapshot)
+        best = evaluated(of, best.materials, best.lights, operator, loss, map_)
+        best = descend(of, best, operator, loss, _descent(bundle, iterations), map_, lambda i, s, r=record: r(number, "polish", i, s), matte)
     return _tidied(everything, best, operator, loss, map_), history
 
 

@@ -40,7 +40,7 @@ def matte_where_it_may_be(
 
     held_out: held-out loss of a solution, or (solution, m) of a material's own observations
     """
-    matte, chosen = np.zeros(len(start.materials), bool), start
+    matte = np.zeros(len(start.materials), bool)
     seen = np.isin(np.arange(len(matte)), np.concatenate([block.material for block in blocks]))
     base = start.materials  # all are brought to rest from here alike: held-out loss changes with iterations, too
 
@@ -49,7 +49,7 @@ def matte_where_it_may_be(
         trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
         return trial if held_out(trial) > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
 
-    rest = rested(base, matte, np.inf)
+    chosen = rest = rested(base, matte, np.inf)
     best = held_out(rest)
     evidence = [Specular(True, None, None)] * len(matte)
     for m in np.argsort(base.specular.mean(1), kind="stable"):

@@ -30,6 +30,14 @@ def test_compiled_response_is_that_of_torch(roughness):
 
 
 @compiler
+def test_the_value_alone_is_that_of_the_response():
+    operator, point = reflection_operator("network"), grid(0.3, torch.float32, rows=77)
+    response = operator.response(*point)
+    torch.testing.assert_close(operator.specular(*point), response.specular, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(operator.diffuse(point[1], point[3]), response.diffuse, rtol=1e-5, atol=1e-9)
+
+
+@compiler
 def test_without_lobes_or_points_there_is_nothing():
     operator = reflection_operator("network")
     none = operator.response(torch.tensor(0.5), torch.ones(0), torch.ones(3), torch.ones(3, 0), torch.ones(3, 0))
