@@ -45,7 +45,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     merge_degrees: observations this near are merged before solving.
 
     lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: observations per
-    illumination that choose the lobes, before all of them polish the answer;  self_shadowing: whether what the meshes
+    illumination that choose the lobes, before four times as many polish the answer in `polish` iterations, and all of
+    them in `settle`;  self_shadowing: whether what the meshes
     hide is taken to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
     has a specular part, `auto` those whose held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
@@ -57,8 +58,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lobes: Annotated[int, Meta(ge=1, le=1024)] = 72
     insert: Annotated[int, Meta(ge=1, le=64)] = 12
     rounds: Annotated[int, Meta(ge=1, le=100)] = 12
-    iterations: Annotated[int, Meta(ge=1, le=1000)] = 12
+    iterations: Annotated[int, Meta(ge=1, le=1000)] = 10
     polish: Annotated[int, Meta(ge=0, le=1000)] = 20
+    settle: Annotated[int, Meta(ge=0, le=1000)] = 4
     sample: Annotated[int, Meta(ge=50)] = 1500
     tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01
@@ -124,6 +126,7 @@ def _bundle(params: Params) -> Bundle:
             "rounds",
             "iterations",
             "polish",
+            "settle",
             "sample",
             "tolerance",
             "least_gain",

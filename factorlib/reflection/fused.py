@@ -21,6 +21,7 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -72,9 +73,14 @@ def _flat(tensors: list[Tensor]) -> Tensor:
 
 
 def _lobe_table(sharpness: Tensor) -> Tensor:
-    """MOMENTS and their derivatives by log λ, [10, p]."""
+    """MOMENTS and their derivatives by log λ, [10, p].  The same lobes are asked for again for every material."""
+    return _lobe_table_of(sharpness.detach().double().numpy().tobytes())
+
+
+@lru_cache(maxsize=256)
+def _lobe_table_of(sharpness: bytes) -> Tensor:
     with torch.enable_grad():
-        log_sharpness = sharpness.detach().double().log().requires_grad_()
+        log_sharpness = torch.from_numpy(np.frombuffer(sharpness).copy()).log().requires_grad_()
         sharpness = log_sharpness.exp()
         moments = [sharpness, gaussian_sharpness(sharpness), *lobe_moments(sharpness)]
         slopes = [torch.autograd.grad(t.sum(), log_sharpness, retain_graph=True)[0] for t in moments]
@@ -105,7 +111,11 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     result = formula * grown
     inside = tape.apply("above", MOST, result)  # beyond, the result is MOST and its derivatives are nil
     by_net = inside * result * fade * (1 - t * t)
-    seeds = [(formula, inside * grown), (fade, inside * result * LARGEST * t), *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns))]
+    seeds = [
+        (formula, inside * grown),
+        (fade, inside * result * LARGEST * t),
+        *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)),
+    ]
     by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)])
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
     results = (result.clamp_max(MOST), by_alpha, by_log_sharpness, by_no, by_nz, by_oz)

@@ -1,7 +1,7 @@
 """The bundle solver: insert lobes where the residual asks, descend jointly, prune, and stop when held-out pixels do.
 
     round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
-            descend on everything (descent), prune, fix the gauge
+            descend on everything (descent), look for a better roughness (roughness), prune, fix the gauge
             (all on a sample of the observations, which finds the lobes as well as all of them do)
     stop:   when a round lowers the held-out loss by less than `least_gain` and does not halve the fitted one (few held-out
             pixels are a noisy vote), at `lobes` lobes per light, or after `rounds`; the best round by held-out loss is
@@ -18,14 +18,15 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from factorlib.solve.choice import Specular, matte_where_it_may_be
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.gauge import in_gauge
 from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
-from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_loss
+from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_losses
 from factorlib.solve.problem import Block, of_rows, sampled
+from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.unknowns import Light, Materials
@@ -42,7 +43,7 @@ class Bundle(msgspec.Struct, frozen=True):
     lobes: int = 72
     insert: int = 12
     rounds: int = 12
-    iterations: int = 12
+    iterations: int = 10
     polish: int = 20
     settle: int = 4
     sample: int = 1500
@@ -130,10 +131,12 @@ def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bu
     if bundle.specular == "on" or not any(block.held_out.any() for block in blocks):
         return fit, np.zeros(len(start.materials), bool), []
 
-    def held_out(s: Solution, m: int | None = None) -> float:
-        return held_out_loss(blocks, s.materials, s.lights, operator, bundle.loss, m)
+    held = [held_out_of(blocks, k) for k in range(len(blocks))]
 
-    solution, matte, evidence = matte_where_it_may_be(blocks, start, operator, fit.loss, held_out, map_)
+    def held_out(s: Solution) -> np.ndarray:
+        return held_out_losses(held, s.materials, s.lights, operator, bundle.loss)
+
+    solution, matte, evidence = matte_where_it_may_be(blocks, held, start, operator, fit.loss, held_out, map_)
     return msgspec.structs.replace(fit, solution=solution), matte, evidence
 
 
@@ -179,7 +182,7 @@ def best_round(
         current = descend(
             blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s)
         )
-        current = _tidied(blocks, current, operator, loss, map_)
+        current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
         held = record(number, "round", -1, current)
         gained, halved = best_held - held, current.loss < HALVED * fitted
         fitted = current.loss
@@ -202,22 +205,30 @@ def polished(
     for of, iterations in phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]:
         record = _recorder(of, history, operator, loss, report, snapshot)
         best = evaluated(of, best.materials, best.lights, operator, loss, map_)
-        best = descend(of, best, operator, loss, _descent(bundle, iterations), map_, lambda i, s, r=record: r(number, "polish", i, s), matte)
+        best = descend(
+            of, best, operator, loss, _descent(bundle, iterations), map_, lambda i, s, r=record: r(number, "polish", i, s), matte
+        )
     return _tidied(everything, best, operator, loss, map_), history
 
 
-def held_out_loss(
-    blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, m: int | None = None
-) -> float:
-    """Mean robust loss per held-out channel value, of all observations or those of material m; of all values where none is held out."""
-    total, count = 0.0, 0
+def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
+    """Mean robust loss per held-out channel value; of all values where none is held out."""
+    losses = held_out_losses([held_out_of(blocks, k) for k in range(len(blocks))], materials, lights, operator, loss)
+    return float(losses.mean()) if len(losses) else 0.0
+
+
+def held_out_of(blocks: Sequence[Block], k: int) -> Block:
+    """What is held out of block k; all of it where nothing is held out of any."""
     none = not any(block.held_out.any() for block in blocks)
-    for block, light in zip(blocks, lights, strict=True):
-        own = block.held_out | none
-        held = of_rows(block, own if m is None else own & (block.material == m))
-        total += robust_loss(residuals(held, predicted_radiance(held, light, materials, operator)), loss.robust_scale)[0]
-        count += 3 * len(held)
-    return total / max(count, 1)
+    return of_rows(blocks[k], blocks[k].held_out | none)
+
+
+def held_out_losses(
+    blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss
+) -> Float[np.ndarray, "n"]:
+    """Robust loss of every observation, mean over its channels, block by block."""
+    residual = [residuals(b, predicted_radiance(b, light, materials, operator)) for b, light in zip(blocks, lights, strict=True)]
+    return robust_losses(np.concatenate(residual), loss.robust_scale).mean(1)
 
 
 def _descent(bundle: Bundle, iterations: int) -> Descent:
@@ -242,6 +253,15 @@ def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bun
 
     lights = list(map_(grown, range(len(blocks))))
     return _refitted(blocks, evaluated(blocks, current.materials, lights, operator, loss, map_), operator, loss, map_)
+
+
+def _out_of_valleys(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
+    """With another roughness where that lowers the loss of the whole sample, too."""
+    materials = materials_out_of_valleys(blocks, current.materials, current.lights, operator, loss, map_)
+    if (materials.roughness == current.materials.roughness).all():
+        return current
+    trial = evaluated(blocks, materials, current.lights, operator, loss, map_)
+    return trial if trial.loss < current.loss else current
 
 
 def _tidied(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:

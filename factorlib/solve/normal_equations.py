@@ -89,8 +89,11 @@ def residuals(block: Block, predicted: Float[np.ndarray, "n 3"]) -> Float[np.nda
 
 def robust_loss(residual: Float[np.ndarray, "n 3"], scale: float) -> tuple[float, Float[np.ndarray, "n 3"]]:
     """Pseudo-Huber loss and the weights that make its Gauss–Newton step a least-squares one."""
-    root = np.sqrt(1 + (residual / scale) ** 2)
-    return float(np.sum(2 * scale**2 * (root - 1))), 1 / root
+    return float(np.sum(robust_losses(residual, scale))), 1 / np.sqrt(1 + (residual / scale) ** 2)
+
+
+def robust_losses(residual: Float[np.ndarray, "n 3"], scale: float) -> Float[np.ndarray, "n 3"]:
+    return 2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)
 
 
 def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:

@@ -30,7 +30,8 @@ from factorlib.solve.step import damped, held_unknowns, masked, schur_complement
 from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
-CONDITION = 1e-10  # smaller eigenvalues of the scaled information are directions the data do not see
+WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
+LEAST_DEVIATION = 1e-4  # of the noise model: what a single observation is explained to says nothing
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
@@ -38,21 +39,22 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     """Standard error of every material unknown, and the residual's standard deviation in units of the noise model.
 
     solution: a `descent.Solution` of these blocks;  loss: that it minimises
-    An unknown that the data do not see, as the roughness of a matte material, has the width of its range.
+    What the data do not see, one unknown as the roughness of a matte material or a trade of one for another, is uncertain by
+    the width of its range, which counts as one more observation of each unknown.
     """
     materials, lights = solution.materials, solution.lights
-    sigma = residual_deviation(blocks, materials, lights, operator)
+    sigma = max(residual_deviation(blocks, materials, lights, operator), LEAST_DEVIATION)
     systems = [
         system(block, light, materials, operator, loss, clusters_of(block)) for block, light in zip(blocks, lights, strict=True)
     ]
-    inverse = _pseudo_inverse(schur_complement(systems, materials, lights))
+    information = schur_complement(systems, materials, lights)
+    widths = np.tile(WIDTHS, len(materials))
+    inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
     scores = np.vstack([reduced_scores(s, light) for s, light in zip(systems, lights, strict=True)])
     count = max(len(scores), 2)
-    sandwich = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
-    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in (inverse * sigma**2, sandwich)]
-    unseen = np.diag(inverse) == 0
-    errors = np.where(unseen, np.inf, np.sqrt(np.maximum(*variances).clip(0))).reshape(-1, 7)
-    errors = np.minimum(errors, [1.0] * 6 + [ROUGHNESS[1] - ROUGHNESS[0]])
+    sandwich = inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
+    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in (inverse, sandwich)]
+    errors = np.minimum(np.sqrt(np.maximum(*variances).clip(0)), widths).reshape(-1, 7)
     return Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma
 
 
@@ -92,8 +94,7 @@ def _gauge_projection(materials: Materials, members: Sequence[int], channel: int
     return np.eye(len(direction)) - np.outer(direction, held) / (held @ direction)
 
 
-def _pseudo_inverse(information: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    diagonal = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))
-    inverse = np.where(values > CONDITION, 1 / np.maximum(values, CONDITION), 0.0)
-    return (vectors * inverse) @ vectors.T / np.outer(diagonal, diagonal)
+def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """Of a symmetric positive definite matrix whose rows are of unlike units."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    return cho_solve(cho_factor(matrix * np.outer(scale, scale)), np.diag(scale)) * scale[:, None]
