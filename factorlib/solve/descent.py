@@ -14,7 +14,7 @@ from factorlib.solve.problem import Block
 from factorlib.solve.step import damped_step
 from factorlib.solve.unknowns import Light, Materials
 
-LESS, MORE = 2.5, 1.75  # factors on the damping after a good and a bad step
+LESS, MORE = 2.5, 3.0  # the damping is divided and multiplied by, after a good and a bad step
 
 
 class Solution(msgspec.Struct, frozen=True):
@@ -58,7 +58,7 @@ def descend(
     matte: Bool[np.ndarray, "m"] | None = None,
 ) -> Solution:
     """Lower the loss from `start`; every accepted point is reported.  Materials that are `matte` keep what specular part they have."""
-    current, damping, growth, idle = start, descent.damping, MORE, 0
+    current, damping, idle = start, descent.damping, 0
     for iteration in range(descent.iterations):
         step = damped_step(current.systems, current.materials, current.lights, damping, matte)
         materials = Materials.of_vector(current.materials.vector() + step.materials)
@@ -72,10 +72,7 @@ def descend(
             report(iteration, current)
         else:
             idle += damping > 1e6
-        if trust > 0.2:
-            damping, growth = max(damping / LESS, 1e-9) if trust > 0.6 else damping, MORE
-        else:  # Nielsen 1999: every refusal in a row doubles the factor
-            damping, growth = damping * growth, 2 * growth
+        damping = max(damping / LESS, 1e-9) if trust > 0.6 else damping if trust > 0.2 else damping * MORE
         if idle >= 2:
             break
     return current

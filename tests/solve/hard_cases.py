@@ -213,6 +213,7 @@ class Bound(msgspec.Struct, frozen=True):
     roughness: float | None
     radiance: float
     says: tuple[str, ...] = ()
+    may_say: str | None = None  # what is neither asked for nor wrong
 
 
 BOUNDS = {
@@ -225,7 +226,7 @@ BOUNDS = {
     "an object of 30 pixels": Bound(None, None, 0.2, ("30 observation(s)", "by convention only")),
     "a single pixel": Bound(None, None, 0.04, ("1 observation(s)", "'red' is flat")),
     "all matte": Bound(0.09, None, 0.04, ("roughness of material 'red' cannot be told", "roughness of material 'green' cannot be told")),
-    "all mirror-like: roughness .1": Bound(0.008, 0.055, 0.018, ("the least the model knows: it may be smoother",)),
+    "all mirror-like: roughness .1": Bound(0.008, 0.055, 0.018, may_say="the least the model knows: it may be smoother"),
     "a black material": Bound(0.1, 0.45, 0.03, ("'red' is so dark", "roughness of material 'red' cannot be told")),
     "a light of one point": Bound(0.015, 0.01, 0.006),
     "constant light": Bound(
