@@ -43,10 +43,15 @@ class Fused:
     """The compiled function with a network's weights."""
 
     def __init__(self, part: str, layers: Layers):
+        self.made_of = part, layers
         self.function = compiled(part, layers.weights[0].shape[1], layers.weights[0].shape[0], len(layers.weights) - 1)
         first = layers.weights[0] * layers.scale
         weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
         self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
+
+    def __reduce__(self):
+        """A copy in another process compiles, or finds in the user's cache, its own."""
+        return Fused, self.made_of
 
     def __call__(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
         """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""

@@ -14,6 +14,7 @@ explains the held-out pixels better is polished.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import msgspec
@@ -245,14 +246,16 @@ def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: L
 
 
 def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
-    def grown(index: int) -> Light:
-        block, light = blocks[index], current.lights[index]
-        count = bundle.lobes - len(light)
-        seed = bundle.seed + 1000 * number + index
-        return lobes_inserted(block, light, current.materials, operator, min(bundle.insert, count), seed) if count > 0 else light
-
-    lights = list(map_(grown, range(len(blocks))))
+    seeds = [bundle.seed + 1000 * number + k for k in range(len(blocks))]
+    grown = partial(_grown, materials=current.materials, operator=operator, bundle=bundle)
+    lights = list(map_(grown, list(zip(blocks, current.lights, seeds, strict=True))))
     return _refitted(blocks, evaluated(blocks, current.materials, lights, operator, loss, map_), operator, loss, map_)
+
+
+def _grown(one: tuple[Block, Light, int], materials: Materials, operator, bundle: Bundle) -> Light:
+    block, light, seed = one
+    count = min(bundle.insert, bundle.lobes - len(light))
+    return lobes_inserted(block, light, materials, operator, count, seed) if count > 0 else light
 
 
 def _out_of_valleys(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:

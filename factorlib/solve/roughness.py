@@ -8,6 +8,7 @@ material where it lies far enough below the loss of the present roughness, solve
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -28,15 +29,17 @@ def materials_out_of_valleys(
     blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, map_: Callable
 ) -> Materials:
     """The materials, those replaced for which another roughness explains the sampled observations better."""
-    found = list(map_(lambda m: _searched(blocks, materials, lights, operator, loss, m), range(len(materials))))
+    searched = partial(_searched, materials=materials, lights=lights, operator=operator, loss=loss)
+    voters = [[_voters(block, m) for block in blocks] for m in range(len(materials))]  # so that no worker is handed all observations
+    found = list(map_(searched, list(enumerate(voters))))
     diffuse, specular, roughness = (np.array(values) for values in zip(*found, strict=True))
     return Materials(diffuse, specular, roughness)
 
 
-def _searched(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, m: int):
+def _searched(of: tuple[int, list[Block]], materials: Materials, lights: Sequence[Light], operator, loss: Loss):
+    m, blocks = of
     present = materials.diffuse[m], materials.specular[m], float(materials.roughness[m])
-    pairs = [(_voters(block, m), light) for block, light in zip(blocks, lights, strict=True)]
-    pairs = [(voters, light) for voters, light in pairs if len(voters)]
+    pairs = [(voters, light) for voters, light in zip(blocks, lights, strict=True) if len(voters)]
     if not pairs:
         return present
     weight = np.concatenate([_weight(voters, light, materials, operator, loss) for voters, light in pairs])

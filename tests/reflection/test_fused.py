@@ -33,8 +33,8 @@ def test_compiled_response_is_that_of_torch(roughness):
 def test_the_value_alone_is_that_of_the_response():
     operator, point = reflection_operator("network"), grid(0.3, torch.float32, rows=77)
     response = operator.response(*point)
-    torch.testing.assert_close(operator.specular(*point), response.specular, rtol=1e-5, atol=1e-9)
-    torch.testing.assert_close(operator.diffuse(point[1], point[3]), response.diffuse, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(operator.specular(*point), response.specular, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(operator.diffuse(point[1], point[3]), response.diffuse, rtol=1e-4, atol=1e-7)
 
 
 @compiler

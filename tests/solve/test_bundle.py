@@ -1,3 +1,6 @@
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
 import msgspec
 import numpy as np
 import pytest
@@ -76,3 +79,19 @@ def test_components_of_unlinked_photos():
     rng = np.random.default_rng(6)
     blocks = [block(name, random_light(rng, 1), MATERIALS, shown, OPERATOR, size=8) for name, shown in (("a", [0, 1]), ("b", [2]))]
     assert connected_components(blocks, 4) == [((0, 1), ("a",)), ((2,), ("b",)), ((3,), ())]
+
+
+def test_neither_threads_nor_processes_change_a_bit():
+    operator = reflection_operator("network")
+    rng = np.random.default_rng(9)
+    blocks = [block(f"room{i}", random_light(rng, 3), MATERIALS, [0, 1, 2], operator, size=12, seed=i) for i in range(3)]
+    bundle = Bundle(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
+
+    def answer(map_):
+        solution = solve(blocks, 3, operator, bundle, map_, lambda event: None).solution
+        return np.concatenate([solution.materials.vector(), *(v.reshape(-1) for li in solution.lights for v in (li.axis, li.weight))])
+
+    serial = answer(serial_map)
+    with ThreadPoolExecutor(3) as threads, ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
+        for pool in (threads, processes):
+            np.testing.assert_array_equal(answer(lambda f, items, pool=pool: list(pool.map(f, items))), serial)
