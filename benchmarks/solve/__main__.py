@@ -1,7 +1,8 @@
 """Speed against error of the joint solve: `make bench-solve`, or `python -m benchmarks.solve [options]`.
 
-One process runs every solver on every set in turn, each on one thread, so that ratios of times hold.  Writes solve.json,
+One process runs every solver on every set in turn, each on all processors, so that ratios of times hold.  Writes solve.json,
 after every solver anew, and error_over_time.svg to build/bench/solve; the traced sets are kept in build/bench/sets.
+What solve.json there holds of other sets and solvers stays; --docs writes all of it to docs/solve-speed.md.
 The operator `reference` is left out: it takes hours.
 """
 
@@ -13,13 +14,16 @@ from typing import Annotated
 import torch
 import typer
 
+from benchmarks.markdown import refresh
 from benchmarks.solve import bundle, joint_mitsuba, paper, scaling
 from benchmarks.solve.figures import error_over_time
 from benchmarks.solve.sets import SETS, SphereSet, sphere_set
+from benchmarks.solve.tables import as_tables
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import write_json
+from factorlib.jsonfile import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
 SOLVERS = ("bundle", "variants", "paper", "mitsuba", "scaling")
 MITSUBA_SETS = ("3x3",)
 
@@ -60,13 +64,15 @@ def main(
     share: Annotated[float, typer.Option(help="of the observations that the paper's solver is given")] = 1.0,
     relight: Annotated[bool, typer.Option(help="solve once more with pairs held back")] = True,
     out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "solve",
+    docs: Annotated[bool, typer.Option(help="also refresh docs/solve-speed.md")] = False,
 ) -> None:
     torch.set_num_threads(1)
-    chosen, result = names_of(solvers, SOLVERS), {"sets": {}}
+    chosen, before = names_of(solvers, SOLVERS), out / "solve.json"
     out.mkdir(parents=True, exist_ok=True)
+    result = read_json(before) if before.exists() else {"sets": {}}
     for name in names_of(sets, SETS):
         spheres = sphere_set(name, ROOT / "build" / "bench" / "sets", hdr)
-        table = result["sets"][name] = about(spheres)
+        table = result["sets"].setdefault(name, about(spheres))
         for solver in chosen:
             for label, row in labelled(solver, spheres, limit_s, share, relight):
                 table["solvers"][label] = row
@@ -76,13 +82,20 @@ def main(
         result["scaling"] = scaling.run(limit_s=limit_s)
         write(out, result)
         print(f"scaling: {result['scaling']}")
+    if docs:
+        refresh(DOCS / "solve-speed.md", as_tables(result))
+        (DOCS / "solve").mkdir(exist_ok=True)
+        (DOCS / "solve" / "error_over_time.svg").write_text(error_over_time(shown_in(result)), encoding="utf-8")
 
 
 def write(out: Path, result: dict) -> None:
     write_json(out / "solve.json", result)
-    shown = {name: table for name, table in result["sets"].items() if table["solvers"]}
-    if shown:
+    if shown := shown_in(result):
         (out / "error_over_time.svg").write_text(error_over_time(shown), encoding="utf-8")
+
+
+def shown_in(result: dict) -> dict:
+    return {name: table for name, table in result["sets"].items() if table["solvers"]}
 
 
 def said(name: str, label: str, row: dict) -> str:

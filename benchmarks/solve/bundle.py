@@ -11,10 +11,10 @@ import msgspec
 from benchmarks.solve.clock import Clock, Taken
 from benchmarks.solve.scores import EVERY, Answer, answer_of, material_scores, picture_scores, pictures_of
 from benchmarks.solve.sets import SphereSet
+from benchmarks.solve.workers import threaded
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, solve
 from factorlib.solve.problem import Noise, blocks_of_observations
-from factorlib.stage import serial_map
 from factorlib.urm.merge import merge
 
 JUDGE = "network"
@@ -25,8 +25,8 @@ class Variant(msgspec.Struct, frozen=True):
 
     operator: str = "network"
     merge_degrees: float = 2.0
-    lobes: int = 48
-    sample: int = 1500
+    lobes: int = Bundle().lobes
+    sample: int = Bundle().sample
 
     @property
     def name(self) -> str:
@@ -41,7 +41,7 @@ VARIANTS = (
     Variant(operator="closed_form"),
     Variant(lobes=16),
     Variant(lobes=32),
-    Variant(lobes=96),
+    Variant(lobes=48),
     Variant(merge_degrees=0.0),
     Variant(merge_degrees=1.0),
     Variant(merge_degrees=4.0),
@@ -72,7 +72,7 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
             found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
 
     options = Bundle(lobes=variant.lobes, sample=variant.sample, tolerance=1e-3)  # tolerance as the stage's
-    joint = solve(blocks, len(seen.materials), operator, options, serial_map, lambda event: None, keep)
+    joint = solve(blocks, len(seen.materials), operator, options, threaded, lambda event: None, keep)
     result = joint.solution
     answer = answer_of(blocks, result.materials, result.lights)
     return [*found, Snapshot(clock.taken(), "result", sum(map(len, result.lights)), answer)]

@@ -12,10 +12,10 @@ from benchmarks.solve.bundle import JUDGE, Snapshot, points, relighting, result_
 from benchmarks.solve.clock import Clock
 from benchmarks.solve.scores import answer_of
 from benchmarks.solve.sets import SphereSet
+from benchmarks.solve.workers import threaded
 from factorlib.reflection import reflection_operator
 from factorlib.solve.paper import Paper, solve
 from factorlib.solve.problem import Noise, blocks_of_observations
-from factorlib.stage import serial_map
 from factorlib.urm.merge import merge
 
 OPERATORS = ("paper_network", "network")
@@ -33,7 +33,7 @@ def snapshots(spheres: SphereSet, operator: str, share: float, without: frozense
         answer = answer_of(blocks, solution.materials, solution.lights)
         found.append(Snapshot(clock.taken(), f"{event.phase} {event.iteration}", event.lobes, answer))
 
-    solve(blocks, len(seen.materials), reflection_operator(operator), Paper(), serial_map, lambda event: None, keep)
+    solve(blocks, len(seen.materials), reflection_operator(operator), Paper(), threaded, lambda event: None, keep)
     return found
 
 

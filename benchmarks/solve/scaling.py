@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from benchmarks.solve.clock import Clock
+from benchmarks.solve.workers import threaded
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, solve
 from factorlib.solve.normal_equations import predicted_radiance
 from factorlib.solve.problem import Block, Noise, blocks_of_observations
 from factorlib.solve.unknowns import Light, Materials
-from factorlib.stage import serial_map
 from factorlib.urm.observations import Observations
 
 PIXELS, LOBES = 12, 6
@@ -36,7 +36,7 @@ def timed(n: int):
     operator = reflection_operator("network")
     blocks = problem(n, operator)
     clock = Clock()
-    solve(blocks, n, operator, OPTIONS, serial_map, lambda event: None)
+    solve(blocks, n, operator, OPTIONS, threaded, lambda event: None)
     return clock.taken()
 
 
