@@ -7,9 +7,10 @@ The sandwich
 
     S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                     (1)
 
-lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  A cluster is what one light
-sends toward nearby mirror directions: a region of the light, whose bias all materials there share.  The larger variance
-of both is taken, unknown by unknown.
+lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  It is taken over two kinds of
+clusters.  One is what a light sends toward nearby mirror directions: a region of the light, whose bias all materials there
+share.  The other is a whole light: with few lobes it is wrong everywhere in ways that lean together, and only other lights
+tell.  The largest of the three variances is taken, unknown by unknown.
 
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
 Here the sum of diffuse and specular reflectance over a component's materials is held in each channel: with g the
@@ -23,6 +24,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import norm
+from scipy.stats import t as student_t
 
 from factorlib.solve.normal_equations import Loss, System, predicted_radiance, residuals, system
 from factorlib.solve.problem import Block, connected_components, mirror_cells
@@ -50,12 +53,20 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     information = schur_complement(systems, materials, lights)
     widths = np.tile(WIDTHS, len(materials))
     inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
-    scores = np.vstack([reduced_scores(s, light) for s, light in zip(systems, lights, strict=True)])
-    count = max(len(scores), 2)
-    sandwich = inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
-    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in (inverse, sandwich)]
-    errors = np.minimum(np.sqrt(np.maximum(*variances).clip(0)), widths).reshape(-1, 7)
+    by_cell = [reduced_scores(s, light) for s, light in zip(systems, lights, strict=True)]
+    covariances = inverse, _sandwich(inverse, np.vstack(by_cell), sigma), _sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
+    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in covariances]
+    errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
     return Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma
+
+
+def _sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float) -> Float[np.ndarray, "k k"]:
+    """(1), as wide as Student's t asks for so few clusters."""
+    count = len(scores)
+    if count < 2:
+        return np.zeros_like(inverse)
+    few = float(student_t.ppf(norm.cdf(1), count - 1))
+    return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
 
 
 def clusters_of(block: Block) -> Int[np.ndarray, "n"]:
