@@ -34,12 +34,13 @@ from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
 
 MANY = 4  # times `sample` observations bring the best round to rest, before all of them settle it
+A_LOBE = 60  # observations for each lobe of a light, that it may not explain their noise
 FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
 HALVED = 0.5  # a round that lowers the fitted loss to this share is not the last, whatever held-out observations say
 
 
 class Bundle(msgspec.Struct, frozen=True):
-    """How the joint problem is solved; `lobes` and `sample` (observations that rounds use) are counted per illumination."""
+    """How the joint problem is solved; `lobes` and `sample` (the least observations that rounds use) are counted per illumination."""
 
     lobes: int = 72
     insert: int = 12
@@ -127,7 +128,7 @@ def solve(
 
 def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable):
     """The fit without needless specular parts, which materials are matte, and the evidence."""
-    blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
+    blocks = sampled_for(blocks, fit.solution.lights, bundle)
     start = evaluated(blocks, fit.solution.materials, fit.solution.lights, operator, fit.loss, map_)
     if bundle.specular == "on" or not any(block.held_out.any() for block in blocks):
         return fit, np.zeros(len(start.materials), bool), []
@@ -146,6 +147,12 @@ def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[B
     shadows = self_shadowing != "off" and any(block.visibility is not None for block in blocks)
     models = {"without": [without_shadows(block) for block in blocks]} if not shadows or self_shadowing == "auto" else {}
     return models | ({"with": list(blocks)} if shadows else {})
+
+
+def sampled_for(blocks: Sequence[Block], lights: Sequence[Light], bundle: Bundle, more: int = 0, times: int = 1) -> list[Block]:
+    """A sample of each block, large enough for its lobes and `more` of them."""
+    counts = [max(times * bundle.sample, A_LOBE * (len(light) + more)) for light in lights]
+    return [sampled(block, count, bundle.seed) for block, count in zip(blocks, counts, strict=True)]
 
 
 def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report, snapshot: Snapshot) -> Callable:
@@ -171,13 +178,15 @@ def best_round(
     snapshot: Snapshot = unwatched,
 ) -> Fit:
     """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
-    blocks, history = [sampled(block, bundle.sample, bundle.seed) for block in blocks], []
-    record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
+    whole, history = blocks, []
+    blocks = [sampled(block, bundle.sample, bundle.seed) for block in whole]
     start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
     current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
     current = _refitted(blocks, current, operator, bundle.loss, map_)
     best, best_held, fitted = current, np.inf, np.inf
     for number in range(bundle.rounds):
+        blocks = sampled_for(whole, current.lights, bundle, bundle.insert)
+        record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
         current = descend(
@@ -185,8 +194,8 @@ def best_round(
         )
         current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
         held = record(number, "round", -1, current)
-        gained, halved = best_held - held, current.loss < HALVED * fitted
-        fitted = current.loss
+        gained, halved = best_held - held, history[-1].loss < HALVED * fitted
+        fitted = history[-1].loss
         if held < best_held:
             best, best_held = current, held
         outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
@@ -200,7 +209,7 @@ def polished(
 ) -> tuple[Solution, list[Event]]:
     """The best round brought to rest on many observations, then on all, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
-    many = [sampled(b, MANY * bundle.sample, bundle.seed) for b in everything]
+    many = sampled_for(everything, fit.solution.lights, bundle, times=MANY)
     history, number, loss, best = list(fit.history), fit.history[-1].round, fit.loss, fit.solution
     phases = [(many, bundle.polish), (everything, min(bundle.settle, bundle.polish))]
     for of, iterations in phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]:
