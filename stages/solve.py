@@ -44,10 +44,10 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     operator: how a lobe's reflection is computed, `auto` being `network`, and `paper_network` for the paper's solver;
     merge_degrees: observations this near are merged before solving.
 
-    lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: the least observations
-    per illumination that choose the lobes (60 for each lobe where that is more), before four times as many polish the answer in `polish` iterations, and all of
-    them in `settle`;  self_shadowing: whether what the meshes
-    hide is taken to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
+    lobes: most lobes an illumination may get (held-out pixels may stop earlier);  sample: the least observations per
+    illumination that choose the lobes (60 for each lobe where that is more), before four times as many polish the
+    answer in `polish` iterations, and all of them in `settle`;  self_shadowing: whether what the meshes hide is taken
+    to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
     has a specular part, `auto` those whose held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
     """
