@@ -167,6 +167,10 @@ def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Los
     return record
 
 
+def _said(record: Callable, round_: int, phase: str, iteration: int, solution: Solution) -> None:
+    record(round_, phase, iteration, solution)
+
+
 def best_round(
     blocks: Sequence[Block],
     materials: int,
@@ -189,9 +193,8 @@ def best_round(
         record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
-        current = descend(
-            blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, lambda i, s, n=number: record(n, "descent", i, s)
-        )
+        said = partial(_said, record, number, "descent")
+        current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, said)
         current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
         held = record(number, "round", -1, current)
         gained, halved = best_held - held, history[-1].loss < HALVED * fitted
