@@ -167,10 +167,6 @@ def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Los
     return record
 
 
-def _said(record: Callable, round_: int, phase: str, iteration: int, solution: Solution) -> None:
-    record(round_, phase, iteration, solution)
-
-
 def best_round(
     blocks: Sequence[Block],
     materials: int,
@@ -193,7 +189,7 @@ def best_round(
         record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
         loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
         current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
-        said = partial(_said, record, number, "descent")
+        said = partial(record, number, "descent")
         current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, said)
         current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
         held = record(number, "round", -1, current)
@@ -219,7 +215,7 @@ def polished(
         record = _recorder(of, history, operator, loss, report, snapshot)
         best = evaluated(of, best.materials, best.lights, operator, loss, map_)
         best = descend(
-            of, best, operator, loss, _descent(bundle, iterations), map_, lambda i, s, r=record: r(number, "polish", i, s), matte
+            of, best, operator, loss, _descent(bundle, iterations), map_, partial(record, number, "polish"), matte
         )
     return _tidied(everything, best, operator, loss, map_), history
 
