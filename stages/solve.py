@@ -55,7 +55,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     solver: Literal["bundle", "paper"] = "bundle"
     operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
     merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
-    lobes: Annotated[int, Meta(ge=1, le=1024)] = 72
+    lobes: Annotated[int, Meta(ge=1, le=1024)] = 48
     insert: Annotated[int, Meta(ge=1, le=64)] = 12
     rounds: Annotated[int, Meta(ge=1, le=100)] = 12
     iterations: Annotated[int, Meta(ge=1, le=1000)] = 10

@@ -42,7 +42,7 @@ HALVED = 0.5  # a round that lowers the fitted loss to this share is not the las
 class Bundle(msgspec.Struct, frozen=True):
     """How the joint problem is solved; `lobes` and `sample` (the least observations that rounds use) are counted per illumination."""
 
-    lobes: int = 72
+    lobes: int = 48
     insert: int = 12
     rounds: int = 12
     iterations: int = 10
