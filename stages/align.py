@@ -9,6 +9,7 @@ import numpy as np
 
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
+from factorlib.align.doubts import Standards, doubts
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
@@ -26,11 +27,8 @@ log = logging.getLogger("factorlib.align")
 CURE = "look at its overlay; give the object's pose, or the photo's camera.focal_px, in dataset.yaml"
 
 
-class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Params(Standards, frozen=True, forbid_unknown_fields=True):
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG  # sharper edges of a mesh stay sharp
-    least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # below, the pose is taken to be wrong
-    least_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # of material labels, likewise
-    least_lead: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.005  # of the score before a runner-up that looks different
     strict: bool = False  # stop at a doubtful pose
     search: Search = Search()
 
@@ -101,20 +99,6 @@ def runner_up_entry(found: Found | None) -> dict | None:
         return None
     other = found.runner_up
     return {"rotation": other.state.rotation.tolist(), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
-
-
-def doubts(iou: float, agreement: float, found: Found | None, params: Params) -> list[str]:
-    reasons = []
-    if iou < params.least_iou:
-        reasons.append(f"mesh and mask overlap by {iou:.2f} only")
-    if agreement < params.least_agreement:
-        reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
-    other = found.runner_up if found else None
-    if other and found.score - other.score < params.least_lead and other.normal_difference_deg > 5:
-        reasons.append(
-            f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})"
-        )
-    return reasons
 
 
 def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:
