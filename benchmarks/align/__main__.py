@@ -1,7 +1,8 @@
 """Alignment against rendered truth: `make bench-align`, or `python -m benchmarks.align [options]`.
 
 Writes align.json to build/bench/align, after every photo anew, and prints the tables; --docs also refreshes docs/align.md.
-The whole set: `python -m benchmarks.align --views 20 --seeds 3 --wrong-views 2`.
+The whole set: `python -m benchmarks.align --views 20 --seeds 3 --wrong-views 2`.  Rows of kinds that are not run stay as they
+were, so that the kinds can be run one after another.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from benchmarks.align.measure import measured_key
 from benchmarks.align.tables import as_tables
 from benchmarks.markdown import refresh
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import write_json
+from factorlib.jsonfile import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,7 +38,8 @@ def main(
         if kind not in RIGHT + WRONG:
             raise InputError(f"no kind '{kind}'", cure=did_you_mean(kind, RIGHT + WRONG))
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict] = []
+    before = read_json(out / "align.json")["photos"] if (out / "align.json").is_file() else []
+    rows = [row for row in before if row["kind"] not in chosen]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for row in pool.map(measured_key, keys(views, seeds, chosen, wrong_views)):
             rows.append(row)

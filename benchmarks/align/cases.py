@@ -124,7 +124,13 @@ def write_set(folder: Path, made: list[Case]) -> None:
         write_labels(folder / f"masks/{each.name}.png", each.label)
         thing = {"name": "thing", "mesh": mesh_name}
         photos.append(
-            {"name": each.name, "image": f"photos/{each.name}.png", "masks": f"masks/{each.name}.png", "illumination": "lamp", "objects": [thing]}
+            {
+                "name": each.name,
+                "image": f"photos/{each.name}.png",
+                "masks": f"masks/{each.name}.png",
+                "illumination": "lamp",
+                "objects": [thing],
+            }
         )
         if each.kind in RIGHT:
             poses[each.name] = {"thing": {"rotation": each.pose.rotation.tolist(), "translation": each.pose.translation.tolist()}}

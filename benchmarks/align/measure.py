@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 
+import msgspec
 import numpy as np
 
 from benchmarks.align.cases import Case, case
@@ -14,6 +15,7 @@ from factorlib.align.evidence import label_agreement, object_evidence, silhouett
 from factorlib.align.place import Thing, placed
 from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Search
+from factorlib.align.trust import trust_in
 
 RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
 
@@ -32,8 +34,9 @@ def measured(given: Case, search: Search = Search()) -> dict:
     truth, blind = given.truth(), Camera(given.camera.width, given.camera.height, 1.0, given.camera.centre)
     clock = Clock()
     evidence = object_evidence({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
-    result = placed([Thing("thing", caster, evidence)], blind, None, None, given.name, search)
-    seen = rasterise(caster, result.camera, result.poses[0])
+    thing = Thing("thing", caster, evidence)
+    result = placed([thing], blind, None, None, given.name, search)
+    seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(thing, result, 0)
     taken, found = clock.taken(), result.found[0]
     iou, agreement = silhouette_iou(evidence, seen.label), label_agreement(evidence, seen.label)
     other = found.runner_up
@@ -42,7 +45,7 @@ def measured(given: Case, search: Search = Search()) -> dict:
         "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024), "pixels": int(evidence.inside.sum()),
         "silhouette_iou": iou, "label_agreement": agreement, "score": found.score,
         "runner_up_score": other.score if other else None, "runner_up_normals_deg": other.normal_difference_deg if other else None,
-        "doubts": doubts(iou, agreement, found),
+        **msgspec.to_builtins(trust), "doubts": doubts(iou, agreement, trust, found),
     }  # fmt: skip
     if given.kind in RIGHT_DEG:
         row["normal_error_deg"] = normal_error_deg(truth, seen)

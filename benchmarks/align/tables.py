@@ -49,7 +49,9 @@ def time(rows: list[dict]) -> str:
     for kind in RIGHT + WRONG:
         some = _of(rows, kind, None)
         if some:
-            seconds = [", ".join(exact(float(q)) for q in np.quantile([r[key] for r in some], (0.5, 1))) for key in ("processor_s", "wall_s")]
+            seconds = [
+                ", ".join(exact(float(q)) for q in np.quantile([r[key] for r in some], (0.5, 1))) for key in ("processor_s", "wall_s")
+            ]
             body.append([kind, *seconds, str(max(row["memory_mb"] for row in some))])
     return table(["case", "processor: median, worst (s)", "wall: median, worst (s)", "memory (MB)"], body)
 
