@@ -28,7 +28,8 @@ UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected 
 UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
 EXIF_SIGMA = 0.05  # whole millimetres, and focus
 WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
-RIVALS = 3  # dropped on the way, refined to the end to find a runner-up
+HOPELESS = 4.0  # times as much left unexplained as by the best, or HOPELESS_LEFT: not refined further
+HOPELESS_LEFT = 0.04
 CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
@@ -43,6 +44,7 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
     resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)  # pixels of the mask's longer side
     margin: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)  # of that side, seen around the mask
+    rivals: Annotated[int, msgspec.Meta(ge=0)] = 2  # guesses dropped on the way, refined to the end to find a runner-up
 
 
 class RunnerUp(msgspec.Struct, frozen=True):
@@ -84,9 +86,9 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
         kept = states[: keep if others else effort * keep]
         target = target_of(evidence, caster.mesh.labels, resolution, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
-        states = [result.state for result in ranked]
+        states = [result.state for result in ranked if 1 - result.score <= max(HOPELESS * (1 - ranked[0].score), HOPELESS_LEFT)]
         others = ranked + others
-    ranked = _distinct(ranked + _rivals(caster, target, camera, ranked[0], others[len(ranked) :], prior, search.steps[-1]), prior)
+    ranked = _distinct(ranked + _rivals(caster, target, camera, ranked[0], others[len(ranked) :], prior, search), prior)
     best = ranked[0]
     return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
 
@@ -127,17 +129,16 @@ def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
 
 
 def _rivals(
-    caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined], prior: FocalPrior, steps: int
+    caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined], prior: FocalPrior, search: Search
 ) -> list[Refined]:
-    """The first of `others`, best first, that are turned by more than DISTINCT_DEG, refined in the finest window: scores of
+    """The best of `others` that are turned by more than DISTINCT_DEG, refined in the finest window: scores of
     different resolutions do not compare."""
     rivals: list[Refined] = []
     for other in others:
-        if all(angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals)):
+        distinct = all(angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals))
+        if distinct and len(rivals) < search.rivals:
             rivals.append(other)
-        if len(rivals) == RIVALS:
-            break
-    return [refined(caster, target, camera, rival.state, prior, steps) for rival in rivals]
+    return [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
 
 
 def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:

@@ -29,7 +29,7 @@ from factorlib.align.target import Target, target_of
 RESOLUTION, MARGIN = 200, 0.2
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing
 FITS_TO_A_PIXEL = 0.995  # score from which no other pose fits clearly better
-QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 10, 0), resolution=(80, 100, 200, 200), margin=(0.35, 0.35, 0.2, 0.2))
+QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 8, 6), rivals=0)
 
 
 class Trust(msgspec.Struct, frozen=True):
