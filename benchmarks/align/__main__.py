@@ -2,7 +2,7 @@
 
 Writes align.json to build/bench/align, after every photo anew, and prints the tables; --docs also refreshes docs/align.md.
 The whole set: `python -m benchmarks.align --views 20 --seeds 3 --wrong-views 2`.  Rows of kinds that are not run stay as they
-were, so that the kinds can be run one after another.
+were, so that the kinds can be run one after another; only their doubts are told anew, by the standards of now (`--kinds ""`: of all).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.align.cases import RIGHT, WRONG, keys
-from benchmarks.align.measure import measured_key
+from benchmarks.align.measure import judged, measured_key
 from benchmarks.align.tables import as_tables
 from benchmarks.markdown import refresh
 from factorlib.errors import InputError, did_you_mean
@@ -33,18 +33,19 @@ def main(
     docs: Annotated[bool, typer.Option(help="also refresh the tables of docs/align.md")] = False,
     out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "align",
 ) -> None:
-    chosen = tuple(kinds.split(","))
+    chosen = tuple(kind for kind in kinds.split(",") if kind)
     for kind in chosen:
         if kind not in RIGHT + WRONG:
             raise InputError(f"no kind '{kind}'", cure=did_you_mean(kind, RIGHT + WRONG))
     out.mkdir(parents=True, exist_ok=True)
     before = read_json(out / "align.json")["photos"] if (out / "align.json").is_file() else []
-    rows = [row for row in before if row["kind"] not in chosen]
+    rows = [judged(row) for row in before if row["kind"] not in chosen]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for row in pool.map(measured_key, keys(views, seeds, chosen, wrong_views)):
             rows.append(row)
             print(said(row), flush=True)
             write_json(out / "align.json", {"photos": rows})
+    write_json(out / "align.json", {"photos": rows})
     tables = as_tables(rows)
     for inner in tables.values():
         print(f"\n{inner}")

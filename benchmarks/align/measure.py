@@ -14,8 +14,8 @@ from factorlib.align.doubts import doubts
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou
 from factorlib.align.place import Thing, placed
 from factorlib.align.raster import Caster, Maps, rasterise
-from factorlib.align.search import Search
-from factorlib.align.trust import trust_in
+from factorlib.align.search import Found, RunnerUp, Search
+from factorlib.align.trust import Trust, trust_in
 
 RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
 
@@ -45,14 +45,21 @@ def measured(given: Case, search: Search = Search()) -> dict:
         "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024), "pixels": int(evidence.inside.sum()),
         "silhouette_iou": iou, "label_agreement": agreement, "score": found.score,
         "runner_up_score": other.score if other else None, "runner_up_normals_deg": other.normal_difference_deg if other else None,
-        **msgspec.to_builtins(trust), "doubts": doubts(iou, agreement, trust, found),
+        **msgspec.to_builtins(trust),
     }  # fmt: skip
     if given.kind in RIGHT_DEG:
         row["normal_error_deg"] = normal_error_deg(truth, seen)
         row["of_the_mesh_deg"] = normal_error_deg(truth, rasterise(caster, given.camera, given.pose))
         row["focal_ratio"] = result.camera.focal / given.camera.focal
         row["right"] = row["normal_error_deg"] <= RIGHT_DEG[given.kind]
-    return row
+    return judged(row)
+
+
+def judged(row: dict) -> dict:
+    """The row with its doubts, by the standards of now: a row of an earlier run need not be measured again."""
+    runner_up = None if row["runner_up_score"] is None else RunnerUp(None, row["runner_up_score"], row["runner_up_normals_deg"])
+    trust = msgspec.convert({name: row[name] for name in Trust.__struct_fields__}, Trust)
+    return row | {"doubts": doubts(row["silhouette_iou"], row["label_agreement"], trust, Found(None, row["score"], 0.0, runner_up))}
 
 
 def normal_error_deg(truth: Maps, found: Maps) -> float:

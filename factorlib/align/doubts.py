@@ -19,7 +19,7 @@ class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_iou: Share = 0.7  # below, the pose is taken to be wrong
     least_agreement: Share = 0.8  # of material labels, likewise
     most_contour_error: Share = 0.009  # of the mask's extent, the median over the contours
-    most_normal_stderr_deg: Annotated[float, msgspec.Meta(gt=0)] = 3.0
+    most_normal_stderr_deg: Annotated[float, msgspec.Meta(gt=0)] = 10.0
     least_lead: Share = 0.1  # of what the runner-up leaves unexplained, the part that the pose found must explain more
 
 
