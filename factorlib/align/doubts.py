@@ -10,6 +10,7 @@ from factorlib.align.search import Found
 from factorlib.align.trust import Trust
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+LEAST_SCORE_LEAD = 0.001  # of the mask's pixels: a lead of less is their noise, however little is left unexplained
 DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another answer
 
 
@@ -37,8 +38,17 @@ def doubts(iou: float, agreement: float, trust: Trust, found: Found | None, stan
     if found and trust.mirrored_score is not None and 1 - trust.mirrored_score < (1 - found.score) / 2:
         reasons.append(f"the mirror image of the mask fits better ({trust.mirrored_score:.3f}, {found.score:.3f}): was it mirrored?")
     other = found.runner_up if found else None
-    if other and found.score - other.score < standards.least_lead * (1 - other.score) and other.normal_difference_deg > DIFFERENT_DEG:
+    if other and other.normal_difference_deg > DIFFERENT_DEG and found.score - other.score < least_lead(other.score, standards):
         reasons.append(
             f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})"
         )
     return reasons
+
+
+def least_lead(runner_up_score: float, standards: Standards) -> float:
+    """How much more of the mask the pose found must explain than another.
+
+    >>> round(least_lead(0.9, Standards(least_lead=0.1)), 9), least_lead(0.9999, Standards(least_lead=0.1))
+    (0.01, 0.001)
+    """
+    return max(standards.least_lead * (1 - runner_up_score), LEAST_SCORE_LEAD)
