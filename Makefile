@@ -53,6 +53,7 @@ help:
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'
+	@echo 'make bench-align                          time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make data                            make data/ again'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 

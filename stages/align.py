@@ -9,11 +9,14 @@ import numpy as np
 
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
+from factorlib.align.doubts import Standards, doubts
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
+from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
 from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Found, Search
+from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_exr
@@ -23,15 +26,13 @@ from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
-CURE = "look at its overlay; give the object's pose, or the photo's camera.focal_px, in dataset.yaml"
+CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
 
 
-class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Params(Standards, frozen=True, forbid_unknown_fields=True):
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG  # sharper edges of a mesh stay sharp
-    least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # below, the pose is taken to be wrong
-    least_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.8  # of material labels, likewise
-    least_lead: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.005  # of the score before a runner-up that looks different
     strict: bool = False  # stop at a doubtful pose
+    keep_doubtful: bool = False  # let an object whose pose was found, and is doubtful, into the solve all the same
     search: Search = Search()
 
 
@@ -43,11 +44,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     result = placed(things, camera_of(slice_.camera, facts), facts["focal_px"], facts["focal_source"], name, params.search)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
-    write_maps(out / f"{name}.exr", maps, confidence(maps, whole))
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     objects = {thing.name: entry(thing, k, result, maps, params) for k, thing in enumerate(things)}
     for thing_name, facts_of_it in objects.items():
         complain(name, thing_name, facts_of_it, params.strict)
+    left_out = np.isin(maps.object, [k for k, facts_of_it in enumerate(objects.values(), start=1) if facts_of_it["left_out"]])
+    write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
     write_json(out / f"{name}.json", {"camera": camera_entry(result), "objects": objects})
 
 
@@ -59,8 +61,14 @@ def things_of(slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, param
         caster = Caster(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         pose = Pose(np.array(thing.pose.rotation), np.array(thing.pose.translation)) if thing.pose else None
-        things.append(Thing(thing.name, caster, evidence, pose))
+        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing)))
     return things
+
+
+def keypoints_of(thing: schema.ObjectEntry) -> Keypoints | None:
+    if not thing.keypoints:
+        return None
+    return Keypoints(np.array([k.pixel for k in thing.keypoints]), np.array([k.point for k in thing.keypoints]))
 
 
 def camera_of(given: schema.Camera, facts: dict) -> Camera:
@@ -80,19 +88,22 @@ def camera_entry(result: Placed) -> dict:
 
 
 def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> dict:
-    """What poses.json says of one object; `doubts` is empty for a pose to be believed."""
+    """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out."""
     seen = np.where(maps.object == k + 1, maps.label, 0)
     iou, agreement = silhouette_iou(thing.evidence, seen), label_agreement(thing.evidence, seen)
-    found, pose = result.found[k], result.poses[k]
+    found, pose, trust = result.found[k], result.poses[k], trust_in(thing, result, k)
+    reasons = doubts(iou, agreement, trust, found, params)
     return {
         "rotation": pose.rotation.tolist(),
         "translation": pose.translation.tolist(),
         "silhouette_iou": iou,
         "label_agreement": agreement,
-        "source": "given" if found is None else "found",
+        "source": "given" if found is None else "keypoints" if found.by_keypoints else "found",
         "score": found.score if found else None,
         "runner_up": runner_up_entry(found),
-        "doubts": doubts(iou, agreement, found, params),
+        **msgspec.to_builtins(trust),
+        "doubts": reasons,
+        "left_out": bool(reasons) and found is not None and not params.keep_doubtful,
     }
 
 
@@ -103,25 +114,13 @@ def runner_up_entry(found: Found | None) -> dict | None:
     return {"rotation": other.state.rotation.tolist(), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
 
 
-def doubts(iou: float, agreement: float, found: Found | None, params: Params) -> list[str]:
-    reasons = []
-    if iou < params.least_iou:
-        reasons.append(f"mesh and mask overlap by {iou:.2f} only")
-    if agreement < params.least_agreement:
-        reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
-    other = found.runner_up if found else None
-    if other and found.score - other.score < params.least_lead and other.normal_difference_deg > 5:
-        reasons.append(
-            f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})"
-        )
-    return reasons
-
-
 def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:
     for reason in facts["doubts"]:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=CURE)
         log.warning("%s: %s: %s; %s", photo, thing, reason, CURE)
+    if facts["left_out"]:
+        log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, thing)
 
 
 def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:

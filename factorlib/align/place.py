@@ -11,9 +11,10 @@ from scipy.optimize import minimize_scalar
 
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence, labelled_iou
+from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, WELL_FOUND, Found, Search, find, focal_prior, with_focal_free
+from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, WELL_FOUND, Found, Search, find, focal_prior, found_near, with_focal_free
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
 
@@ -21,12 +22,13 @@ log = logging.getLogger("factorlib.align")
 
 
 class Thing(msgspec.Struct, frozen=True):
-    """An object to place: its mesh, what the photo says about it, and its pose if the user gave one."""
+    """An object to place: its mesh, what the photo says about it, and what the user said of its pose, if anything."""
 
     name: str
     caster: Caster
     evidence: Evidence
     pose: Pose | None = None
+    keypoints: Keypoints | None = None
 
 
 class Placed(msgspec.Struct, frozen=True):
@@ -37,6 +39,7 @@ class Placed(msgspec.Struct, frozen=True):
     log_focal_sigma: float
     poses: list[Pose]
     found: list[Found | None]  # None where the pose was given
+    prior: FocalPrior  # what was known of the focal length beforehand
 
 
 def placed(
@@ -46,7 +49,7 @@ def placed(
 
     Raises InputError for an object to search whose mask has no pixel.
     """
-    prior = focal_prior(focal, source, camera.width, camera.height)
+    prior = beforehand = focal_prior(focal, source, camera.width, camera.height)
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     sigma, found = 0.0, {}
     if prior.sigma > 0 and any(thing.pose is not None for thing in things):
@@ -61,14 +64,18 @@ def placed(
                 f"no pixel of the mask shows object {thing.name!r}", file="dataset.yaml", key=photo,
                 cure="remove the object from this photo, or check its mask and materials",
             )  # fmt: skip
-        found[k] = find(thing.caster, thing.evidence, camera, prior, search)
+        if thing.keypoints is None:
+            found[k] = find(thing.caster, thing.evidence, camera, prior, search)
+        else:
+            start = state_of_keypoints(thing.keypoints, thing.caster, camera, prior, photo, thing.name)
+            found[k] = found_near(thing.caster, thing.evidence, camera, start, prior, search)
         if prior.sigma > 0:
             found[k], source = _judged(thing, camera, prior, found[k], source, photo, search)
             sigma = found[k].log_focal_sigma
             camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
     poses = [thing.pose or found[k].state.pose(thing.caster) for k, thing in enumerate(things)]
-    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))])
+    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))], beforehand)
 
 
 def _judged(

@@ -1,8 +1,8 @@
 """The pose of one object in one photo, from its mask alone: unknown rotation, place, distance and, if need be, focal length.
 
 Coarse to fine: every view and roll at thumbnail size (`coarse`), the best of them refined on contours (`refine`) at
-three resolutions, fewer at each.  Whatever survives beside the winner, turned by more than DISTINCT_DEG, is the
-runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
+three resolutions, fewer at each.  Whatever survives beside the winner, turned by more than DISTINCT_DEG, is refined as finely
+and is the runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected 
 UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
 EXIF_SIGMA = 0.05  # whole millimetres, and focus
 WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
+HOPELESS = 4.0  # times as much left unexplained as by the best, or HOPELESS_LEFT: not refined further
+HOPELESS_LEFT = 0.04
 CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
@@ -42,6 +44,7 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
     resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)  # pixels of the mask's longer side
     margin: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)  # of that side, seen around the mask
+    rivals: Annotated[int, msgspec.Meta(ge=0)] = 2  # guesses dropped on the way, refined to the end to find a runner-up
 
 
 class RunnerUp(msgspec.Struct, frozen=True):
@@ -59,6 +62,7 @@ class Found(msgspec.Struct, frozen=True):
     score: float
     log_focal_sigma: float
     runner_up: RunnerUp | None
+    by_keypoints: bool = False  # started where the user's keypoints say; nothing else was tried
 
 
 def focal_prior(camera_focal: float | None, source: str | None, width: int, height: int) -> FocalPrior:
@@ -82,17 +86,30 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
         kept = states[: keep if others else effort * keep]
         target = target_of(evidence, caster.mesh.labels, resolution, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
-        states = [result.state for result in ranked]
+        states = [result.state for result in ranked if 1 - result.score <= max(HOPELESS * (1 - ranked[0].score), HOPELESS_LEFT)]
         others = ranked + others
+    ranked = _distinct(ranked + _rivals(caster, target, camera, ranked[0], others[len(ranked) :], prior, search), prior)
     best = ranked[0]
-    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, others))
+    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
+
+
+def found_near(caster: Caster, evidence: Evidence, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()) -> Found:
+    """The pose refined from `start`, at the two finest resolutions; `start` itself where that leads far off."""
+    camera, state = msgspec.structs.replace(camera, focal=prior.focal), start
+    for steps, resolution, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
+        target = target_of(evidence, caster.mesh.labels, resolution, margin)
+        result = refined(caster, target, camera, state, prior, steps)
+        if angle_between(result.state.rotation, start.rotation) > DISTINCT_DEG:
+            result = refined(caster, target, camera, start, prior, 0)
+        state = result.state
+    return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
 
 
 def with_focal_free(caster: Caster, evidence: Evidence, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
     """The pose found, refined once more under another `prior` of the focal length."""
     target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     result = refined(caster, target, camera, found.state, prior, 2 * search.steps[-1])
-    return Found(result.state, result.score, result.log_focal_sigma(), found.runner_up)
+    return Found(result.state, result.score, result.log_focal_sigma(), found.runner_up, found.by_keypoints)
 
 
 def value(result: Refined, prior: FocalPrior) -> float:
@@ -109,6 +126,19 @@ def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
         if all(angle_between(result.state.rotation, other.state.rotation) > SAME_DEG for other in kept):
             kept.append(result)
     return kept
+
+
+def _rivals(
+    caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined], prior: FocalPrior, search: Search
+) -> list[Refined]:
+    """The best of `others` that are turned by more than DISTINCT_DEG, refined in the finest window: scores of
+    different resolutions do not compare."""
+    rivals: list[Refined] = []
+    for other in others:
+        distinct = all(angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals))
+        if distinct and len(rivals) < search.rivals:
+            rivals.append(other)
+    return [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
 
 
 def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:

@@ -24,6 +24,8 @@ MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
 ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1: matrices typed with four digits pass
+LEAST_KEYPOINTS, GOOD_KEYPOINTS = 4, 6
+LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
 
 
 class Refusal:
@@ -202,6 +204,33 @@ def _check_object(key: str, thing: ObjectEntry, spec: DatasetFile, refuse: Refus
         check_path(f"{key}.mask", thing.mask, (".png",), refuse)
     if thing.pose is not None:
         _check_rotation(f"{key}.pose.rotation", thing.pose.rotation, refuse)
+    if thing.keypoints:
+        _check_keypoints(f"{key}.keypoints", thing, refuse)
+
+
+def _check_keypoints(key: str, thing: ObjectEntry, refuse: Refusal) -> None:
+    """Enough of them, of different places, and not all on a line, about which the object could turn."""
+    if thing.pose is not None:
+        refuse(key, "has both a pose and keypoints", "keep one: a pose is used as it is, keypoints are where the search begins")
+    if len(thing.keypoints) < LEAST_KEYPOINTS:
+        cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
+        refuse(key, f"{len(thing.keypoints)} keypoints do not settle a pose", cure)
+    for name in ("pixel", "point"):
+        _check_spread(key, name, [getattr(keypoint, name) for keypoint in thing.keypoints], refuse)
+
+
+def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: Refusal) -> None:
+    for index, place in enumerate(places):
+        if place in places[:index]:
+            other = places.index(place)
+            refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
+    arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
+    longest = max(arms, key=lambda arm: math.hypot(*arm))
+    unit = [x / math.hypot(*longest) for x in longest]
+    along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
+    off = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
+    if max(off) < LEAST_OFF_LINE * math.hypot(*longest):
+        refuse(key, f"every {name} lies on one line", "name places in different directions: about a line the object could turn")
 
 
 def _check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:

@@ -49,6 +49,13 @@ class Pose(_Format):
     translation: Vec3
 
 
+class Keypoint(_Format):
+    """A pixel of the photo (x right, y down, pixel centres at 0.5) and the point of the mesh that it shows."""
+
+    pixel: Vec2
+    point: Vec3
+
+
 class ObjectEntry(_Format):
     """One instance of a mesh in a photo; `materials` overrides the mesh's parts, `mask` is its own silhouette."""
 
@@ -57,6 +64,7 @@ class ObjectEntry(_Format):
     materials: dict[str, str] = {}
     mask: str | None = None
     pose: Pose | None = None
+    keypoints: list[Keypoint] = []
 
 
 class PhotoEntry(_Format):

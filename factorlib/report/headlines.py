@@ -95,11 +95,17 @@ def _of_photos(run: Artifacts, metrics: dict) -> list[str]:
 
 def _of_poses(run: Artifacts) -> list[str]:
     poses = run.json("align", "poses.json") or {}
-    return [
+    left_out = [
+        f"{photo}: '{name}' is left out of the solve, its pose is doubtful: {'; '.join(entry['doubts'])}."
+        for photo in run.set.photos
+        for name, entry in poses.get(photo, {}).get("objects", {}).items()
+        if entry.get("left_out")
+    ]
+    return left_out + [
         f"{photo}: the mesh of '{name}' and its mask overlap by only {percent(entry['silhouette_iou'])} (intersection over union)."
         for photo in run.set.photos
         for name, entry in poses.get(photo, {}).get("objects", {}).items()
-        if entry.get("silhouette_iou") is not None and entry["silhouette_iou"] < LOW_IOU
+        if entry.get("silhouette_iou") is not None and entry["silhouette_iou"] < LOW_IOU and not entry.get("left_out")
     ]
 
 

@@ -10,14 +10,27 @@ from factorlib.report.photos import longest_side
 from factorlib.report.png import box_of, data_uri, reduced
 
 
+class ObjectRow(msgspec.Struct, frozen=True):
+    """What was measured of one object's pose, None for what was not, and in words what speaks against it."""
+
+    name: str
+    iou: float | None
+    suspicious: bool
+    agreement: float | None
+    score: float | None
+    runner_up: dict | None  # score, normal_difference_deg
+    doubts: list[str]
+    left_out: bool
+
+
 class PoseRow(msgspec.Struct, frozen=True):
-    """An overlay picture of a photo, its focal length, and each object's overlap (None if not said)."""
+    """An overlay picture of a photo, its focal length, and its objects."""
 
     photo: str
     uri: str | None
     focal_px: float | None
     focal_source: str | None
-    objects: list[tuple[str, float | None, bool]]  # name, silhouette IoU, suspicious
+    objects: list[ObjectRow]
 
 
 def pose_rows(run: Artifacts) -> list[PoseRow]:
@@ -26,13 +39,20 @@ def pose_rows(run: Artifacts) -> list[PoseRow]:
 
 
 def _row(run: Artifacts, photo: str, entry: dict, facts: dict) -> PoseRow:
-    objects = [(name, o.get("silhouette_iou")) for name, o in entry["objects"].items()]
     return PoseRow(
         photo,
         _overlay(run, photo),
         entry["camera"].get("focal_px"),
         facts.get("focal_source"),
-        [(name, iou, iou is not None and iou < LOW_IOU) for name, iou in objects],
+        [_object(name, said) for name, said in entry["objects"].items()],
+    )
+
+
+def _object(name: str, said: dict) -> ObjectRow:
+    iou, doubts = said.get("silhouette_iou"), said.get("doubts", [])
+    suspicious = bool(doubts) or (iou is not None and iou < LOW_IOU)
+    return ObjectRow(
+        name, iou, suspicious, said.get("label_agreement"), said.get("score"), said.get("runner_up"), doubts, said.get("left_out", False)
     )
 
 

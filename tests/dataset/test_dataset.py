@@ -217,6 +217,10 @@ P0, P1, O0 = ("photos", 0), ("photos", 1), ("photos", 0, "objects", 0)
 NO_TURN = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]
 MIRROR = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]
 NAN = float("nan")
+KEYPOINTS = [
+    {"pixel": [float(x), float(y)], "point": [float(a), float(b), float(c)]}
+    for x, y, a, b, c in ((1, 1, 0, 0, 0), (5, 1, 1, 0, 0), (5, 4, 1, 1, 0), (1, 4, 0, 1, 1))
+]
 BAD = {
     "another format": (("format",), 2, "format", "format: 1"),
     "no materials": (("materials",), [], "materials", "1 to 254"),
@@ -264,6 +268,26 @@ BAD = {
     ),
     "mirrored pose": ((*O0, "pose"), {"rotation": MIRROR, "translation": [0, 0, 1]}, "photos[0].objects[0].pose.rotation", "reflection"),
     "NaN pose": ((*O0, "pose"), {"rotation": TURN, "translation": [0, NAN, 1]}, "photos[0].objects[0].pose.translation[1]", "finite"),
+    "three keypoints": ((*O0, "keypoints"), KEYPOINTS[:3], "photos[0].objects[0].keypoints", "give 4 or more"),
+    "keypoints on a line": (
+        (*O0, "keypoints"),
+        [{"pixel": k["pixel"], "point": [0.1 * n, 0.2 * n, 0]} for n, k in enumerate(KEYPOINTS)],
+        "photos[0].objects[0].keypoints",
+        "every point lies on one line",
+    ),
+    "one pixel named twice": (
+        (*O0, "keypoints"),
+        [*KEYPOINTS, {"pixel": KEYPOINTS[1]["pixel"], "point": [9, 9, 9]}],
+        "photos[0].objects[0].keypoints[4].pixel",
+        "keypoints[1]",
+    ),
+    "keypoints beside a pose": ((*P0, "objects", 1, "keypoints"), KEYPOINTS, "photos[0].objects[1].keypoints", "keep one"),
+    "NaN keypoint": (
+        (*O0, "keypoints"),
+        [*KEYPOINTS[:3], {"pixel": [9, NAN], "point": [0, 0, 1]}],
+        "photos[0].objects[0].keypoints[3].pixel[1]",
+        "finite",
+    ),
     "mirrored world": ((*P0, "world_from_camera"), MIRROR, "photos[0].world_from_camera", "reflection"),
     "bad mesh name": (("meshes", "a/b"), {"file": "vase.ply", "material": "red"}, "meshes.a/b", "A-Z a-z 0-9"),
     "missing mesh": (("meshes", "vase", "file"), "vaze.ply", "meshes.vase.file", "did you mean 'vase.ply'"),

@@ -195,3 +195,19 @@ def test_a_browser_draws_it(made, tmp_path, width):
     assert drawn.mean() > 0.03  # something is there
     assert not drawn[:, -4:].any()  # and nothing runs over the right edge
     assert (np.ptp(pixels, axis=-1) > 60).any()  # pictures are in colour
+
+
+def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
+    _, inputs, html = made
+    shutil.copytree(inputs["align"], tmp_path / "align")
+    poses = json.loads((tmp_path / "align" / "poses.json").read_text())
+    poses["noon"]["objects"]["balls"] |= {
+        "label_agreement": 0.71, "score": 0.912, "runner_up": {"score": 0.905, "normal_difference_deg": 41.0},
+        "doubts": ["mesh <and> mask differ"], "left_out": True,
+    }  # fmt: skip
+    (tmp_path / "align" / "poses.json").write_text(json.dumps(poses))
+    doubtful = page_of(msgspec.structs.replace(inputs, folders=inputs.folders | {"align": tmp_path / "align"}), tmp_path / "report")
+    parsed(doubtful)
+    for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "noon: &#39;balls&#39; is left out"):
+        assert words in doubtful and words not in html, words
+    assert "keypoints" in doubtful

@@ -88,13 +88,35 @@ def test_exif_of_a_crop_is_found_out(tmp_path, caplog):
     assert entry["camera"]["focal_source"] == "estimated" and entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.2)
 
 
-def test_a_wrong_mesh_is_doubted_and_stops_a_strict_run(tmp_path, caplog):
+def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, caplog):
     inputs, _, _, _ = step(tmp_path, chair(), blob(), focal=300.0, source="dataset")
     with caplog.at_level(logging.WARNING, "factorlib.align"):
-        entry = run(tmp_path, inputs)[1]
-    assert entry["objects"]["thing"]["doubts"] and "give the object's pose" in caplog.text
+        out, entry = run(tmp_path, inputs)
+    thing = entry["objects"]["thing"]
+    assert thing["doubts"] and thing["left_out"] and "keypoints or pose" in caplog.text and "left out of the solve" in caplog.text
+    maps = read_exr(out / "a.exr")
+    assert (maps["label"] > 0).any() and not maps["confidence"].any()
+    kept, entry = run(tmp_path, inputs, "kept", keep_doubtful=True)
+    assert not entry["objects"]["thing"]["left_out"] and read_exr(kept / "a.exr")["confidence"].any()
     with pytest.raises(InputError, match="overlap"):
         run(tmp_path, inputs, "strict", strict=True)
+
+
+def test_a_given_pose_is_doubted_but_never_left_out(tmp_path):
+    inputs, _, _, _ = step(tmp_path, chair(), blob(), pose_given=True, focal=300.0, source="dataset")
+    out, entry = run(tmp_path, inputs)
+    thing = entry["objects"]["thing"]
+    assert thing["doubts"] and not thing["left_out"] and read_exr(out / "a.exr")["confidence"].any()
+
+
+def test_keypoints_are_where_the_search_begins(tmp_path):
+    inputs, caster, camera, pose = step(tmp_path, chair(), chair(), focal=300.0, source="dataset")
+    corners = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0]])
+    pixels = camera.project(pose.apply(corners))
+    keypoints = [{"pixel": list(p), "point": list(q)} for p, q in zip(pixels.tolist(), corners.tolist())]
+    inputs.facts["dataset.objects"]["objects"][0]["keypoints"] = keypoints
+    thing = run(tmp_path, inputs)[1]["objects"]["thing"]
+    assert thing["source"] == "keypoints" and thing["doubts"] == [] and np.allclose(thing["rotation"], pose.rotation, atol=0.02)
 
 
 def test_object_without_a_pixel_is_refused(tmp_path):

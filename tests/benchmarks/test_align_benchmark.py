@@ -1,0 +1,83 @@
+"""The benchmark's set is what it says, and its tables have their place; what it measures is not repeated here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from benchmarks.align import cases, shapes
+from benchmarks.align.measure import normal_error_deg
+from benchmarks.align.tables import as_tables
+from benchmarks.markdown import refresh
+from factorlib.align.raster import rasterise
+from factorlib.dataset.read import read_dataset
+from factorlib.meshes.read import read_mesh
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "align.md"
+
+
+@pytest.mark.parametrize("shape", shapes.SHAPES)
+def test_shapes_are_of_the_size_said_and_rough_ones_near_them(shape):
+    fine, rough = shapes.mesh(shape), shapes.rough(shape, 0)
+    extent = np.ptp(fine.vertices, axis=0).max()
+    assert 15_000 < len(fine.faces) < 25_000 and len(rough.faces) <= 520 and rough.labels == fine.labels
+    far = cKDTree(fine.vertices).query(rough.vertices)[0].max() / extent
+    assert 0.003 < far < 1.3 * shapes.WARP
+
+
+@pytest.mark.parametrize("kind", cases.RIGHT + cases.WRONG)
+def test_a_case_is_the_same_twice_and_cut_by_no_frame(kind):
+    first, again = (cases.case(kind, "jug", 3, 1) for _ in range(2))
+    assert np.array_equal(first.label, again.label) and np.array_equal(first.pose.rotation, again.pose.rotation)
+    assert first.label.any() and not (first.label[0].any() or first.label[-1].any() or first.label[:, 0].any() or first.label[:, -1].any())
+    assert not np.array_equal(first.pose.rotation, cases.case(kind, "jug", 4, 1).pose.rotation)
+
+
+def test_each_wrong_kind_is_wrong_in_the_way_it_is_named_for():
+    wrong = {kind: cases.case(kind, "chair", 0, 0) for kind in cases.WRONG}
+    assert wrong["wrong mesh"].given != "chair"
+    assert np.array_equal(wrong["mirrored mask"].label[:, ::-1], wrong["mirrored mask"].truth().label)
+    assert 5 <= np.count_nonzero(wrong["tiny mask"].label) <= 40
+    blot, truth = wrong["wrong mask"].label > 0, wrong["wrong mask"].truth().label > 0
+    assert np.count_nonzero(blot & truth) < 0.8 * np.count_nonzero(blot | truth)
+
+
+def test_the_error_of_the_truth_is_zero_and_of_nothing_is_180():
+    case = cases.case("exact", "hook", 0, 0)
+    away = type(case.pose)(case.pose.rotation, case.pose.translation + np.array([100.0, 0, 0]))
+    assert normal_error_deg(case.truth(), case.truth()) < 1e-5
+    assert normal_error_deg(case.truth(), rasterise(case.given_mesh(), case.camera, away)) == 180
+
+
+def test_the_set_is_a_dataset_that_is_read_with_its_truth(tmp_path):
+    made = [cases.case(kind, "chair", 0, 0) for kind in ("exact", "rough", "mirrored mask")]
+    cases.write_set(tmp_path / "set", made)
+    dataset = read_dataset(tmp_path / "set")
+    assert [photo.name for photo in dataset.spec.photos] == [case.name for case in made]
+    assert set(dataset.truth.poses) == {case.name for case in made if case.kind in cases.RIGHT}
+    entry = dataset.spec.meshes["chair"]
+    mesh = read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.parts, entry.material)
+    assert mesh.labels == (1, 2) and np.isclose(mesh.radius, shapes.mesh("chair").radius, rtol=1e-3)
+
+
+def test_tables_have_their_place(tmp_path):
+    right = {
+        "wall_s": 1.0,
+        "processor_s": 1.0,
+        "memory_mb": 5,
+        "normal_error_deg": 0.5,
+        "of_the_mesh_deg": 0.1,
+        "right": True,
+        "doubts": [],
+    }
+    rows = [right | {"kind": kind, "shape": shape} for kind in cases.RIGHT for shape in shapes.SHAPES]
+    rows += [right | {"kind": kind, "shape": "jug", "doubts": ["so"]} for kind in cases.WRONG]
+    tables = as_tables(rows)
+    assert "| exact, all | 5 of 5 |" in tables["success"] and "| all | 4 of 4 |" in tables["flags"]
+    page = tmp_path / "align.md"
+    page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
+    refresh(page, tables)
+    assert all(inner in page.read_text(encoding="utf-8") for inner in tables.values())
