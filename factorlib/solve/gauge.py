@@ -1,7 +1,9 @@
 """Fixing what the data cannot: one factor per channel and connected component, between reflectances and lights.
 
-Tint   The paper's prior settles it: lights as near to grey as they can be.  With a_ic the summed lobe weights of
+Tint   The paper's prior settles it: lights as near to grey as they can be.  With a_ic the summed lobe energies of
        light i over their mean of channels, the factors s_c minimise Σ_i Σ_c (s_c a_ic − 1)², so s_c = Σ_i a_ic / Σ_i a_ic².
+       The paper sums weights.  But those are peaks: of one light, sums of two fits differ as one of its lobes is fitted by
+       several sharper ones, while energies add up to what the light sends.
 Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
        the light, which is what photographs of objects show, and Mitsuba needs it below one.
 """
@@ -17,7 +19,7 @@ from factorlib.solve.unknowns import Light, Materials
 
 BRIGHTEST = 0.9
 RULE = (
-    "per connected component: channel factors make the lights' summed lobe weights nearest to grey (the prior of Wang et al.); "
+    "per connected component: channel factors make the lights' summed lobe energies nearest to grey (after the prior of Wang et al.); "
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
 
@@ -41,6 +43,6 @@ def in_gauge(materials: Materials, lights: Sequence[Light], blocks: Sequence[Blo
 
 
 def _greying(lights: Sequence[Light]) -> np.ndarray:
-    sums = np.array([light.weight.sum(0) for light in lights])
+    sums = np.array([light.energy.sum(0) for light in lights])
     share = sums / np.maximum(sums.mean(1, keepdims=True), 1e-30)
     return np.clip(share.sum(0) / np.maximum((share**2).sum(0), 1e-30), 1e-3, 1e3)

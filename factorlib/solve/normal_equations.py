@@ -4,7 +4,7 @@
     residual   r_ic = (y_ic − radiance_ic) / σ_ic, and min(r_ic, 0) where the channel is clipped: a clipped pixel says
                                                    "at least this much"
     loss       Σ 2k² (√(1 + r²/k²) − 1)            pseudo-Huber: wrong normals and mask borders pull with bounded force
-             + n π Σ_c (W_c/W̄ − 1)² / 3            the paper's prior: variance over channels of the summed weights
+             + n π Σ_c (E_c/Ē − 1)² / 3            the paper's prior, on summed energies: variance over channels
 
 D (diffuse) and S (specular) are the responses of a unit lobe, from the reflection operator with their derivatives.
 Channels share the geometry unknowns (axis, sharpness) and have their own weights, so the Gram matrix is assembled
@@ -99,7 +99,7 @@ def robust_losses(residual: Float[np.ndarray, "n 3"], scale: float) -> Float[np.
 def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:
     """The loss of one illumination over what is not held out, prior included."""
     residual = residuals(block, predicted_radiance(block, light, materials, operator))[~block.held_out]
-    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss, materials.blur)[0]
+    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0]
 
 
 def system(
@@ -119,7 +119,7 @@ def system(
         response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[index], operator))
         own = None if clusters is None else (scores, clusters[rows])
         total += _add_rows(hessian, gradient, own, block, rows, light, materials, index, response, loss)
-    prior, prior_gradient, prior_hessian = _prior(block, light, loss, materials.blur)
+    prior, prior_gradient, prior_hessian = _prior(block, light, loss)
     lobes = slice(7 * m + 2 * p, 7 * m + 6 * p)
     gradient[lobes] += prior_gradient
     hessian[lobes, lobes] += prior_hessian
@@ -192,13 +192,12 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
         yield Channel(places, jacobian * (precision * pull)[:, None], residual * pull, lost)
 
 
-def _prior(block: Block, light: Light, loss: Loss, blur: float):
-    """The tint prior over the unknowns [s, e_R, e_G, e_B] × p, with the mean W̄ held: value, gradient, Hessian."""
+def _prior(block: Block, light: Light, loss: Loss):
+    """The tint prior over the unknowns [s, e_R, e_G, e_B] × p, with the mean Ē held: value, gradient, Hessian."""
     strength = loss.prior * int((~block.held_out).sum()) / 3
-    sums = light.weight.sum(0)
+    sums = light.energy.sum(0)
     centre = (np.eye(3) - 1 / 3) / max(float(sums.mean()), 1e-30)
     residual = centre @ sums
-    _, weight_by_s = light.sharpness_slopes(blur)
-    by_lobes = np.hstack([(light.weight * weight_by_s[:, None]).T, np.kron(np.eye(3), 1 / light.spread)])  # of the sums
+    by_lobes = np.hstack([np.zeros((3, len(light))), np.kron(np.eye(3), np.ones(len(light)))])  # of the sums
     jacobian = centre @ by_lobes
     return strength * float(residual @ residual), strength * jacobian.T @ residual, strength * jacobian.T @ jacobian

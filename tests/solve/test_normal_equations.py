@@ -34,7 +34,7 @@ def test_gradient_by_light_is_the_finite_difference(problem):
     data, light = problem
     found = system(data, light, MATERIALS, OPERATOR, LOSS)
     size = 6 * len(light) + 1
-    # the prior holds W̄, so it is left out of the difference and tested on its own below
+    # the prior holds Ē, so it is left out of the difference and tested on its own below
     loss = Loss(robust_scale=3.0, prior=0.0)
     found = system(data, light, MATERIALS, OPERATOR, loss)
     expected = derivative(lambda d: fit_loss(data, light.moved(d, MATERIALS.blur), MATERIALS, OPERATOR, loss), size)
