@@ -31,7 +31,8 @@ def serial_map(function: Callable, items: Iterable) -> list:
 class Inputs(msgspec.Struct, frozen=True):
     """The declared inputs of one step.
 
-    folders: stage name -> folder of that stage's files (of this photo only, where both are per photo)
+    folders: stage name -> folder of that stage's files (of this photo only, where both are per photo);
+             parameter that names a folder -> that folder, where it is given
     facts:   "dataset.<slice>" -> JSON-able facts of the dataset
     files:   dataset-relative path, as it stands in dataset.yaml -> absolute path
     photo:   name of this step's photo, None in a stage over the whole set

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import LightSlice
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
@@ -27,6 +28,7 @@ from factorlib.solve.normal_equations import Loss
 from factorlib.solve.paper import REPORTS, Paper
 from factorlib.solve.paper import solve as solve_as_the_paper
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable
+from factorlib.solve.resume import Journal
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import GAUGE, standard_errors
@@ -93,7 +95,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     operator = reflection_operator(operator_of(params), weights=inputs["train"])
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        joint = _solved(params, blocks, len(materials), operator, spread, progress)
+        journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
+        joint = _solved(params, blocks, len(materials), operator, spread, progress, journal)
     _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator, params.solver)
 
 
@@ -103,13 +106,15 @@ def operator_of(params: Params) -> str:
     return automatic if params.operator == "auto" else params.operator
 
 
-def _solved(params: Params, blocks: list[Block], materials: int, operator, spread: Callable, progress: Progress) -> Joint:
+def _solved(
+    params: Params, blocks: list[Block], materials: int, operator, spread: Callable, progress: Progress, journal: Journal
+) -> Joint:
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
         said = lambda event: progress(event.round + 1, REPORTS + 1, f"subset {event.iteration}: loss {event.loss:.3g}")  # noqa: E731
         return solve_as_the_paper(blocks, materials, operator, paper, spread, said)
     models = len(candidates(blocks, params.self_shadowing))
-    return solve(blocks, materials, operator, _bundle(params), spread, _to_progress(progress, params, models))
+    return solve(blocks, materials, operator, _bundle(params), spread, _to_progress(progress, params, models), journal=journal)
 
 
 def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:

@@ -25,6 +25,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
     threads: threads of its numerics, part of what is computed (a sum depends on them), never the machine's
     logs:    hand it the log of the steps above it (not part of its key)
+    given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
+             the folder among its inputs, and the key has the files' contents, not where they lie
     """
 
     inputs: list[str] = []
@@ -33,6 +35,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
     logs: bool = False
+    given: dict[str, list[str]] = {}
     params: dict[str, Any] = {}
 
     @property
@@ -42,6 +45,16 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def upstream(self) -> list[str]:
         return [name for name in self.inputs if not name.startswith(DATASET)]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The parameters that the stage itself takes."""
+        return {name: value for name, value in self.params.items() if name not in self.given}
+
+    @property
+    def folders(self) -> dict[str, Any]:
+        """The folders that were named, as they were written."""
+        return {name: self.params[name] for name in self.given if self.params.get(name) is not None}
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,6 +98,9 @@ def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tupl
         known = [DATASET + s for s in known_slices] + list(pipeline.stages)
         if entry not in known:
             raise InputError(f"there is no {entry!r}", file=path, key=f"stages.{name}.inputs", cure=did_you_mean(entry, known))
+    for param in stage.given:
+        if param in stage.inputs:
+            raise InputError(f"{param!r} is a stage already", file=path, key=f"stages.{name}.given", cure="call the parameter something else")
     if stage.gather and not stage.over:
         raise InputError("only what is made per photo can be gathered", file=path, key=f"stages.{name}.gather", cure="add over: photo")
 

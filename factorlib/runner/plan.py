@@ -129,6 +129,7 @@ _KIND = {
     "param": "parameter {}",
     "facts": "{} in the dataset's files",
     "file": "file {}",
+    "given": "given file {}",
     "input": "result of {}",
     "gathered": "gathered file of {}",
     "data": "package data {}",
@@ -151,7 +152,7 @@ _ABSENT = object()
 def _change(name: str, before: Any, after: Any) -> str:
     kind, colon, what = name.partition(":")
     label = _KIND.get(kind, "{}").format(what) if colon else name
-    if kind in ("source", "facts", "file", "input", "data"):
+    if kind in ("source", "facts", "file", "given", "input", "data"):
         return f"{label}: " + ("new" if before is _ABSENT else "gone" if after is _ABSENT else "changed")
     shown = ["default" if v is _ABSENT and kind == "param" else "none" if v is _ABSENT else json.dumps(v) for v in (before, after)]
     return f"{label}: {shown[0]} -> {shown[1]}"

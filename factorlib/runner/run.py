@@ -22,7 +22,7 @@ from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.project import claim
 from factorlib.runner.store import view_of
-from factorlib.runner.survey import Survey
+from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
 
@@ -93,7 +93,7 @@ class Run:
         """Refuse bad parameters before anything has run."""
         self._plan()
         stages = dict.fromkeys(p.step.stage for p in self.planned if p.status != "current")
-        checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].params]
+        checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
         futures = [self.pools.submit(code.threads, check_params, code) for code in checks]
         outcomes = [_outcome_of(future) for future in futures]
         for future in futures:
@@ -144,23 +144,25 @@ class Run:
 
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
-        return Code(project.root, project.package, stage, spec.params, project.pipeline_file, spec.threads)
+        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads)
 
     def _task(self, planned: Planned) -> Task:
         step, data = planned.step, self.survey.data
         stage = self.survey.spec.pipeline.stages[step.stage]
         slices = {name: data.slice(name, step.photo) for name in stage.slices}
         files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}
+        given = {param: given_folder(stage, param) for param in stage.folders}
+        read = {f"given:{param}/{file}": folder / file for param, folder in given.items() for file in stage.given[param]}
         label = str(step).replace("/", "-")
         return Task(
             code=self._code(step.stage),
             photo=step.photo,
             makes=stage.makes,
             gather=stage.gather,
-            folders={name: self._folder(step, name) for name in stage.upstream},
+            folders={name: self._folder(step, name) for name in stage.upstream} | given,
             facts={DATASET + name: slice_.facts for name, slice_ in slices.items()},
-            files=files,
-            hashes={file: planned.record[f"file:{file}"] for file in files},
+            files=files | read,
+            hashes={file: planned.record[f"file:{file}"] for file in files} | {file: planned.record[file] for file in read},
             log=self._log_above(step, self.folder / f"{label}.log.jsonl") if stage.logs else None,
             store=self.survey.store.root,
             key=planned.key,

@@ -14,7 +14,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.closure import Closure, Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.packages import Packages
-from factorlib.runner.pipeline import DATASET, Pipeline, read_pipeline, with_settings
+from factorlib.runner.pipeline import DATASET, Pipeline, Stage, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Home, Project, home_of
 from factorlib.runner.store import Outputs, Store
@@ -69,6 +69,7 @@ def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packa
     records = {}
     for name in spec.pipeline.needed(spec.targets):
         of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
             records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
     return records
@@ -79,7 +80,7 @@ def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> Non
     for name, stage in pipeline.stages.items():
         if not stage.params:
             continue
-        known = sources.stage_params(project.package, name, project.pipeline_file)
+        known = [*sources.stage_params(project.package, name, project.pipeline_file), *stage.given]
         for param in stage.params:
             if param not in known:
                 where = f"stages.{name}.params.{param}"
@@ -90,10 +91,30 @@ def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> Non
 def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Packages) -> Record:
     stage = pipeline.stages[name]
     record = {"stage": name, "threads": stage.threads, "python": f"{sys.version_info[0]}.{sys.version_info[1]}", "makes": stage.makes}
-    record |= {f"param:{key}": value for key, value in stage.params.items()}
+    record |= {f"param:{key}": value for key, value in stage.values.items()}
     record |= {f"source:{module}": digest for module, digest in closure.modules.items()}
     record |= {f"data:{file}": digest for file, digest in closure.data.items()}
     return record | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+
+
+def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) -> Record:
+    """The files of the folders that parameters name, by content."""
+    stage, record = pipeline.stages[name], {}
+    for param, files in ((param, stage.given[param]) for param in stage.folders):
+        folder = given_folder(stage, param)
+        for file in files:
+            try:
+                record[f"given:{param}/{file}"] = hashes.content(folder / file)
+            except (OSError, TypeError):
+                found = "there is no such folder" if not folder.is_dir() else f"it has no readable {file!r}"
+                key, cure = f"{name}.{param}", f"name a folder with {', '.join(files)}, such as the result of an earlier run of the stage"
+                raise InputError(found, file=project.shown(folder), key=key, cure=cure) from None
+    return record
+
+
+def given_folder(stage: Stage, param: str) -> Path:
+    """The folder that a parameter names, from where the user stands; links are followed now, for results move on."""
+    return Path(str(stage.folders[param])).resolve()
 
 
 def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> Record:

@@ -21,12 +21,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.solve.choice import Specular, matte_where_it_may_be
+from factorlib.solve.choice import Specular, matte_where_it_may_be, untried, without_specular
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.gauge import in_gauge
 from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals, robust_losses
 from factorlib.solve.problem import Block, of_rows, sampled
+from factorlib.solve.resume import Journal
 from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.start import starting_light, starting_materials
@@ -94,6 +95,55 @@ class Joint(msgspec.Struct, frozen=True):
     specular: list[Specular] = []
 
 
+class Start(msgspec.Struct, frozen=True):
+    """Where the rounds start, and what is decided before them.
+
+    point: materials and lights for the given blocks;  decided: materials whose specular part is not tried;
+    matte: those of them that have none
+    """
+
+    point: Callable[[Sequence[Block], object, Bundle, Callable], tuple[Materials, list[Light]]]
+    decided: Bool[np.ndarray, "m"]
+    matte: Bool[np.ndarray, "m"]
+
+
+def from_nothing(materials: int) -> Start:
+    """Mean radiances alone, nothing decided."""
+
+    def point(blocks: Sequence[Block], operator, bundle: Bundle, map_: Callable) -> tuple[Materials, list[Light]]:
+        start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
+        return start, [starting_light(block, start) for block in blocks]
+
+    return Start(point, np.zeros(materials, bool), np.zeros(materials, bool))
+
+
+class Rounds(msgspec.Struct, frozen=True):
+    """How far the rounds are: where they stand, the best of them and its held-out loss, the last fitted loss and its function."""
+
+    current: Solution
+    best: Solution
+    held_out: float
+    fitted: float
+    loss: Loss
+    history: list[Event]
+    over: bool = False
+
+
+class Chosen(msgspec.Struct, frozen=True):
+    """Without needless specular parts; which materials have none, and what decided about each."""
+
+    solution: Solution
+    matte: Bool[np.ndarray, "m"]
+    specular: list[Specular]
+
+
+class Polished(msgspec.Struct, frozen=True):
+    """At rest after a phase of the polish, and all events so far."""
+
+    solution: Solution
+    history: list[Event]
+
+
 class Fit(msgspec.Struct, frozen=True):
     """The best round, its held-out loss, the loss function it was fitted by, and all events up to the last round."""
 
@@ -109,37 +159,59 @@ class Fit(msgspec.Struct, frozen=True):
 
 
 def solve(
-    blocks: Sequence[Block], materials: int, operator, bundle: Bundle, map_: Callable, report: Report, snapshot: Snapshot = unwatched
+    blocks: Sequence[Block],
+    materials: int,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    snapshot: Snapshot = unwatched,
+    start: Start | None = None,
+    journal: Journal | None = None,
 ) -> Joint:
-    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers."""
-    models = candidates(blocks, bundle.self_shadowing)
+    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers.
+
+    start: `from_nothing` unless given;  journal: what is done already, and what to keep of the rest
+    """
+    models, start, journal = candidates(blocks, bundle.self_shadowing), start or from_nothing(materials), journal or Journal()
     fits: dict[str, Fit] = {}
     for name, model in models.items():
-        fits[name] = best_round(model, materials, operator, bundle, map_, report, list(fits.values()), snapshot)
+        fits[name] = best_round(model, start, operator, bundle, map_, report, list(fits.values()), snapshot, journal, f"rounds {name}")
     chosen = min(fits, key=lambda name: fits[name].held_out)
-    fit, matte, specular = with_specular_chosen(models[chosen], fits[chosen], operator, bundle, map_)
-    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte, snapshot)
+    fit = fits[chosen]
+    choice = with_specular_chosen(models[chosen], fit, start, operator, bundle, map_, journal)
+    fit, matte = msgspec.structs.replace(fit, solution=choice.solution), choice.matte
+    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte, snapshot, journal)
     found = solution.materials
     specular_or_none = np.where(matte[:, None], 0.0, found.specular)
     solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
     held_out = {name: fit.held_out for name, fit in fits.items()}
-    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, specular)
+    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, choice.specular)
 
 
-def with_specular_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable):
-    """The fit without needless specular parts, which materials are matte, and the evidence."""
-    blocks = sampled_for(blocks, fit.solution.lights, bundle)
-    start = evaluated(blocks, fit.solution.materials, fit.solution.lights, operator, fit.loss, map_)
-    if bundle.specular == "on" or not any(block.held_out.any() for block in blocks):
-        return fit, np.zeros(len(start.materials), bool), []
-
+def with_specular_chosen(
+    blocks: Sequence[Block], fit: Fit, start: Start, operator, bundle: Bundle, map_: Callable, journal: Journal
+) -> Chosen:
+    """The fit without needless specular parts: those decided before, and those that held-out observations do not ask for."""
+    if kept := journal.kept("choice", Chosen):
+        return kept
+    materials = fit.solution.materials
+    for m in np.flatnonzero(start.matte):
+        materials = without_specular(materials, m)
+    before = msgspec.structs.replace(fit.solution, materials=materials)
+    if bundle.specular == "on" or start.decided.all() or not any(block.held_out.any() for block in blocks):
+        return journal.keep("choice", Chosen(before, start.matte, untried(start.matte) if start.decided.any() else []))
+    blocks = sampled_for(blocks, before.lights, bundle)
     held = [held_out_of(blocks, k) for k in range(len(blocks))]
 
     def held_out(s: Solution) -> np.ndarray:
         return held_out_losses(held, s.materials, s.lights, operator, bundle.loss)
 
-    solution, matte, evidence = matte_where_it_may_be(blocks, held, start, operator, fit.loss, held_out, map_)
-    return msgspec.structs.replace(fit, solution=solution), matte, evidence
+    at = evaluated(blocks, materials, before.lights, operator, fit.loss, map_)
+    solution, matte, evidence = matte_where_it_may_be(
+        blocks, held, at, operator, fit.loss, held_out, map_, decided=start.decided, matte=start.matte
+    )
+    return journal.keep("choice", Chosen(_bare(solution), matte, evidence))
 
 
 def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[Block]]:
@@ -169,55 +241,94 @@ def _recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Los
 
 def best_round(
     blocks: Sequence[Block],
-    materials: int,
+    start: Start,
     operator,
     bundle: Bundle,
     map_: Callable,
     report: Report,
     rivals: Sequence[Fit] = (),
     snapshot: Snapshot = unwatched,
+    journal: Journal | None = None,
+    part: str = "rounds",
 ) -> Fit:
     """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
-    whole, history = blocks, []
-    blocks = [sampled(block, bundle.sample, bundle.seed) for block in whole]
-    start = starting_materials(blocks, materials, bundle.start_specular_share, bundle.start_roughness)
-    current = evaluated(blocks, start, [starting_light(b, start) for b in blocks], operator, bundle.loss, map_)
-    current = _refitted(blocks, current, operator, bundle.loss, map_)
-    best, best_held, fitted = current, np.inf, np.inf
-    for number in range(bundle.rounds):
-        blocks = sampled_for(whole, current.lights, bundle, bundle.insert)
-        record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
-        loss = msgspec.structs.replace(bundle.loss, robust_scale=_robust_scale(blocks, current, operator, bundle.loss))
-        current = _with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
-        said = partial(record, number, "descent")
-        current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, said)
-        current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
-        held = record(number, "round", -1, current)
-        gained, halved = best_held - held, history[-1].loss < HALVED * fitted
-        fitted = history[-1].loss
-        if held < best_held:
-            best, best_held = current, held
-        outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
-        if outdone or (gained < bundle.least_gain * held and not halved) or max(map(len, current.lights)) >= bundle.lobes:
-            break
-    return Fit(best, best_held, loss, history)
+    journal = journal or Journal()
+    rounds = journal.kept(part, Rounds)
+    for event in rounds.history if rounds else ():
+        report(event)
+    rounds = rounds or journal.keep(part, _before_rounds(blocks, start, operator, bundle, map_))
+    while not rounds.over:
+        rounds = journal.keep(part, _next_round(blocks, rounds, operator, bundle, map_, report, rivals, snapshot))
+    return Fit(rounds.best, rounds.held_out, rounds.loss, rounds.history)
+
+
+def _before_rounds(blocks: Sequence[Block], start: Start, operator, bundle: Bundle, map_: Callable) -> Rounds:
+    blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
+    materials, lights = start.point(blocks, operator, bundle, map_)
+    current = evaluated(blocks, materials, lights, operator, bundle.loss, map_)
+    current = _bare(_refitted(blocks, current, operator, bundle.loss, map_))
+    return Rounds(current, current, np.inf, np.inf, bundle.loss, [])
+
+
+def _next_round(
+    blocks: Sequence[Block],
+    rounds: Rounds,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    rivals: Sequence[Fit],
+    snapshot: Snapshot,
+) -> Rounds:
+    history, current = list(rounds.history), rounds.current
+    number = sum(event.phase == "round" for event in history)
+    blocks = sampled_for(blocks, current.lights, bundle, bundle.insert)
+    record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
+    loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
+    current = with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
+    current = descend(blocks, current, operator, loss, _descent(bundle, bundle.iterations), map_, partial(record, number, "descent"))
+    current = _tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
+    held = record(number, "round", -1, current)
+    gained, halved = rounds.held_out - held, history[-1].loss < HALVED * rounds.fitted
+    outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
+    enough = (gained < bundle.least_gain * held and not halved) or max(map(len, current.lights)) >= bundle.lobes
+    best = current if gained > 0 else rounds.best
+    over = outdone or enough or number + 1 == bundle.rounds
+    return Rounds(_bare(current), _bare(best), min(held, rounds.held_out), history[-1].loss, loss, history, bool(over))
 
 
 def polished(
-    blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, report: Report, matte=None, snapshot: Snapshot = unwatched
+    blocks: Sequence[Block],
+    fit: Fit,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    matte=None,
+    snapshot: Snapshot = unwatched,
+    journal: Journal | None = None,
 ) -> tuple[Solution, list[Event]]:
     """The best round brought to rest on many observations, then on all, and the whole history."""
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     many = sampled_for(everything, fit.solution.lights, bundle, times=MANY)
-    history, number, loss, best = list(fit.history), fit.history[-1].round, fit.loss, fit.solution
+    number, loss, journal = fit.history[-1].round, fit.loss, journal or Journal()
     phases = [(many, bundle.polish), (everything, min(bundle.settle, bundle.polish))]
-    for of, iterations in phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]:
+    at = Polished(fit.solution, fit.history)
+    for phase, (of, iterations) in enumerate(phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]):
+        if kept := journal.kept(f"polish {phase}", Polished):
+            at = kept
+            continue
+        history = list(at.history)
         record = _recorder(of, history, operator, loss, report, snapshot)
-        best = evaluated(of, best.materials, best.lights, operator, loss, map_)
-        best = descend(
-            of, best, operator, loss, _descent(bundle, iterations), map_, partial(record, number, "polish"), matte
-        )
-    return _tidied(everything, best, operator, loss, map_), history
+        best = evaluated(of, at.solution.materials, at.solution.lights, operator, loss, map_)
+        best = descend(of, best, operator, loss, _descent(bundle, iterations), map_, partial(record, number, "polish"), matte)
+        at = journal.keep(f"polish {phase}", Polished(_bare(best), history))
+    return _tidied(everything, at.solution, operator, loss, map_), at.history
+
+
+def _bare(solution: Solution) -> Solution:
+    """Without its systems, which follow from the rest and are large."""
+    return Solution(solution.materials, solution.lights, [])
 
 
 def held_out_loss(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss) -> float:
@@ -244,7 +355,7 @@ def _descent(bundle: Bundle, iterations: int) -> Descent:
     return Descent(iterations, bundle.tolerance)
 
 
-def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
+def robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
     """Three robust standard deviations of the current residual, never below one σ of the noise model."""
     absolute = [
         np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator)))
@@ -253,7 +364,7 @@ def _robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: L
     return max(3 * 1.4826 * float(np.median(np.concatenate(absolute))), 1.0)
 
 
-def _with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
+def with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
     seeds = [bundle.seed + 1000 * number + k for k in range(len(blocks))]
     grown = partial(_grown, materials=current.materials, operator=operator, bundle=bundle)
     lights = list(map_(grown, list(zip(blocks, current.lights, seeds, strict=True))))

@@ -35,13 +35,23 @@ class Specular(msgspec.Struct, frozen=True):
 
 
 def matte_where_it_may_be(
-    blocks: Sequence[Block], held: Sequence[Block], start: Solution, operator, loss, losses: Callable, map_: Callable
+    blocks: Sequence[Block],
+    held: Sequence[Block],
+    start: Solution,
+    operator,
+    loss,
+    losses: Callable,
+    map_: Callable,
+    decided: Bool[np.ndarray, "m"] | None = None,
+    matte: Bool[np.ndarray, "m"] | None = None,
 ) -> tuple[Solution, Bool[np.ndarray, "m"], list[Specular]]:
     """The solution with needless specular parts gone, which materials those are, and the evidence for every material.
 
-    held: the held-out observations;  losses: those of a solution, one of each held-out observation
+    held: the held-out observations;  losses: those of a solution, one of each held-out observation;
+    decided: materials that are not tried;  matte: those that have lost their specular part already
     """
-    matte = np.zeros(len(start.materials), bool)
+    matte = np.zeros(len(start.materials), bool) if matte is None else matte.copy()
+    tried = ~matte if decided is None else ~decided
     seen = np.isin(np.arange(len(matte)), np.concatenate([block.material for block in blocks]))
     material = np.concatenate([block.material for block in held])
 
@@ -54,10 +64,10 @@ def matte_where_it_may_be(
     base = start.materials  # all go on from here by as many iterations
     chosen = rested(start, base, matte)
     best = losses(chosen)
-    evidence = [Specular(True, None, None)] * len(matte)
+    evidence = untried(matte)
     for m in np.argsort(base.specular.mean(1), kind="stable"):
         own = material == m
-        if not seen[m] or not own.any() or base.specular[m].mean() > base.diffuse[m].mean():
+        if not tried[m] or not seen[m] or not own.any() or base.specular[m].mean() > base.diffuse[m].mean():
             continue
         without = without_specular(base, m)
         trial = rested(start, without, matte | (np.arange(len(matte)) == m), HOPELESS * best.mean())
@@ -67,6 +77,11 @@ def matte_where_it_may_be(
         if not needed:
             base, chosen, best, matte[m] = without, trial, found, True
     return chosen, matte, evidence
+
+
+def untried(matte: Bool[np.ndarray, "m"]) -> list[Specular]:
+    """The evidence where there is none: what was decided before."""
+    return [Specular(not is_matte, None, None) for is_matte in matte.tolist()]
 
 
 def without_specular(materials: Materials, m: int) -> Materials:

@@ -358,3 +358,55 @@ def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success
     assert len(list((project.build / "store" / "unfinished").iterdir())) == 1
     assert make(project) == 0
     assert not list((project.build / "store" / "unfinished").iterdir())
+
+
+# ── a folder that a parameter names ──────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def giving(project, tmp_path):
+    """The toy whose table reads start/seed.txt where it is given one; everything current without."""
+    pipeline = toy.PIPELINE.replace("table: {}", "table: {given: {start: [seed.txt]}}")
+    seed = '(inputs["start"] / "seed.txt").read_text() if "start" in inputs.folders else params.scale'
+    write(project.root / "pipeline.yaml", pipeline)
+    write(project.root / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", f"str({seed})"))
+    write(tmp_path / "one" / "seed.txt", "5")
+    assert make(project) == 0
+    return project
+
+
+def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_path):
+    named = lambda folder: [f"table.start={tmp_path / folder}"]  # noqa: E731
+    assert new_runs(giving, settings=named("one")) == ["table", "total"]
+    assert (giving.build / "set" / "total" / "total.txt").read_text() == "total: 45"
+    shutil.copytree(tmp_path / "one", tmp_path / "other")
+    write(tmp_path / "other" / "more.txt", "not read")
+    assert new_runs(giving, settings=named("other")) == []
+    write(tmp_path / "other" / "seed.txt", "6")
+    assert reasons(giving, "table", settings=named("other")) == ["given file start/seed.txt: changed"]
+    assert new_runs(giving, settings=named("other")) == ["table", "total"]
+    assert new_runs(giving) == [] and (giving.build / "set" / "total" / "total.txt").read_text() == "total: 18", "it is off unless named"
+
+
+def test_no_path_of_a_given_folder_is_in_the_key(giving, tmp_path):
+    make(giving, settings=[f"table.start={tmp_path / 'one'}"])
+    assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
+
+
+@pytest.mark.parametrize("folder, words", [("nowhere", "no such folder"), (".", "no readable 'seed.txt'")])
+def test_a_given_folder_that_is_not_there_is_refused_before_anything_runs(giving, tmp_path, folder, words):
+    with pytest.raises(InputError) as caught:
+        make(giving, settings=[f"table.start={tmp_path / folder}"])
+    said = str(caught.value)
+    assert words in said and "table.start" in said and "name a folder with seed.txt" in said and str(tmp_path.name) in said
+
+
+def test_a_given_file_that_changes_while_it_is_read_is_no_result(giving, tmp_path):
+    text = (giving.root / "stages" / "table.py").read_text().rstrip("\n")
+    write(giving.root / "stages" / "table.py", text + '\n    (inputs["start"] / "seed.txt").write_text("9")\n')
+    assert make(giving, settings=[f"table.start={tmp_path / 'one'}"]) == 1
+
+
+def test_a_given_folder_that_is_no_path_is_refused(giving):
+    with pytest.raises(InputError, match="no such folder"):
+        make(giving, settings=["table.start=3"])

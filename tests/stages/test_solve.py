@@ -34,15 +34,16 @@ def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0
     return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
 
 
-def run(folder, seen: dict[str, Observations], **params):
+def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None, start=None, **params):
     urm, out = folder / "urm", folder / "out"
-    urm.mkdir(parents=True), out.mkdir()
+    urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
     for name, part in seen.items():
         write_observations(urm / f"{name}.parquet", part)
     light = {name: {"illumination": name, "world_from_camera": None} for name in seen}
-    inputs = Inputs({"urm": urm, "train": folder}, {"dataset.materials": list(NAMES), "dataset.light": light})
+    folders = {"urm": urm, "train": folder} | ({"start": start} if start else {})
+    inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
     quick = {"operator": "closed_form", "lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
-    solve.main(solve.Params(**{**quick, **params}), inputs, out, silent)
+    solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
     return out
 
 
@@ -135,3 +136,23 @@ def test_the_papers_solver_writes_the_same_artifacts(tmp_path, linked):
 )
 def test_each_solver_has_an_operator_of_its_own(solver, operator, taken):
     assert solve.operator_of(solve.Params(solver=solver, operator=operator)) == taken
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_solve_goes_on_to_the_same_bytes(tmp_path, linked):
+    said = []
+
+    def killed_in_the_polish(done, total, text=""):
+        said.append(text)
+        if text.startswith("polish"):
+            raise Killed
+
+    whole = run(tmp_path / "whole", linked)
+    with pytest.raises(Killed):
+        run(tmp_path / "killed", linked, killed_in_the_polish, tmp_path / "unfinished")
+    out = run(tmp_path / "killed", linked, unfinished=tmp_path / "unfinished")
+    for file in sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file()):
+        assert (whole / file).read_bytes() == (out / file).read_bytes(), file

@@ -1,0 +1,110 @@
+"""A solve that is stopped anywhere and started again ends in the same bits, and does not start again from the beginning."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.checkpoint import Checkpoint
+from factorlib.light.sphere import fibonacci_sphere
+from factorlib.reflection import reflection_operator
+from factorlib.solve import bundle, insertion
+from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.resume import Journal
+from factorlib.stage import serial_map
+from tests.solve.problems import MATERIALS, block, random_light
+
+OPERATOR = reflection_operator("network")
+BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=2, settle=2, sample=30)
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """Most of the time would go into looking for lobes, and few observations would leave no phase to settle."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(insertion, "DICTIONARY", {1.0: 16, 30.0: 60})
+        patch.setattr(bundle, "A_LOBE", 5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """Two lights with two photos each, some of which is hidden by what is made up: two models to choose from."""
+    rng = np.random.default_rng(4)
+    made = [block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=8, seed=i) for i in range(2)]
+    visibility = [(255 * (rng.random((len(b), 96)) < 0.9)).astype(np.uint8) for b in made]
+    directions = np.stack([fibonacci_sphere(96)] * 2)
+    return [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, visibility, strict=True)]
+
+
+def answer(blocks, journal=None, stop=lambda event: False):
+    """All numbers of an answer, and the events reported."""
+    events = []
+
+    def report(event):
+        events.append(event)
+        if stop(event):
+            raise Killed
+
+    joint = solve(blocks, 3, OPERATOR, BUNDLE, serial_map, report, journal=journal)
+    s = joint.solution
+    parts = [s.materials.vector(), joint.matte, *(getattr(li, f).reshape(-1) for li in s.lights for f in li.__struct_fields__)]
+    told = msgspec.json.encode([joint.history, joint.held_out, joint.specular, joint.loss, joint.self_shadowing])
+    return np.concatenate(parts).tobytes() + told, events
+
+
+@pytest.fixture(scope="module")
+def whole(blocks):
+    return answer(blocks)
+
+
+def places(events):
+    """The number of the event at which each place to stop is first reached."""
+    second = next(k for k in range(1, len(events)) if events[k].round < events[k - 1].round)  # the other model begins
+    polish = [k for k, event in enumerate(events) if event.phase == "polish"]
+    return {
+        "a later round": next(k for k, event in enumerate(events) if event.round == 1),
+        "second model": second,
+        "second model, its last round": polish[0] - 1,
+        "polish, after the choice": polish[0],
+        "settle": polish[-1],
+    }
+
+
+PLACES = ("a later round", "second model", "second model, its last round", "polish, after the choice", "settle")
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_killed_solve_goes_on_to_the_same_bits(blocks, whole, tmp_path, place):
+    bits, events = whole
+    at = places(events)[place]
+    seen = []
+    with pytest.raises(Killed):
+        answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")), lambda event: seen.append(event) or len(seen) == at + 1)
+    again, _ = answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")))
+    assert again == bits
+
+
+def test_what_was_done_is_not_done_again(blocks, whole, tmp_path):
+    """Killed in the last phase, hardly anything is computed again; the rounds are reported again, for who shows progress."""
+    _, events = whole
+    seen, work = [], []
+    with pytest.raises(Killed):
+        answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")), lambda event: seen.append(event) or len(seen) == len(events))
+
+    def counted(function, items):
+        work.append(len(items))
+        return serial_map(function, items)
+
+    solve(blocks, 3, OPERATOR, BUNDLE, counted, lambda event: work.append(0), journal=Journal(Checkpoint(tmp_path / "solve.pt")))
+    assert sum(work) < 2 * len(blocks) * (BUNDLE.settle + 2)
+
+
+def test_a_file_that_cannot_be_read_starts_the_solve_again(blocks, whole, tmp_path):
+    path = tmp_path / "solve.pt"
+    answer(blocks, Journal(Checkpoint(path)))
+    path.write_bytes(path.read_bytes()[:1000])
+    assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
