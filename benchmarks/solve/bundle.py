@@ -99,7 +99,7 @@ def points(spheres: SphereSet, found: list[Snapshot], judge) -> list[dict]:
     return rows
 
 
-def thinned(found: list[Snapshot], most: int = 16) -> list[Snapshot]:
+def thinned(found: list[Snapshot], most: int = 40) -> list[Snapshot]:
     """At most that many, the last among them."""
     step = -(-len(found) // most)
     return found[::-1][::step][::-1]
