@@ -17,12 +17,14 @@ import pyarrow.parquet as pq
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import LightSlice
+from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes, write_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
 from factorlib.solve.coverage import relative_standard_errors
+from factorlib.solve.earlier import Earlier, read_earlier
 from factorlib.solve.gauge import RULE
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.paper import REPORTS, Paper
@@ -33,6 +35,7 @@ from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
+from factorlib.solve.warm import from_earlier
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate, read_observations
@@ -52,6 +55,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
     has a specular part, `auto` those whose held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
+
+    The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
+    from it, and whether they have specular parts, and whether there are shadows, stays as it was decided there.
     """
 
     solver: Literal["bundle", "paper"] = "bundle"
@@ -80,6 +86,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
+    earlier = _earlier(params, inputs)
     read = [read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))]
     seen = concatenate([merge(usable(part), params.merge_degrees) for part in read])
     _warn_of_unusable(read)
@@ -96,7 +103,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
         journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
-        joint = _solved(params, blocks, len(materials), operator, spread, progress, journal)
+        joint = _solved(params, blocks, materials, operator, spread, progress, journal, earlier)
     _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator, params.solver)
 
 
@@ -107,14 +114,35 @@ def operator_of(params: Params) -> str:
 
 
 def _solved(
-    params: Params, blocks: list[Block], materials: int, operator, spread: Callable, progress: Progress, journal: Journal
+    params: Params,
+    blocks: list[Block],
+    materials: list[str],
+    operator,
+    spread: Callable,
+    progress: Progress,
+    journal: Journal,
+    earlier: Earlier | None,
 ) -> Joint:
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
         said = lambda event: progress(event.round + 1, REPORTS + 1, f"subset {event.iteration}: loss {event.loss:.3g}")  # noqa: E731
-        return solve_as_the_paper(blocks, materials, operator, paper, spread, said)
-    models = len(candidates(blocks, params.self_shadowing))
-    return solve(blocks, materials, operator, _bundle(params), spread, _to_progress(progress, params, models), journal=journal)
+        return solve_as_the_paper(blocks, len(materials), operator, paper, spread, said)
+    bundle, start = _bundle(params), None
+    if earlier:
+        start = from_earlier(earlier, materials, bundle.specular)
+        decided = earlier.self_shadowing if bundle.self_shadowing == "auto" else None
+        bundle = msgspec.structs.replace(bundle, self_shadowing=decided or bundle.self_shadowing)
+    said = _to_progress(progress, params, len(candidates(blocks, bundle.self_shadowing)))
+    return solve(blocks, len(materials), operator, bundle, spread, said, start=start, journal=journal)
+
+
+def _earlier(params: Params, inputs: Inputs) -> Earlier | None:
+    """The solution to start from, where one is given."""
+    if "start" not in inputs.folders:
+        return None
+    if params.solver == "paper":
+        raise InputError("the paper's solver starts from nothing", key="solve.start", cure="leave it out, or set solve.solver=bundle")
+    return read_earlier(inputs["start"])
 
 
 def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:

@@ -99,12 +99,13 @@ class Start(msgspec.Struct, frozen=True):
     """Where the rounds start, and what is decided before them.
 
     point: materials and lights for the given blocks;  decided: materials whose specular part is not tried;
-    matte: those of them that have none
+    matte: those of them that have none;  rested: the point counts as a round, and another follows only where one halves a loss
     """
 
     point: Callable[[Sequence[Block], object, Bundle, Callable], tuple[Materials, list[Light]]]
     decided: Bool[np.ndarray, "m"]
     matte: Bool[np.ndarray, "m"]
+    rested: bool = False
 
 
 def from_nothing(materials: int) -> Start:
@@ -253,6 +254,7 @@ def best_round(
 ) -> Fit:
     """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round."""
     journal = journal or Journal()
+    bundle = msgspec.structs.replace(bundle, rounds=1) if start.rested else bundle
     rounds = journal.kept(part, Rounds)
     for event in rounds.history if rounds else ():
         report(event)
@@ -267,7 +269,12 @@ def _before_rounds(blocks: Sequence[Block], start: Start, operator, bundle: Bund
     materials, lights = start.point(blocks, operator, bundle, map_)
     current = evaluated(blocks, materials, lights, operator, bundle.loss, map_)
     current = _bare(_refitted(blocks, current, operator, bundle.loss, map_))
-    return Rounds(current, current, np.inf, np.inf, bundle.loss, [])
+    if not start.rested:
+        return Rounds(current, current, np.inf, np.inf, bundle.loss, [])
+    loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
+    fitted = evaluated(blocks, current.materials, current.lights, operator, loss, map_).loss
+    held_out = held_out_loss(blocks, current.materials, current.lights, operator, bundle.loss)
+    return Rounds(current, current, held_out, fitted, loss, [])
 
 
 def _next_round(

@@ -60,7 +60,8 @@ def matte_where_it_may_be(
         trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
         return trial if losses(trial).mean() > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
 
-    start = rested(start, start.materials, matte)  # nearer to rest, iterations change the held-out loss less
+    if decided is None or not decided.any():  # else the rounds began at rest
+        start = rested(start, start.materials, matte)  # nearer to rest, iterations change the held-out loss less
     base = start.materials  # all go on from here by as many iterations
     chosen = rested(start, base, matte)
     best = losses(chosen)

@@ -1,0 +1,238 @@
+"""Where the rounds start when an earlier solution is given: what has a name there is taken over, the rest is found from it.
+
+    known   materials by their name, lights by their illumination's; the radiance unit of a block is taken out of its light,
+            photos new to a light get the exposure that explains their median radiance
+    new     what a known thing lights or shows is found first, again and again: a light by insertion and descent with the
+            materials held, a material by the search over all roughnesses with the lights held
+    left    what no chain of photos links to anything known starts from mean radiances, as all does from nothing
+
+Earlier materials that no photo linked stand in gauges of their own.  A photo that links them tells the factor per channel
+between them: how much brighter the ones are, in its light, than the others foretell.
+
+A light that explains its photos worse than one broad lobe does (it was taken again, or turned, or in other units) is not
+known but new.  Only the rounds' start and what is decided before them are changed: nothing pulls toward the earlier answer.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from factorlib.solve.bundle import Bundle, Start, from_nothing, held_out_loss, robust_scale, with_new_lobes
+from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.earlier import Earlier
+from factorlib.solve.insertion import blurred, pruned, sharpest_told
+from factorlib.solve.normal_equations import Loss, System, fit_loss, predicted_radiance
+from factorlib.solve.problem import Block, of_rows
+from factorlib.solve.roughness import materials_out_of_valleys
+from factorlib.solve.start import starting_light
+from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
+from factorlib.solve.weights import refitted_weights
+from factorlib.stage import serial_map
+
+log = logging.getLogger("factorlib.solve")
+AT_ONCE = 2  # times as many lobes as a round inserts, where materials need not be found with them
+
+
+class Known(msgspec.Struct, frozen=True):
+    """What an earlier solution says of a problem's materials and blocks.
+
+    component: number of each known material's own gauge, −1 where a material is new;  lights: None where one is new
+    """
+
+    materials: Materials
+    component: Int[np.ndarray, "m"]
+    lights: list[Light | None]
+
+
+def from_earlier(earlier: Earlier, names: Sequence[str], specular: str) -> Start:
+    """The start of a problem whose materials are called `names`; `specular` as of the bundle: `on` decides nothing."""
+    model = earlier.table.model.specular
+    decided = np.array([name in model and name in earlier.table.materials and specular == "auto" for name in names])
+    matte = np.array([not model.get(name, True) for name in names]) & decided
+    return Start(partial(_point, earlier=earlier, names=list(names)), decided, matte, rested=True)
+
+
+def known_of(earlier: Earlier, names: Sequence[str], blocks: Sequence[Block]) -> Known:
+    """Matched by name."""
+    rows, component = np.full((len(names), 7), 0.5), np.full(len(names), -1)
+    for m, name in enumerate(names):
+        if found := earlier.table.materials.get(name):
+            rows[m] = [*found.diffuse, *found.specular, found.roughness]
+            component[m] = earlier.table.gauge.component[name]
+    return Known(Materials.of_vector(rows.reshape(-1)), component, [_light(earlier, block) for block in blocks])
+
+
+def _light(earlier: Earlier, block: Block) -> Light | None:
+    """In the block's radiance unit; NaN is the log exposure of a photo that was not there.  None without lobes or photos."""
+    lobes = earlier.lights.get(block.name)
+    exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
+    if not lobes or np.isnan(exposure).all():
+        return None
+    axis = lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True)
+    return Light(axis, np.log(np.clip(lobes.sharpness, *SHARPNESS)), lobes.weight / block.unit, exposure)
+
+
+def _point(
+    blocks: Sequence[Block], operator, bundle: Bundle, map_: Callable, *, earlier: Earlier, names: list[str]
+) -> tuple[Materials, list[Light]]:
+    known = known_of(earlier, names, blocks)
+    return Spreading(blocks, known, operator, bundle, map_).point()
+
+
+class Spreading:
+    """Materials and lights while they become known; what is known only grows."""
+
+    def __init__(self, blocks: Sequence[Block], known: Known, operator, bundle: Bundle, map_: Callable):
+        self.blocks, self.operator, self.bundle, self.map = blocks, operator, bundle, map_
+        self.materials, self.component = known.materials, known.component.copy()
+        self.lights: list[Light | None] = [None] * len(blocks)
+        for i, light in enumerate(known.lights):
+            if light is not None and self._known_rows(i).any():
+                self.lights[i] = self._checked(i, light)
+
+    def point(self) -> tuple[Materials, list[Light]]:
+        self._one_gauge()
+        while self._lights_of_materials() | self._materials_of_lights():
+            self._one_gauge()
+        return self._rest()
+
+    def _known_rows(self, i: int) -> Bool[np.ndarray, "n"]:
+        """Observations of block i whose materials are known, in the one gauge that most of them have."""
+        component = self.component[self.blocks[i].material]
+        return (component == _most(component)) & (component >= 0)
+
+    def _checked(self, i: int, light: Light) -> Light | None:
+        """The light with every photo's exposure and its weights fitted again; None where one broad lobe explains more."""
+        shown = of_rows(self.blocks[i], self._known_rows(i))
+        light = _with_exposures(light, shown, self.materials, self.operator)
+        fit = partial(_fitted_weights, shown, materials=self.materials, operator=self.operator, loss=self.bundle.loss)
+        (best, fitted), (least, _) = fit(light), fit(starting_light(shown, self.materials))
+        if best < least:
+            return fitted
+        log.warning("illumination '%s' starts anew: what the earlier solution says of it explains less than one broad lobe", shown.name)
+        return None
+
+    def _lights_of_materials(self) -> bool:
+        """Find the new lights that show known materials; whether there were any."""
+        new = [i for i, light in enumerate(self.lights) if light is None and self._known_rows(i).any()]
+        shown = [of_rows(self.blocks[i], self._known_rows(i)) for i in new]
+        fit = partial(fitted_light, materials=self.materials, operator=self.operator, bundle=self.bundle)
+        for i, light in zip(new, self.map(fit, shown), strict=True):
+            self.lights[i] = light
+        return bool(new)
+
+    def _materials_of_lights(self) -> bool:
+        """Find the new materials that known lights show; whether there were any."""
+        lit = [i for i, light in enumerate(self.lights) if light is not None]
+        blocks, lights = [self.blocks[i] for i in lit], [self.lights[i] for i in lit]
+        new = [m for m in np.flatnonzero(self.component < 0) if any((block.material == m).any() for block in blocks)]
+        if not new:
+            return False
+        self.materials = _merged(self.materials, _guessed(self.materials, new), new)
+        found = materials_out_of_valleys(blocks, self.materials, lights, self.operator, self.bundle.loss, self.map)
+        self.materials = _merged(self.materials, found, new)
+        for m in new:
+            shows = next(i for i in lit if (self.blocks[i].material == m).any())
+            self.component[m] = _most(self.component[self.blocks[shows].material])
+        return True
+
+    def _one_gauge(self) -> None:
+        """Materials of different gauges that one light shows come into the gauge that most of its observations have."""
+        for i, (block, light) in enumerate(zip(self.blocks, self.lights, strict=True)):
+            if light is None:
+                continue
+            main = _most(self.component[block.material])
+            for other in sorted(set(self.component[block.material].tolist()) - {-1, main}):
+                rows = of_rows(block, self.component[block.material] == other)
+                self._rescale(other, _brighter(rows, light, self.materials, self.operator), main, i)
+
+    def _rescale(self, other: int, factor: Float[np.ndarray, "3"], main: int, keep: int) -> None:
+        members = np.flatnonzero(self.component == other)
+        for i, light in enumerate(self.lights):
+            if light is not None and i != keep and _most(self.component[self.blocks[i].material]) == other:
+                self.lights[i] = msgspec.structs.replace(light, weight=light.weight / factor)
+        diffuse, specular = self.materials.diffuse.copy(), self.materials.specular.copy()
+        diffuse[members] *= factor
+        specular[members] *= factor
+        self.materials = Materials(diffuse, specular, self.materials.roughness)
+        self.component[members] = main
+
+    def _rest(self) -> tuple[Materials, list[Light]]:
+        """What nothing known leads to, from mean radiances."""
+        start, lights = from_nothing(len(self.materials)).point(self.blocks, self.operator, self.bundle, self.map)
+        materials = _merged(self.materials, start, np.flatnonzero(self.component < 0))
+        return materials, [light if known is None else known for known, light in zip(self.lights, lights, strict=True)]
+
+
+def fitted_light(block: Block, materials: Materials, operator, bundle: Bundle) -> Light:
+    """A light found by rounds of insertion and descent with the materials held, as long as they gain."""
+    light, best, least = starting_light(block, materials), None, np.inf
+    bundle = msgspec.structs.replace(bundle, insert=AT_ONCE * bundle.insert)
+    for number in range(bundle.rounds):
+        current = evaluated([block], materials, [light], operator, bundle.loss, materials_held)
+        loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale([block], current, operator, bundle.loss))
+        current = with_new_lobes([block], current, operator, loss, bundle, number, serial_map)
+        current = evaluated([block], materials, current.lights, operator, loss, materials_held)
+        current = descend([block], current, operator, loss, Descent(bundle.iterations, bundle.tolerance), materials_held)
+        light = blurred(pruned(current.lights[0]), sharpest_told(materials))
+        held_out = held_out_loss([block], materials, [light], operator, bundle.loss)
+        gained, least, best = least - held_out, min(least, held_out), light if held_out < least else best
+        if gained < bundle.least_gain * held_out or len(light) >= bundle.lobes:
+            break
+    return best
+
+
+def materials_held(function: Callable, items) -> list[System]:
+    """A map that leaves no gradient in the materials: a damped step holds what has none."""
+    systems = serial_map(function, items)
+    return [msgspec.structs.replace(system, material_gradient=np.zeros_like(system.material_gradient)) for system in systems]
+
+
+def _fitted_weights(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> tuple[float, Light]:
+    current: Solution = evaluated([block], materials, [light], operator, loss, serial_map)
+    fitted = refitted_weights(light, current.systems[0])
+    return min((current.loss, light), (fit_loss(block, fitted, materials, operator, loss), fitted), key=lambda pair: pair[0])
+
+
+def _with_exposures(light: Light, block: Block, materials: Materials, operator) -> Light:
+    """With the exposures that were not known, and the first photo's moved into the weights."""
+    exposure = light.log_exposure
+    guess = msgspec.structs.replace(light, log_exposure=np.where(np.isnan(exposure), 0.0, exposure))
+    for k in np.flatnonzero(np.isnan(exposure)):
+        rows = block.photo == k
+        if rows.any():
+            guess.log_exposure[k] = np.log(_brighter(of_rows(block, rows), guess, materials, operator)).mean()
+    first = guess.log_exposure[0]
+    return Light(light.axis, light.log_sharpness, light.weight * np.exp(first), guess.log_exposure - first)
+
+
+def _brighter(block: Block, light: Light, materials: Materials, operator) -> Float[np.ndarray, "3"]:
+    """By what factor observations are brighter than foretold, per channel."""
+    foretold = np.median(predicted_radiance(block, light, materials, operator), axis=0)
+    return np.maximum(np.median(block.radiance, axis=0), 1e-6) / np.maximum(foretold, 1e-6)
+
+
+def _guessed(materials: Materials, new: Sequence[int]) -> Materials:
+    """The new materials as grey as the middle of the roughnesses; the search that follows replaces them."""
+    rows = materials.vector().reshape(-1, 7).copy()
+    rows[list(new)] = [*([0.3] * 3), *([0.1] * 3), np.sqrt(ROUGHNESS[0] * ROUGHNESS[1])]
+    return Materials.of_vector(rows.reshape(-1))
+
+
+def _merged(materials: Materials, found: Materials, which: Sequence[int]) -> Materials:
+    """`materials` with those of `which` as `found`."""
+    rows = materials.vector().reshape(-1, 7).copy()
+    rows[list(which)] = found.vector().reshape(-1, 7)[list(which)]
+    return Materials.of_vector(rows.reshape(-1))
+
+
+def _most(component: Int[np.ndarray, "n"]) -> int:
+    """The gauge that most observations have, of those in any; −1 where none is."""
+    of_known = component[component >= 0]
+    return int(np.bincount(of_known).argmax()) if len(of_known) else -1
