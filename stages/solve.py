@@ -104,7 +104,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
         journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
         joint = _solved(params, blocks, materials, operator, spread, progress, journal, earlier)
-    _write(out, materials, blocks if joint.self_shadowing else [without_shadows(block) for block in blocks], joint, operator, params.solver)
+    shown = blocks if joint.self_shadowing else [without_shadows(block) for block in blocks]
+    _write(out, materials, shown, joint, operator, params.solver, earlier)
 
 
 def operator_of(params: Params) -> str:
@@ -217,7 +218,7 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
         )  # fmt: skip
 
 
-def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator, solver: str) -> None:
+def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator, solver: str, earlier: Earlier | None) -> None:
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
     _warn(ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator))
@@ -233,6 +234,9 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "self_shadowing": joint.self_shadowing,
         "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }
+    if earlier:
+        known = {"materials": set(names) & set(earlier.table.materials), "illuminations": {b.name for b in blocks} & set(earlier.lights)}
+        model["started_from"] = {of: sorted(names) for of, names in known.items()}
     gauge = {"rule": RULE, "component": {name: component_of[m] for m, name in enumerate(names)}, "stderr": GAUGE}
     write_json(out / "materials.json", {"materials": _as_json(names, found, errors), "gauge": gauge, "model": model})
     write_json(out / "uncertainty.json", {"residual_sigma": deviation, "materials": _as_json(names, errors, None), "gauge": GAUGE})

@@ -8,6 +8,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.reflection import reflection_operator
+from factorlib.solve.earlier import FILES
 from factorlib.solve.normal_equations import predicted_radiance
 from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.stage import Inputs, silent
@@ -156,3 +157,49 @@ def test_a_killed_solve_goes_on_to_the_same_bytes(tmp_path, linked):
     out = run(tmp_path / "killed", linked, unfinished=tmp_path / "unfinished")
     for file in sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file()):
         assert (whole / file).read_bytes() == (out / file).read_bytes(), file
+
+
+def test_a_start_gives_the_answer_from_nothing_and_is_said(tmp_path, linked):
+    steady = {"rounds": 4, "iterations": 10, "polish": 15, "lobes": 12, "specular": "on"}
+    first = run(tmp_path / "first", {"a": linked["a"]}, **steady)
+    cold = run(tmp_path / "cold", linked, **steady)
+    warm = run(tmp_path / "warm", linked, start=first, **steady)
+    a, b = (read_json(folder / "materials.json") for folder in (warm, cold))
+    assert a["model"]["started_from"] == {"materials": sorted(NAMES), "illuminations": ["a"]}
+    assert "started_from" not in b["model"]
+    for name in NAMES:
+        assert a["materials"][name]["roughness"] == pytest.approx(b["materials"][name]["roughness"], abs=0.03)
+
+
+def test_the_papers_solver_takes_no_start(tmp_path, linked):
+    with pytest.raises(InputError, match="starts from nothing"):
+        run(tmp_path, linked, solver="paper", start=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "file, old, new, words",
+    [
+        ("materials.json", '"roughness"', '"rougness"', "missing required field `roughness`"),
+        ("materials.json", '"diffuse": [', '"diffuse": [-1, ', "of length 3"),
+        ("materials.json", '"component": {', '"component": {"gold": 0, ', "names other materials"),
+        ("materials.json", "{", "(", "not readable as JSON"),
+        ("exposures.json", "1.0", "0.0", "not a positive number"),
+        ("exposures.json", "1.0", '"one"', "Expected `float`"),
+        ("lobes.parquet", None, None, "not a table of lobes"),
+    ],
+)
+def test_a_start_that_is_none_says_which_file_and_what_to_do(tmp_path, a_result, linked, file, old, new, words):
+    folder = tmp_path / "earlier"
+    folder.mkdir()
+    for name in FILES:
+        (folder / name).write_bytes((a_result / name).read_bytes())
+    path = folder / file
+    path.write_bytes(b"rows") if old is None else path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError) as caught:
+        run(tmp_path, linked, start=folder)
+    assert words in str(caught.value) and str(path) in str(caught.value) and caught.value.cure
+
+
+@pytest.fixture(scope="module")
+def a_result(tmp_path_factory, linked):
+    return run(tmp_path_factory.mktemp("result"), linked)
