@@ -14,7 +14,7 @@ from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
-BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=2, settle=2, sample=30)
+BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
 
 
 class Killed(Exception):
