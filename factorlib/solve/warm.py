@@ -110,7 +110,7 @@ class Spreading:
     def _checked(self, i: int, light: Light) -> Light | None:
         """The light with every photo's exposure and its weights fitted again; None where one broad lobe explains more."""
         shown = of_rows(self.blocks[i], self._known_rows(i))
-        light = _with_exposures(light, shown, self.materials, self.operator)
+        light = with_exposures(light, shown, self.materials, self.operator)
         fit = partial(_fitted_weights, shown, materials=self.materials, operator=self.operator, loss=self.bundle.loss)
         (best, fitted), (least, _) = fit(light), fit(starting_light(shown, self.materials))
         if best < least:
@@ -200,7 +200,7 @@ def _fitted_weights(block: Block, light: Light, materials: Materials, operator, 
     return min((current.loss, light), (fit_loss(block, fitted, materials, operator, loss), fitted), key=lambda pair: pair[0])
 
 
-def _with_exposures(light: Light, block: Block, materials: Materials, operator) -> Light:
+def with_exposures(light: Light, block: Block, materials: Materials, operator) -> Light:
     """With the exposures that were not known, and the first photo's moved into the weights."""
     exposure = light.log_exposure
     guess = msgspec.structs.replace(light, log_exposure=np.where(np.isnan(exposure), 0.0, exposure))

@@ -14,7 +14,7 @@ from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
-BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=2, settle=2, sample=30)
+BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
 
 
 class Killed(Exception):
@@ -100,7 +100,7 @@ def test_what_was_done_is_not_done_again(blocks, whole, tmp_path):
         return serial_map(function, items)
 
     solve(blocks, 3, OPERATOR, BUNDLE, counted, lambda event: work.append(0), journal=Journal(Checkpoint(tmp_path / "solve.pt")))
-    assert sum(work) < 2 * len(blocks) * (BUNDLE.settle + 2)
+    assert sum(work) <= len(blocks) * (BUNDLE.settle + 2)  # where it starts, its steps, the end in gauge
 
 
 def test_a_file_that_cannot_be_read_starts_the_solve_again(blocks, whole, tmp_path):

@@ -10,10 +10,11 @@ from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion
 from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.descent import Descent, descend, evaluated
 from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table
-from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.unknowns import Light, Materials
-from factorlib.solve.warm import Spreading, from_earlier, known_of
+from factorlib.solve.warm import Spreading, from_earlier, known_of, materials_held, with_exposures
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
@@ -164,6 +165,16 @@ def test_a_light_nobody_knows_is_found_with_the_materials_held():
     explained(blocks, materials, found, atol=0.15)
 
 
+def test_a_descent_with_the_materials_held_moves_the_light_alone():
+    (data,), (light,) = truth(0)
+    away = msgspec.structs.replace(light, log_sharpness=light.log_sharpness - 0.2)
+    moved = msgspec.structs.replace(MATERIALS, roughness=MATERIALS.roughness + 0.03)
+    start = evaluated([data], moved, [away], OPERATOR, Loss(), materials_held)
+    found = descend([data], start, OPERATOR, Loss(), Descent(5), materials_held)
+    np.testing.assert_array_equal(found.materials.vector(), moved.vector())
+    assert found.loss < start.loss
+
+
 def test_a_material_nobody_knows_is_found_in_the_known_lights():
     blocks, lights = truth(0, 1)
     earlier = written(
@@ -181,7 +192,10 @@ def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
     relative = {photo: tuple(np.array(earlier.exposures[photo]) / earlier.exposures[others[0]][0]) for photo in others}
     factor = earlier.exposures[others[0]][0]
     lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was while `first` was not there
-    _, (light,) = begun(msgspec.structs.replace(earlier, exposures=relative, lights=lobes), blocks)
+    earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
+    light = with_exposures(known_of(earlier, NAMES, blocks).lights[0], blocks[0], MATERIALS, OPERATOR)
+    explained(blocks, MATERIALS, [light], atol=0.02)
+    _, (light,) = begun(earlier, blocks)
     np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
     explained(blocks, MATERIALS, [light], atol=0.02)
 
