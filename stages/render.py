@@ -16,6 +16,7 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.export.materials import Material, read_materials
 from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import exposure_of, picture, write_png
+from factorlib.images.tone import curve
 from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes, read_lobes
 from factorlib.reflection import reflection_operator
@@ -52,7 +53,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     def report(done: float, pixels: float) -> None:
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    _write(out / "resynthesis" / name, resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs)), exposure)
+    model = read_json(inputs["solve"] / "materials.json")["model"]
+    again = resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs, model))
+    _write(out / "resynthesis" / name, toned(again, model.get("tone", {}).get(name)), exposure)
     seen = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
@@ -63,9 +66,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(total, total, name)
 
 
-def shadowed(inputs: Inputs) -> Observations | None:
+def toned(radiance: np.ndarray, tone: dict | None) -> np.ndarray:
+    """Through the photo's tone curve, where the solve found one."""
+    return radiance if tone is None else tone["pivot"] * curve(radiance / tone["pivot"], tone["exponent"])
+
+
+def shadowed(inputs: Inputs, model: dict) -> Observations | None:
     """The photo's observations, where the solve took their visibility into account."""
-    model = read_json(inputs["solve"] / "materials.json")["model"]
     return read_observations(inputs["urm"] / f"{inputs.photo}.parquet") if model.get("self_shadowing") else None
 
 

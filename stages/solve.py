@@ -53,7 +53,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     illumination that choose the lobes (60 for each lobe where that is more), before four times as many polish the
     answer in `polish` iterations, and all of them in `settle`;  self_shadowing: whether what the meshes hide is taken
     to be dark, `auto` where held-out pixels are explained better so;  specular: whether every material
-    has a specular part, `auto` those whose held-out pixels are explained better so;  prior: weight of the paper's tint
+    has a specular part, `auto` those whose held-out pixels are explained better so;  tone: whether photos may have a tone
+    curve beyond their encoding, `auto` where held-out pixels are explained better so;  prior: weight of the paper's tint
     prior;  noise_…: the noise model, in units of an illumination's mean radiance.
 
     The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
@@ -75,6 +76,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     held_out: Annotated[float, Meta(ge=0, le=0.5)] = 0.1
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     specular: Literal["auto", "on"] = "auto"
+    tone: Literal["auto", "off"] = "auto"
     prior: Annotated[float, Meta(ge=0)] = 1e-4
     noise_absolute: Annotated[float, Meta(gt=0)] = 0.05
     noise_relative: Annotated[float, Meta(ge=0)] = 0.05
@@ -166,6 +168,7 @@ def _bundle(params: Params) -> Bundle:
             "least_gain",
             "self_shadowing",
             "specular",
+            "tone",
             "seed",
         )
     }
@@ -234,6 +237,12 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "self_shadowing": joint.self_shadowing,
         "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }
+    model["tone"] = {
+        photo: {"exponent": float(np.exp(log_tone)), "pivot": block.unit}
+        for block, light in zip(blocks, joint.solution.lights, strict=True)
+        for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
+    }
+    model["tone_chosen_by"] = {block.name: msgspec.to_builtins(told) for block, told in zip(blocks, joint.tone, strict=False)}
     if earlier:
         known = {"materials": set(names) & set(earlier.table.materials), "illuminations": {b.name for b in blocks} & set(earlier.lights)}
         model["started_from"] = {of: sorted(names) for of, names in known.items()}

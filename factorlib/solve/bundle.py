@@ -31,6 +31,7 @@ from factorlib.solve.resume import Journal
 from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.start import starting_light, starting_materials
+from factorlib.solve.tone_choice import Tone, toned_where_it_pays
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import refitted_weights
 
@@ -56,6 +57,7 @@ class Bundle(msgspec.Struct, frozen=True):
     start_specular_share: float = 0.2
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     specular: Literal["auto", "on"] = "auto"
+    tone: Literal["auto", "off"] = "auto"
     loss: Loss = Loss()
     seed: int = 0
 
@@ -83,7 +85,7 @@ class Joint(msgspec.Struct, frozen=True):
     """The answer, in the gauge of `solve.gauge`: materials, one light per block, how it was reached, and the last loss.
 
     self_shadowing: whether visibility was used;  held_out: the held-out loss with and without it, of what was tried;
-    matte: materials without specular part;  specular: what decided about each
+    matte: materials without specular part;  specular: what decided about each;  tone: what decided about each light's curves
     """
 
     solution: Solution
@@ -93,6 +95,7 @@ class Joint(msgspec.Struct, frozen=True):
     held_out: dict[str, float] = {}
     matte: Bool[np.ndarray, "m"] | None = None
     specular: list[Specular] = []
+    tone: list[Tone] = []
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -138,6 +141,13 @@ class Chosen(msgspec.Struct, frozen=True):
     specular: list[Specular]
 
 
+class Toned(msgspec.Struct, frozen=True):
+    """With the tone curves that it needs, and what decided about each light."""
+
+    solution: Solution
+    tone: list[Tone]
+
+
 class Polished(msgspec.Struct, frozen=True):
     """At rest after a phase of the polish, and all events so far."""
 
@@ -180,6 +190,9 @@ def solve(
         fits[name] = best_round(model, start, operator, bundle, map_, report, list(fits.values()), snapshot, journal, f"rounds {name}")
     chosen = min(fits, key=lambda name: fits[name].held_out)
     fit = fits[chosen]
+    toned = with_tone_chosen(models[chosen], fit, operator, bundle, map_, journal)
+    if any(of_light.kept for of_light in toned.tone):  # what the curves explain had stopped the rounds early
+        fit = further_rounds(models[chosen], fit, toned.solution, operator, bundle, map_, report, snapshot, journal)
     choice = with_specular_chosen(models[chosen], fit, start, operator, bundle, map_, journal)
     fit, matte = msgspec.structs.replace(fit, solution=choice.solution), choice.matte
     solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte, snapshot, journal)
@@ -187,7 +200,25 @@ def solve(
     specular_or_none = np.where(matte[:, None], 0.0, found.specular)
     solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
     held_out = {name: fit.held_out for name, fit in fits.items()}
-    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, choice.specular)
+    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, choice.specular, toned.tone)
+
+
+def with_tone_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, journal: Journal) -> Toned:
+    """The fit with a tone curve for the photos that held-out observations ask for one."""
+    if kept := journal.kept("tone", Toned):
+        return kept
+    if bundle.tone == "off" or not any(block.held_out.any() for block in blocks):
+        return Toned(fit.solution, [])
+    blocks = sampled_for(blocks, fit.solution.lights, bundle)
+    held = [held_out_of(blocks, k) for k in range(len(blocks))]
+    at = evaluated(blocks, fit.solution.materials, fit.solution.lights, operator, fit.loss, map_)
+    losses = partial(_held_out, held=held, operator=operator, loss=bundle.loss)
+    solution, evidence = toned_where_it_pays(blocks, held, at, operator, fit.loss, losses, map_)
+    return journal.keep("tone", Toned(_bare(solution), evidence))
+
+
+def _held_out(solution: Solution, held: Sequence[Block], operator, loss: Loss) -> Float[np.ndarray, "n"]:
+    return held_out_losses(held, solution.materials, solution.lights, operator, loss)
 
 
 def with_specular_chosen(
@@ -204,13 +235,10 @@ def with_specular_chosen(
         return journal.keep("choice", Chosen(before, start.matte, untried(start.matte) if start.decided.any() else []))
     blocks = sampled_for(blocks, before.lights, bundle)
     held = [held_out_of(blocks, k) for k in range(len(blocks))]
-
-    def held_out(s: Solution) -> np.ndarray:
-        return held_out_losses(held, s.materials, s.lights, operator, bundle.loss)
-
+    losses = partial(_held_out, held=held, operator=operator, loss=bundle.loss)
     at = evaluated(blocks, materials, before.lights, operator, fit.loss, map_)
     solution, matte, evidence = matte_where_it_may_be(
-        blocks, held, at, operator, fit.loss, held_out, map_, decided=start.decided, matte=start.matte
+        blocks, held, at, operator, fit.loss, losses, map_, decided=start.decided, matte=start.matte
     )
     return journal.keep("choice", Chosen(_bare(solution), matte, evidence))
 
@@ -264,6 +292,36 @@ def best_round(
     return Fit(rounds.best, rounds.held_out, rounds.loss, rounds.history)
 
 
+def further_rounds(
+    blocks: Sequence[Block],
+    fit: Fit,
+    start: Solution,
+    operator,
+    bundle: Bundle,
+    map_: Callable,
+    report: Report,
+    snapshot: Snapshot,
+    journal: Journal,
+) -> Fit:
+    """Rounds that go on from another solution than the fit's best, as if they had found it."""
+    rounds = journal.kept("further rounds", Rounds)
+    if not rounds:
+        held_out = held_out_loss(sampled_for(blocks, start.lights, bundle), start.materials, start.lights, operator, bundle.loss)
+        rounds = Rounds(start, start, held_out, np.inf, fit.loss, fit.history)
+        rounds = msgspec.structs.replace(rounds, over=_full(start.lights, bundle) or _rounds_done(rounds) >= bundle.rounds)
+    while not rounds.over:
+        rounds = journal.keep("further rounds", _next_round(blocks, rounds, operator, bundle, map_, report, (), snapshot))
+    return Fit(rounds.best, rounds.held_out, rounds.loss, rounds.history)
+
+
+def _full(lights: Sequence[Light], bundle: Bundle) -> bool:
+    return max(map(len, lights)) >= bundle.lobes
+
+
+def _rounds_done(rounds: Rounds) -> int:
+    return sum(event.phase == "round" for event in rounds.history)
+
+
 def _before_rounds(blocks: Sequence[Block], start: Start, operator, bundle: Bundle, map_: Callable) -> Rounds:
     blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
     materials, lights = start.point(blocks, operator, bundle, map_)
@@ -288,7 +346,7 @@ def _next_round(
     snapshot: Snapshot,
 ) -> Rounds:
     history, current = list(rounds.history), rounds.current
-    number = sum(event.phase == "round" for event in history)
+    number = _rounds_done(rounds)
     blocks = sampled_for(blocks, current.lights, bundle, bundle.insert)
     record = _recorder(blocks, history, operator, bundle.loss, report, snapshot)
     loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
@@ -298,7 +356,7 @@ def _next_round(
     held = record(number, "round", -1, current)
     gained, halved = rounds.held_out - held, history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
-    enough = (gained < bundle.least_gain * held and not halved) or max(map(len, current.lights)) >= bundle.lobes
+    enough = (gained < bundle.least_gain * held and not halved) or _full(current.lights, bundle)
     best = current if gained > 0 else rounds.best
     over = outdone or enough or number + 1 == bundle.rounds
     return Rounds(_bare(current), _bare(best), min(held, rounds.held_out), history[-1].loss, loss, history, bool(over))

@@ -1,7 +1,7 @@
 """Which directions of a light the data constrain: the standard error of its radiance there.
 
 Let a be the whitened response of a lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian of what is
-solved for besides the lobes (materials, exposures).  What the data say about the light's weight there, all that J could
+solved for besides the lobes (materials, exposures, tones).  What the data say about the light's weight there, all that J could
 imitate left out and the light of other directions given, is the Schur complement
 
     i_d = aᵀa − aᵀJ (JᵀJ)⁻¹ Jᵀa = ‖a‖² − ‖Qᵀa‖²,       Q an orthonormal basis of J's columns,                  (1)
@@ -64,7 +64,7 @@ def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n
 
 def _jacobians(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
     """Of each channel by all but the lobes, in the order of the block's rows; robust weights left out, since a lobe's atoms have none."""
-    unknowns = 7 * len(materials) + 6 * len(light) + len(light.log_exposure) - 1
+    unknowns = 7 * len(materials) + light.unknowns
     whole = [np.zeros((len(block), unknowns)) for _ in range(3)]
     plain = msgspec.structs.replace(loss, robust_scale=1e6)
     for m, rows in material_slices(block):

@@ -11,6 +11,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes, read_lobes
+from factorlib.solve.unknowns import TONE
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")
 AT_LEAST_0 = Annotated[float, msgspec.Meta(ge=0)]
@@ -29,12 +30,20 @@ class Gauge(msgspec.Struct, frozen=True):
     component: dict[str, int]
 
 
+class Tone(msgspec.Struct, frozen=True):
+    """The tone curve of a photo (`factorlib.images.tone`); pivot is the radiance that it leaves as it is."""
+
+    exponent: Annotated[float, msgspec.Meta(ge=TONE[0], le=TONE[1])]
+    pivot: Annotated[float, msgspec.Meta(gt=0)]
+
+
 class Model(msgspec.Struct, frozen=True):
-    """What was decided; self_shadowing_chosen_by holds the loss of each model that was tried."""
+    """What was decided; self_shadowing_chosen_by holds the loss of each model that was tried, tone the photos that have a curve."""
 
     specular: dict[str, bool] = {}
     self_shadowing: bool = False
     self_shadowing_chosen_by: dict[str, float] = {}
+    tone: dict[str, Tone] = {}
 
 
 class Table(msgspec.Struct, frozen=True):

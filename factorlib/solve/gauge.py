@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from factorlib.solve.problem import Block, connected_components
@@ -37,8 +38,7 @@ def in_gauge(materials: Materials, lights: Sequence[Light], blocks: Sequence[Blo
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
         for i in own:
-            light = lights[i]
-            lights[i] = Light(light.axis, light.log_sharpness, light.weight / factor, light.log_exposure)
+            lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
     return Materials(diffuse, specular, materials.roughness), lights
 
 

@@ -11,6 +11,7 @@ descent that follows moves the lobes off the dictionary).
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from factorlib.light.sphere import fibonacci_sphere
 from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
 from factorlib.solve.problem import Block
 from factorlib.solve.shadowing import shadowed
+from factorlib.solve.tone import slope_at
 from factorlib.solve.unknowns import Light, Materials
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
@@ -63,7 +65,8 @@ def whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sha
             parts = torch.from_numpy(diffuse[of]), operator.specular(*inputs).double()
             diffuse[of], specular[of] = shadowed(parts, block, rows[of], axis, sharpness, materials.roughness[m])
     material = block.material[rows]
-    scale = block.precision[rows] * np.exp(light.log_exposure)[block.photo[rows]][:, None]
+    scale = block.precision[rows] * slope_at(block.radiance[rows], light, block.photo[rows])
+    scale *= np.exp(light.log_exposure)[block.photo[rows]][:, None]
     return np.stack([
         scale[:, c, None] * (materials.diffuse[material, c, None] * diffuse + materials.specular[material, c, None] * specular)
         for c in range(3)
@@ -99,7 +102,7 @@ def blurred(light: Light, sharpest: float) -> Light:
     """Lobes sharper than `sharpest` at that sharpness, their energy kept."""
     log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
     kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(log_sharpness))
-    return Light(light.axis, log_sharpness, light.weight * kept[:, None], light.log_exposure)
+    return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
 
 
 def pruned(light: Light, least_share: float = 1e-5) -> Light:

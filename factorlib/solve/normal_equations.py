@@ -1,6 +1,6 @@
 """Residuals of one illumination and their normal equations.
 
-    predicted  y_ic = e_i Σ_p w_pc B_ipc,          B_ipc = k_d,c D_ip + k_s,c S_ip
+    predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc),     B_ipc = k_d,c D_ip + k_s,c S_ip,  τ the photo's tone curve
     residual   r_ic = (y_ic − radiance_ic) / σ_ic, and min(r_ic, 0) where the channel is clipped: a clipped pixel says
                                                    "at least this much"
     loss       Σ 2k² (√(1 + r²/k²) − 1)            pseudo-Huber: wrong normals and mask borders pull with bounded force
@@ -20,8 +20,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from factorlib.images.tone import by_log_exponent, curve, slope
 from factorlib.solve.problem import Block
 from factorlib.solve.shadowing import shadowed, shadowed_response
+from factorlib.solve.tone import exponents, toned
 from factorlib.solve.unknowns import Light, Materials
 
 CHUNK = 4096  # observations whose responses are held at once
@@ -78,7 +80,7 @@ def predicted_radiance(block: Block, light: Light, materials: Materials, operato
             parts = shadowed(parts, block, rows, light.axis, light.sharpness, materials.roughness[m])
         diffuse, specular = (part.double().numpy() @ light.weight for part in parts)
         radiance[rows] = exposure[rows, None] * (materials.diffuse[m] * diffuse + materials.specular[m] * specular)
-    return radiance
+    return toned(radiance, light, block.photo)
 
 
 def residuals(block: Block, predicted: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -109,8 +111,8 @@ def system(
 
     clusters: number of each observation's cluster, from 0, for `System.scores`
     """
-    p, f, m = len(light), len(light.log_exposure), len(materials)
-    size = 6 * p + f - 1
+    p, m = len(light), len(materials)
+    size = light.unknowns
     hessian = np.zeros((7 * m + size, 7 * m + size))
     gradient = np.zeros(7 * m + size)
     scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, 7 * m + size))
@@ -164,8 +166,9 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
     weight, spread = torch.from_numpy(light.weight), torch.from_numpy(light.spread)
     by_s, weight_by_s = (torch.from_numpy(slope) for slope in light.sharpness_slopes(materials.blur))
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
-    photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure))[:, 1:].double()
-    geometry, exposures = np.arange(first, first + 3 * p), np.arange(first + 6 * p, first + 6 * p + len(light.log_exposure) - 1)
+    photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure)).double()
+    end = first + 6 * p + len(light.log_exposure) - 1
+    geometry, exposures, tones = np.arange(first, first + 3 * p), np.arange(first + 6 * p, end), np.arange(end, first + light.unknowns)
     for c in range(3):
         kd, ks = materials.diffuse[m, c], materials.specular[m, c]
         basis = kd * r["diffuse"] + ks * r["specular"]
@@ -177,9 +180,11 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
             columns = [column + also for column, also in zip(columns, shading, strict=True)]
         by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
         columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / spread]
-        predicted = basis @ weight[:, c]
+        linear = basis @ weight[:, c]
+        predicted, rising, by_tone = _toned_with_slopes(linear, block, rows, light)
         own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]
-        jacobian = torch.cat([*columns, photos * predicted[:, None], torch.stack(own, 1)], 1)
+        jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * rising
+        jacobian = torch.cat([jacobian, photos * by_tone], 1) if len(light.log_tone) else jacobian
         precision = torch.from_numpy(block.precision[rows, c])
         difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
         satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
@@ -187,9 +192,18 @@ def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials,
         root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
         pull = (fit / root * ~satisfied).sqrt()
         weights = np.arange(first + (3 + c) * p, first + (4 + c) * p)
-        places = np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6]])
+        places = np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6], tones])
         lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
         yield Channel(places, jacobian * (precision * pull)[:, None], residual * pull, lost)
+
+
+def _toned_with_slopes(linear: Float[torch.Tensor, "n"], block: Block, rows: slice, light: Light):
+    """Radiance [n] as the photos show it, and its slopes [n, 1] by linear radiance and by the log exponents."""
+    if len(light.log_tone) == 0:
+        return linear, 1.0, 0.0
+    x, exponent = linear.clamp(min=0).numpy()[:, None], exponents(light, block.photo[rows])
+    shown, rising, by_tone = (torch.from_numpy(of(x, exponent)) for of in (curve, slope, by_log_exponent))
+    return shown[:, 0], rising, by_tone
 
 
 def _prior(block: Block, light: Light, loss: Loss):

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from factorlib.solve.normal_equations import Loss, operator_inputs, predicted_radiance, residuals, robust_loss
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.shadowing import shadowed
+from factorlib.solve.tone import slope_at, straightened
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, Light, Materials
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
@@ -43,7 +44,7 @@ def _searched(of: tuple[int, list[Block]], materials: Materials, lights: Sequenc
     if not pairs:
         return present
     weight = np.concatenate([_weight(voters, light, materials, operator, loss) for voters, light in pairs])
-    radiance = np.concatenate([voters.radiance for voters, _ in pairs])
+    radiance = np.concatenate([straightened(voters.radiance, light, voters.photo) for voters, light in pairs])
     trials = []
     for roughness in (present[2], *GRID):
         diffuse, specular = (np.concatenate(part) for part in zip(*(_lit(*pair, roughness, operator) for pair in pairs), strict=True))
@@ -58,9 +59,10 @@ def _voters(block: Block, m: int) -> Block:
 
 
 def _weight(voters: Block, light: Light, materials: Materials, operator, loss: Loss) -> Float[np.ndarray, "n 3"]:
-    """Roots of weights: outliers of the present model count little, clipped channels not at all."""
+    """Roots of weights of linear radiance: outliers of the present model count little, clipped channels not at all."""
     _, robust = robust_loss(residuals(voters, predicted_radiance(voters, light, materials, operator)), loss.robust_scale)
-    return np.where(voters.clipped, 0.0, voters.precision * np.sqrt(robust))
+    precision = voters.precision * slope_at(voters.radiance, light, voters.photo)
+    return np.where(voters.clipped, 0.0, precision * np.sqrt(robust))
 
 
 def _lit(voters: Block, light: Light, roughness: float, operator) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What is solved for: materials (shared), and lights with their lobes and exposures (one per illumination).
+"""What is solved for: materials (shared), and lights with their lobes, exposures and tones (one per illumination).
 
 A lobe's unknowns are chosen so that what the data hold fixed stays put while another unknown moves: its energy
 e = w/λ' rather than its peak w, λ' = λ/(1 − e^{−2λ}), and
@@ -19,6 +19,7 @@ from factorlib.light.lobes import lobe_integral
 
 ROUGHNESS = (0.1, 1.0)  # the operators' domain
 SHARPNESS = (0.1, 2000.0)  # from nearly constant to 1.3° wide, about a texel of the exported map
+TONE = (0.4, 2.5)  # exponents of tone curves
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
@@ -50,12 +51,16 @@ class Materials(msgspec.Struct, frozen=True):
 
 
 class Light(msgspec.Struct, frozen=True):
-    """p lobes w·exp(λ(ω·z − 1)) of one illumination and the log exposures of its f photos (the first is 0)."""
+    """p lobes w·exp(λ(ω·z − 1)) of one illumination and the log exposures of its f photos (the first is 0).
+
+    log_tone: log exponents of the photos' tone curves (`images.tone`); none where the photos are taken to be linear
+    """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
     log_sharpness: Float[np.ndarray, "p"]
     weight: Float[np.ndarray, "p 3"]  # in the illumination's own radiance unit
     log_exposure: Float[np.ndarray, "f"]
+    log_tone: Float[np.ndarray, "f"] = msgspec.field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
@@ -86,8 +91,8 @@ class Light(msgspec.Struct, frozen=True):
         doubled = np.maximum(2 * self.sharpness, 1e-9)
         return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
 
-    def moved(self, step: Float[np.ndarray, "6p+f-1"], blur: float) -> Light:
-        """Apply a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, then exposures 1…f−1; blur is b."""
+    def moved(self, step: Float[np.ndarray, "l"], blur: float) -> Light:
+        """Apply a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
         p = len(self)
         by = step[: 6 * p].reshape(6, p)
         first, second = self.tangents()
@@ -95,21 +100,28 @@ class Light(msgspec.Struct, frozen=True):
         axis = self.axis + turn[0][:, None] * first + turn[1][:, None] * second
         variance = (1 / self.sharpness + blur) * np.exp(-np.clip(by[2], -1, 1)) - blur
         log_sharpness = -np.log(np.clip(variance, 1 / SHARPNESS[1], 1 / SHARPNESS[0]))
+        by_exposure, by_tone = np.split(step[6 * p :], [len(self.log_exposure) - 1])
         return Light(
             axis / np.linalg.norm(axis, axis=1, keepdims=True),
             log_sharpness,
             np.maximum(self.energy + by[3:].T, 0.0) / (lobe_integral(np.exp(log_sharpness))[:, None] / (2 * np.pi)),
-            self.log_exposure + np.concatenate([[0.0], np.clip(step[6 * p :], -1, 1)]),
+            self.log_exposure + np.concatenate([[0.0], np.clip(by_exposure, -1, 1)]),
+            np.clip(self.log_tone + np.clip(by_tone, -0.2, 0.2), *np.log(TONE)),
         )
 
     def take(self, rows) -> Light:
-        return Light(self.axis[rows], self.log_sharpness[rows], self.weight[rows], self.log_exposure)
+        return msgspec.structs.replace(self, axis=self.axis[rows], log_sharpness=self.log_sharpness[rows], weight=self.weight[rows])
 
     def joined(self, axis, log_sharpness, weight) -> Light:
         """With further lobes appended."""
-        return Light(
-            np.vstack([self.axis, axis]),
-            np.concatenate([self.log_sharpness, log_sharpness]),
-            np.vstack([self.weight, weight]),
-            self.log_exposure,
+        return msgspec.structs.replace(
+            self,
+            axis=np.vstack([self.axis, axis]),
+            log_sharpness=np.concatenate([self.log_sharpness, log_sharpness]),
+            weight=np.vstack([self.weight, weight]),
         )
+
+    @property
+    def unknowns(self) -> int:
+        """How many: the length of a step."""
+        return 6 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)

@@ -75,7 +75,9 @@ def _light(earlier: Earlier, block: Block) -> Light | None:
     if not lobes or np.isnan(exposure).all():
         return None
     axis = lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True)
-    return Light(axis, np.log(np.clip(lobes.sharpness, *SHARPNESS)), lobes.weight / block.unit, exposure)
+    tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
+    log_tone = np.log(tone) if len(tone) == len(block.photos) else np.zeros(0)
+    return Light(axis, np.log(np.clip(lobes.sharpness, *SHARPNESS)), lobes.weight / block.unit, exposure, log_tone)
 
 
 def _point(
@@ -209,7 +211,7 @@ def with_exposures(light: Light, block: Block, materials: Materials, operator) -
         if rows.any():
             guess.log_exposure[k] = np.log(_brighter(of_rows(block, rows), guess, materials, operator)).mean()
     first = guess.log_exposure[0]
-    return Light(light.axis, light.log_sharpness, light.weight * np.exp(first), guess.log_exposure - first)
+    return msgspec.structs.replace(light, weight=light.weight * np.exp(first), log_exposure=guess.log_exposure - first)
 
 
 def _brighter(block: Block, light: Light, materials: Materials, operator) -> Float[np.ndarray, "3"]:

@@ -6,6 +6,7 @@ channels that are already explained, and outliers, carry the weights of the curr
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
@@ -24,7 +25,7 @@ def refitted_weights(light: Light, equations: System) -> Light:
         hessian = equations.light_hessian[own, own]
         target = hessian @ energy[:, c] - equations.light_gradient[own]
         energy[:, c] = nonnegative_minimum(hessian, target)
-    return Light(light.axis, light.log_sharpness, energy / light.spread[:, None], light.log_exposure)
+    return msgspec.structs.replace(light, weight=energy / light.spread[:, None])
 
 
 def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:

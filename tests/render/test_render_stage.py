@@ -7,7 +7,8 @@ import torch
 from factorlib.conventions import FRONT
 from factorlib.export.materials import materials_of_table
 from factorlib.images.exr import read_exr, read_rgb_exr
-from factorlib.jsonfile import read_json
+from factorlib.images.tone import curve
+from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes, write_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.stage import silent
@@ -79,3 +80,19 @@ def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
         lobes.write_bytes(before)
     assert "nothing is known of its light" in caplog.text
     assert not read_rgb_exr(out / "resynthesis" / "front.exr").any()
+
+
+def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(made, tmp_path):
+    inputs, _ = made
+    straight = run(made, "front", tmp_path / "straight")
+    file = inputs["solve"] / "materials.json"
+    before, solved = file.read_bytes(), read_json(file)
+    try:
+        write_json(file, solved | {"model": {"tone": {"front": {"exponent": 1.5, "pivot": 0.3}, "side": {"exponent": 2.0, "pivot": 1.0}}}})
+        curved = run(made, "front", tmp_path / "curved")
+    finally:
+        file.write_bytes(before)
+    linear, shown = (read_rgb_exr(of / "resynthesis" / "front.exr") for of in (straight, curved))
+    np.testing.assert_allclose(shown, 0.3 * curve(linear / 0.3, 1.5), rtol=1e-4, atol=1e-6)
+    other = [p for p in straight.rglob("*.exr") if "resynthesis" not in p.parts]
+    assert all(p.read_bytes() == (curved / p.relative_to(straight)).read_bytes() for p in other)

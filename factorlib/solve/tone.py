@@ -1,0 +1,30 @@
+"""The tone curves of a light's photos (`factorlib.images.tone`), one exponent a photo; the identity where the light has none."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.images.tone import curve, inverse, slope
+from factorlib.solve.unknowns import Light
+
+
+def toned(linear: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
+    """Radiance as the photos show it."""
+    return linear if len(light.log_tone) == 0 else curve(np.maximum(linear, 0.0), exponents(light, photo))
+
+
+def straightened(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
+    """Linear radiance of what the photos show."""
+    return radiance if len(light.log_tone) == 0 else inverse(radiance, exponents(light, photo))
+
+
+def slope_at(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"] | float:
+    """By how much what a photo shows grows with linear radiance, where it shows `radiance`."""
+    if len(light.log_tone) == 0:
+        return 1.0
+    return slope(straightened(radiance, light, photo), exponents(light, photo))
+
+
+def exponents(light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 1"]:
+    return np.exp(light.log_tone)[photo][:, None]

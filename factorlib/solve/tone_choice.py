@@ -1,0 +1,79 @@
+"""Whether the photos of a light have a tone curve: where held-out observations are explained better with one.
+
+An exponent for each photo is let loose where one Gauss-Newton step of everything promises a gain from it.  Then the problem is
+brought to rest with and without, by as many iterations, and the lights whose own held-out loss falls by `LEAST_GAIN` of itself
+keep their curves.  A light that has curves already, from an earlier solution, keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.problem import Block
+from factorlib.solve.step import damped_step
+from factorlib.solve.unknowns import Light
+
+PROMISED = 0.02  # of the fitted loss, below which no curve is tried
+LEAST_GAIN = 0.03  # of its own held-out loss, that a light's curves must be worth
+ITERATIONS = 6
+DAMPING = 1e-3
+
+
+class Tone(msgspec.Struct, frozen=True):
+    """What decided about the photos of a light: their held-out loss with and without tone curves, None where none was tried."""
+
+    kept: bool
+    held_out_loss_with: float | None = None
+    held_out_loss_without: float | None = None
+
+
+def toned_where_it_pays(
+    blocks: Sequence[Block], held: Sequence[Block], start: Solution, operator, loss, losses: Callable, map_: Callable
+) -> tuple[Solution, list[Tone]]:
+    """The solution with the tone curves that it needs, and the evidence for every light.
+
+    held: the held-out observations, block by block;  losses: those of a solution, one of each held-out observation
+    """
+
+    def rested(lights: Sequence[Light]) -> Solution:
+        at = evaluated(blocks, start.materials, lights, operator, loss, map_)
+        return descend(blocks, at, operator, loss, Descent(ITERATIONS), map_)
+
+    had = np.array([len(light.log_tone) > 0 for light in start.lights])
+    without = descend(blocks, start, operator, loss, Descent(ITERATIONS), map_)
+    if promised_gain(blocks, without, operator, loss, map_) < PROMISED:
+        return without, [Tone(bool(has)) for has in had]
+    found = rested(loosened(start.lights, ~had))
+    with_, without_ = (_of_each_light(losses(s), held) for s in (found, without))
+    kept = (with_ < (1 - LEAST_GAIN) * without_) & ~had
+    chosen = without if not kept.any() else found if (kept | had).all() else rested(loosened(start.lights, kept))
+    evidence = zip((kept | had).tolist(), with_.tolist(), without_.tolist(), had, strict=True)
+    return chosen, [Tone(True) if has else Tone(*decided) for *decided, has in evidence]
+
+
+def promised_gain(blocks: Sequence[Block], at: Solution, operator, loss, map_: Callable) -> float:
+    """The share of the loss that one step of everything gains more with tone curves for all than without."""
+    none = np.array([len(light.log_tone) == 0 for light in at.lights])
+    loose = evaluated(blocks, at.materials, loosened(at.lights, none), operator, loss, map_)
+    steps = [damped_step(s.systems, s.materials, s.lights, DAMPING).promised for s in (at, loose)]
+    return (steps[1] - steps[0]) / max(at.loss, 1e-300)
+
+
+def loosened(lights: Sequence[Light], which: Bool[np.ndarray, "k"]) -> list[Light]:
+    """The lights, those of `which` with a curve for each photo, a straight one."""
+    return [_straight(light) if one else light for light, one in zip(lights, which, strict=True)]
+
+
+def _of_each_light(losses: Float[np.ndarray, "n"], held: Sequence[Block]) -> Float[np.ndarray, "k"]:
+    """The mean over each light's observations, 0 for none."""
+    parts = np.split(losses, np.cumsum([len(block) for block in held])[:-1])
+    return np.array([part.mean() if len(part) else 0.0 for part in parts])
+
+
+def _straight(light: Light) -> Light:
+    return msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))

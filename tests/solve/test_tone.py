@@ -1,0 +1,71 @@
+"""Photos whose files are not as linear as they say: the curves are found, and where there are none, none are."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.images.tone import curve
+from factorlib.reflection import reflection_operator
+from factorlib.solve.bundle import Bundle, solve
+from factorlib.stage import serial_map
+from tests.solve.problems import MATERIALS, block, factor_between, random_light
+
+OPERATOR = reflection_operator("network")
+QUICK = Bundle(lobes=8, insert=4, rounds=3, iterations=8, polish=15, tolerance=1e-4)
+
+
+def rooms(photos=1):
+    rng = np.random.default_rng(3)
+    return [block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=12, seed=i) for i in range(3)]
+
+
+def through(data, *exponents):
+    """What cameras with tone curves make of it, one exponent a photo."""
+    shown = curve(data.radiance, np.array(exponents)[data.photo][:, None])
+    return msgspec.structs.replace(data, radiance=shown, precision=1 / np.hypot(0.05, 0.05 * shown))
+
+
+def solved(blocks, **how):
+    joint = solve(blocks, len(MATERIALS), OPERATOR, msgspec.structs.replace(QUICK, **how), serial_map, lambda event: None)
+    return joint, [np.exp(light.log_tone) for light in joint.solution.lights]
+
+
+def error_of(joint):
+    found = joint.solution.materials
+    return np.abs(found.diffuse * factor_between(found, MATERIALS) - MATERIALS.diffuse).max()
+
+
+@pytest.fixture(scope="module")
+def curved():
+    return [through(data, exponent) for data, exponent in zip(rooms(), (1.3, 0.8, 1.0), strict=True)]
+
+
+@pytest.fixture(scope="module")
+def found(curved):
+    return solved(curved)
+
+
+def test_curves_are_found_and_spare_the_materials(curved, found):
+    joint, exponents = found
+    without, none = solved(curved, tone="off")
+    np.testing.assert_allclose([float(e[0]) if len(e) else 1.0 for e in exponents], (1.3, 0.8, 1.0), rtol=0.05)
+    assert all(len(e) == 0 for e in none)
+    assert error_of(joint) < 0.3 * error_of(without)
+
+
+def test_the_evidence_is_that_held_out_losses_fall(found):
+    told = found[0].tone
+    assert [one.kept for one in told][:2] == [True, True]
+    assert all(one.kept == (one.held_out_loss_with < 0.97 * one.held_out_loss_without) for one in told)
+
+
+def test_photos_of_one_light_have_a_curve_each():
+    blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2))]
+    _, exponents = solved(blocks)
+    np.testing.assert_allclose(exponents[0], (1.0, 1.3), rtol=0.05)
+
+
+def test_linear_photos_stay_linear_and_say_why():
+    joint, exponents = solved(rooms())
+    assert all(len(e) == 0 for e in exponents)
+    assert [told.kept for told in joint.tone] == [False] * 3
