@@ -13,7 +13,7 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from factorlib.align.refine import refined
 from factorlib.align.state import State

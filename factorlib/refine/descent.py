@@ -13,24 +13,26 @@ hold the pose where it is.  J is taken from normals of poses a little to either 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.align.camera import Camera
-from factorlib.align.evidence import labelled_iou
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.raster import Caster
 from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
 from factorlib.align.state import State
-from factorlib.align.target import Target
+from factorlib.align.target import Target, target_of
 from factorlib.refine.light import pursued_light, robust_scale, whitened_residuals, with_weights
+from factorlib.refine.pixels import View
 from factorlib.solve.insertion import whitened_atoms
 from factorlib.solve.normal_equations import predicted_radiance, robust_losses
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.unknowns import Light, Materials
 
+RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as of `factorlib.align.target`
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
 EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
 DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
@@ -52,6 +54,18 @@ class Moving(msgspec.Struct, frozen=True):
         return labelled_iou(self.target.evidence, self.caster.labels(hits))
 
 
+def moving_object(view: View, number: int, poses: Sequence[Pose], camera: Camera, evidence: Evidence, prior: FocalPrior) -> Moving:
+    """Object `number` of a photo, the others staying at their `poses`."""
+    caster = view.casters[number]
+
+    def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, "n"]]:
+        own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
+        seen = view.seen(own, posed)
+        return view.block(own, seen, like, posed), seen.agrees
+
+    return Moving(caster, target_of(evidence, caster.mesh.labels, RESOLUTION, MARGIN), camera, prior, block)
+
+
 def descended(moving: Moving, start: State, materials: Materials, operator, steps: int, most_lost: float) -> State:
     """The state, of those met in `steps` steps from `start`, whose fitted pixels are explained best while the labelled
     IoU is at most `most_lost` below that of the start."""
@@ -63,7 +77,7 @@ def descended(moving: Moving, start: State, materials: Materials, operator, step
         fit = of_rows(every, agrees & ~every.held_out)
         if len(fit) == 0:
             break
-        light = pursued_light(fit, materials, operator) if k % 4 == 0 else with_weights(fit, light, materials, operator)
+        light = pursued_light(fit, materials, operator) if k in (0, steps // 2) else with_weights(fit, light, materials, operator)
         residual = whitened_residuals(fit, light, materials, operator)
         scale = robust_scale(residual) if k == 0 else scale
         loss = float(robust_losses(residual, scale).mean())

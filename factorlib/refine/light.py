@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from factorlib.solve.insertion import lobes_inserted, pruned, whitened_atoms
 from factorlib.solve.normal_equations import predicted_radiance, residuals
-from factorlib.solve.problem import Block
+from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import nonnegative_minimum
@@ -25,6 +25,7 @@ RIDGE = 1e-4  # of the squared response of each lobe
 
 def pursued_light(block: Block, materials: Materials, operator) -> Light:
     """Explains what of the block is not held out."""
+    block = of_rows(block, ~block.held_out)
     light = starting_light(block, materials)
     for number in range(ROUNDS):
         light = lobes_inserted(block, light, materials, operator, INSERTED, number)
