@@ -23,10 +23,12 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
+AS_IT_IS = (1.0, 1.0, 1.0)
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
 
 
@@ -64,11 +66,13 @@ def things_of(
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        caster = Caster(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg))
+        before = earlier.objects.get(thing.name) if earlier and not thing.pose else None
+        scale = before.scale if before else AS_IT_IS
+        caster = Caster(scaled(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         pose = Pose(np.array(thing.pose.rotation), np.array(thing.pose.translation)) if thing.pose else None
-        before = earlier.objects.get(thing.name) if earlier else None
-        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing), before.as_found() if before else None))
+        found = before.as_found() if before else None
+        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing), found, scale))
     return things
 
 
@@ -102,6 +106,7 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> d
     reasons = doubts(iou, agreement, trust, found, params)
     return {
         **pose_entry(pose),
+        "scale": list(thing.scale),
         "silhouette_iou": iou,
         "label_agreement": agreement,
         "source": source_of(found),

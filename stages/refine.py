@@ -14,12 +14,12 @@ from factorlib.align.camera import Camera, angle_between
 from factorlib.align.earlier import EarlierPhoto
 from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.raster import Caster, rasterise
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import UNKNOWN_FOCAL, focal_prior, normal_difference
+from factorlib.align.search import normal_difference, prior_before
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.refine.choice import Standards
 from factorlib.refine.materials import known_materials
@@ -64,20 +64,14 @@ def scene_of(inputs: Inputs, photo: dict, entry: dict, shadows: int) -> Scene:
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, said, pose = slice_.meshes[thing.mesh], entry["objects"][thing.name], found.objects[thing.name]
         file = inputs.file(mesh.file)
-        caster = Caster(read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials))
+        caster = Caster(scaled(read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials), pose.scale))
         evidence, other = object_evidence(photo, number, caster.mesh.labels, thing.mask is not None), pose.runner_up
         moves = said["source"] != "given"
         things.append(Thing(caster, evidence, pose.pose(), other.pose() if other else None, moves, not said["left_out"]))
     height, width = photo["label"].shape
     camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
-    return Scene(camera, things, prior_of(entry["camera"]["focal_source"], read_json(inputs["masks"] / f"{inputs.photo}.json"), camera), shadows)
-
-
-def prior_of(source: str, facts: dict, camera: Camera) -> FocalPrior:
-    """What was known of the focal length before `align` looked: EXIF counts only where it stood."""
-    if source == facts["focal_source"]:
-        return focal_prior(facts["focal_px"], source, camera.width, camera.height)
-    return FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
+    facts = read_json(inputs["masks"] / f"{inputs.photo}.json")
+    return Scene(camera, things, prior_before(entry["camera"]["focal_source"], facts["focal_px"], facts["focal_source"], width, height), shadows)
 
 
 def told(thing: Thing, result: Refined, camera: Camera) -> dict:

@@ -1,4 +1,4 @@
-"""Poses of an earlier result, by photo and object: poses.json of a folder that `align` or `refine` wrote."""
+"""Poses of an earlier result, by photo and object: poses.json of a folder that `align`, `fit_mesh` or `refine` wrote."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from factorlib.jsonfile import read_json
 FILE = "poses.json"
 Vec3 = tuple[float, float, float]
 POSITIVE = Annotated[float, msgspec.Meta(gt=0)]
+Factors = tuple[POSITIVE, POSITIVE, POSITIVE]
 ROTATION_ERROR = 1e-3  # of RᵀR from the identity
 
 
@@ -38,8 +39,9 @@ class EarlierRunnerUp(EarlierPose, frozen=True):
 
 
 class EarlierObject(EarlierPose, frozen=True):
-    """What is used of an object's entry."""
+    """What is used of an object's entry; x_cam = rotation · (scale ∘ x_object) + translation."""
 
+    scale: Factors = (1.0, 1.0, 1.0)
     runner_up: EarlierRunnerUp | None = None
 
     def as_found(self) -> Earlier:
@@ -90,4 +92,4 @@ def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "
 
 
 def _unfit(path: Path, found: str, key: str | None = None) -> InputError:
-    return InputError(f"no poses to start from: {found}", file=path, key=key, cure="name the folder of a result of `align` or `refine`")
+    return InputError(f"no poses to start from: {found}", file=path, key=key, cure="name the folder of a result of `align`, `fit_mesh` or `refine`")

@@ -60,6 +60,7 @@ class Thing(msgspec.Struct, frozen=True):
     pose: Pose | None = None
     keypoints: Keypoints | None = None
     earlier: Earlier | None = None
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the caster's mesh, against the file's
 
 
 class Placed(msgspec.Struct, frozen=True):

@@ -3,7 +3,8 @@
 Every candidate gets a light of its own from the pixels that are fitted, with weights of the same lobes, and all are judged on the
 pixels held out, those that every candidate shows.  A candidate replaces the pose found only where it lowers the held-out loss by
 `least_gain` of itself and by SURE standard errors of that difference, cells being independent, and where it leaves the
-silhouette as it was but for `most_lost` of it (`rival` for the runner-up).  The same decides whether a runner-up is ruled out.
+silhouette as it was but for `most_lost` of it (`rival` for the runner-up).  Where the silhouette fits better by more than
+`most_lost`, two witnesses agree and the gain alone is enough.  The same decides whether a runner-up is ruled out.
 """
 
 from __future__ import annotations
@@ -130,7 +131,8 @@ def gain_of(before: Float[np.ndarray, "n"], after: Float[np.ndarray, "n"], cell:
 
 def is_better(one: Judged, than: Judged, standards: Standards) -> bool:
     """Whether shading settles for `one`."""
-    gain = one.gain - than.gain
-    stderr = np.hypot(one.gain_stderr, than.gain_stderr)
+    gain, more = one.gain - than.gain, one.score - than.score
+    stderr = float(np.hypot(one.gain_stderr, than.gain_stderr))
     lost = standards.rival if "runner_up" in (one.name, than.name) else standards.most_lost
-    return gain > max(standards.least_gain, SURE * stderr) and one.score >= than.score - lost
+    agreed = more > standards.most_lost or gain > SURE * stderr
+    return gain > standards.least_gain and agreed and more >= -lost

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from factorlib.reflection import reflection_operator
 from factorlib.refine.descent import projected_equations
 from factorlib.refine.light import pursued_light, together, whitened_residuals, with_weights
+from factorlib.reflection import reflection_operator
 from factorlib.solve.insertion import whitened_atoms
 from tests.solve.problems import MATERIALS, block, random_light
 

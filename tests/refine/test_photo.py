@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.refine import TRUE, KINDS, normal_error, photographed, refined_of
+from benchmarks.refine import KINDS, TRUE, normal_error, photographed, refined_of
 from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior
 from factorlib.refine.photo import Scene, Thing, refined_photo

@@ -114,4 +114,4 @@ def test_a_folder_without_poses_is_refused(tmp_path, text, words):
     (tmp_path / "poses.json").write_text(text)
     with pytest.raises(InputError) as caught:
         read_earlier(tmp_path)
-    assert words in str(caught.value) and "poses.json" in str(caught.value) and "result of `align` or `refine`" in str(caught.value)
+    assert words in str(caught.value) and "poses.json" in str(caught.value) and "result of `align`, `fit_mesh` or `refine`" in str(caught.value)
