@@ -51,9 +51,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     results = refined_photo(scene, pixels, materials, operator, params, lambda done, total: progress(done, total, name))
     for (thing, said), each, of in zip(entry["objects"].items(), results, scene.things, strict=True):
         said |= told(of, each, scene.camera)
-        if each.settled and each.settled.chosen != "found":
-            log.info("%s: %s: %s", name, thing, said["refined"])
-    entry["camera"]["focal_px"] = float(results[0].after.camera(scene.camera).focal) if results else entry["camera"]["focal_px"]
+        if each.moved:
+            log.warning("%s: shading moves %s by %.1f°", name, thing, said["refined"]["moved"]["rotation_deg"])
+            entry["camera"]["focal_px"] = float(each.after.camera(scene.camera).focal)
     write_json(out / f"{name}.json", entry)
 
 
@@ -76,13 +76,15 @@ def scene_of(inputs: Inputs, photo: dict, entry: dict, shadows: int) -> Scene:
 
 def told(thing: Thing, result: Refined, camera: Camera) -> dict:
     """What changes in the object's entry of poses.json, and in `refined` what decided."""
-    now, verdict = result.after.camera(camera), result.settled
-    pose = result.after.pose(thing.caster)
-    entry = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+    entry, verdict = {}, result.settled
     if verdict is None:
-        return entry | {"refined": None}
+        return {"refined": None}
     if verdict.chosen == "runner_up" or verdict.ruled_out:
         entry["runner_up"] = None  # shading has decided between the two
+    if result.moved:
+        pose, seen = result.after.pose(thing.caster), result.after.camera(camera)
+        entry |= {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+        entry["silhouette_iou"] = silhouette_iou(thing.evidence, rasterise(thing.caster, seen, pose).label)
     target = target_of(thing.evidence, thing.caster.mesh.labels, 200, 0.1)
     moved = {
         "rotation_deg": angle_between(result.after.rotation, result.before.rotation),
@@ -92,6 +94,5 @@ def told(thing: Thing, result: Refined, camera: Camera) -> dict:
         name: {"held_out_loss": c.held_out_loss, "gain": c.gain, "gain_stderr": c.gain_stderr, "score": c.score}
         for name, c in verdict.candidates.items()
     }
-    iou = silhouette_iou(thing.evidence, rasterise(thing.caster, now, pose).label)
     evidence = {"chosen": verdict.chosen, "runner_up_ruled_out": verdict.ruled_out, "moved": moved, "candidates": candidates}
-    return entry | {"silhouette_iou": iou, "refined": evidence}
+    return entry | {"refined": evidence}

@@ -117,8 +117,15 @@ def placed(
             sigma = found[k].log_focal_sigma
             camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [thing.pose or found[k].state.pose(thing.caster) for k, thing in enumerate(things)]
+    poses = [_pose(thing, found.get(k)) for k, thing in enumerate(things)]
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))], beforehand)
+
+
+def _pose(thing: Thing, found: Found | None) -> Pose:
+    """What was said or found before is used to the last digit."""
+    if thing.pose is None and thing.earlier is None:
+        return found.state.pose(thing.caster)
+    return thing.pose or thing.earlier.pose
 
 
 def _found_before(thing: Thing, camera: Camera, sigma: float, search: Search) -> Found:

@@ -40,11 +40,15 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 class Refined(msgspec.Struct, frozen=True):
-    """An object's pose now, as a state from which the camera follows too, as it was, and what decided (None: it was not tried)."""
+    """An object's pose as it was and now, as states from which the camera follows too, and what decided (None: it was not tried)."""
 
     before: State
     after: State
     settled: Settled | None
+
+    @property
+    def moved(self) -> bool:
+        return self.settled is not None and self.settled.chosen != "found"
 
 
 def refined_photo(
@@ -58,7 +62,7 @@ def refined_photo(
     """Every object, in order; `pixels` is None where the photo shows too few."""
     things, camera, poses = scene.things, scene.camera, [thing.pose for thing in scene.things]
     before = [state_of(thing.pose, camera, thing.caster) for thing in things]
-    decided: list[Settled | None] = [None] * len(things)
+    results = [Refined(state, state, None) for state in before]
     prior = scene.prior if len(things) == 1 else FocalPrior(camera.focal, 0.0)
     for done, k in enumerate(by_pixels(things)):
         report(done, len(things))
@@ -67,12 +71,12 @@ def refined_photo(
         view = View(pixels, [thing.caster for thing in things], [j == k or thing.trusted for j, thing in enumerate(things)], scene.shadows)
         moving = moving_object(view, k, poses, camera, things[k].evidence, prior)
         rival = state_of(things[k].runner_up, camera, things[k].caster) if things[k].runner_up else None
-        decided[k] = settled(moving, before[k], rival, materials, operator, pixels.cell, standards)
-        if decided[k] is not None:
-            state = decided[k].candidates[decided[k].chosen].state
-            poses[k], camera = state.pose(things[k].caster), state.camera(camera)
-    after = [state_of(pose, camera, thing.caster) for pose, thing in zip(poses, things, strict=True)]
-    return [Refined(*each) for each in zip(before, after, decided, strict=True)]
+        verdict = settled(moving, before[k], rival, materials, operator, pixels.cell, standards)
+        if verdict is not None:
+            results[k] = Refined(before[k], verdict.candidates[verdict.chosen].state, verdict)
+        if results[k].moved:
+            poses[k] = results[k].after.pose(things[k].caster)
+    return results
 
 
 def by_pixels(things: Sequence[Thing]) -> list[int]:

@@ -140,7 +140,7 @@ def test_an_earlier_pose_and_focal_length_are_used_as_they_are(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair())
     entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera))[1]
     thing = entry["objects"]["thing"]
-    assert np.allclose(thing["rotation"], pose.rotation, atol=1e-12) and np.allclose(thing["translation"], pose.translation)
+    assert thing["rotation"] == pose.rotation.tolist() and thing["translation"] == pose.translation.tolist()
     assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["focal_source"] == "estimated"
     assert thing["source"] == "refined" and thing["score"] > 0.97 and thing["doubts"] == [] and thing["runner_up"] is None
 

@@ -83,8 +83,8 @@ def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
     write_json(tmp_path / "refined" / "poses.json", {"a": entry})
     again = msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": tmp_path / "refined"})
     thing_again = run(align, again, tmp_path / "aligned")["objects"]["thing"]
-    assert np.allclose(thing_again["rotation"], thing["rotation"], atol=1e-12) and thing_again["source"] == "refined"
-    assert np.allclose(thing_again["translation"], thing["translation"], atol=1e-9) and not thing_again["left_out"]
+    assert all(thing_again[name] == thing[name] for name in ("rotation", "translation")) and thing_again["source"] == "refined"
+    assert not thing_again["left_out"]
 
 
 def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, caplog):
@@ -97,7 +97,7 @@ def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, capl
     for entry in (given, run(refine, inputs, unknown / "out")):
         thing = entry["objects"]["thing"]
         assert thing["refined"] is None
-        assert np.allclose(thing["rotation"], turned.pose.rotation, atol=1e-12) and np.allclose(thing["translation"], turned.pose.translation)
+        assert {name: thing[name] for name in ("rotation", "translation")} == pose_entry(turned.pose)
     assert "too few pixels of known materials" in caplog.text
 
 
