@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from factorlib.align import proportions as module
 from factorlib.align.evidence import Evidence
 from factorlib.align.proportions import SHAPES, Sighting, jacobian_with_shape, proportions
 from factorlib.align.raster import Caster, rasterise
@@ -72,6 +73,26 @@ def test_what_one_photo_asks_for_and_another_does_not_is_not_used():
     other, _ = sightings(scaled(chair(), (1.15, 1, 1)), chair(), count=1, seed=21)
     verdict = proportions(exact + other)
     assert not verdict.used and verdict.held_out_after > 0.8 * verdict.held_out_before
+
+
+def test_photos_are_judged_by_factors_that_they_had_no_say_in(monkeypatch):
+    shown, _ = sightings(chair(), scaled(chair(), (1.15, 1, 1)), count=5)
+    fit, judge, fits, judged = module.fitted, module.unexplained, [], []
+
+    def spied_fit(ones, steps):
+        fits.append((ones, fit(ones[:1], 1).factors))
+        return module.Fitted(fits[-1][1], [one.state for one in ones])
+
+    def spied_judge(one, factors, steps):
+        judged.append((one, factors))
+        return judge(one, factors, 1)
+
+    monkeypatch.setattr(module, "fitted", spied_fit)
+    monkeypatch.setattr(module, "unexplained", spied_judge)
+    proportions(shown)
+    for one, factors in judged:
+        assert all(one is not other for ones, of in fits if of is factors for other in ones)
+    assert sum(factors.tolist() != [1.0] * 3 for _, factors in judged) == len(shown)
 
 
 def test_image_points_move_by_the_derivative():
