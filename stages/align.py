@@ -10,6 +10,7 @@ import numpy as np
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
+from factorlib.align.earlier import EarlierPhoto, read_earlier
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
@@ -22,10 +23,12 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
+AS_IT_IS = (1.0, 1.0, 1.0)
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
 
 
@@ -40,8 +43,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name = inputs.photo
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
-    things = things_of(slice_, channels, inputs, params)
-    result = placed(things, camera_of(slice_.camera, facts), facts["focal_px"], facts["focal_source"], name, params.search)
+    earlier = read_earlier(inputs["poses"]).get(name) if "poses" in inputs.folders else None
+    things = things_of(slice_, channels, inputs, params, earlier)
+    focal, before = (facts["focal_px"], facts["focal_source"]), earlier.focal if earlier else None
+    result = placed(things, camera_of(slice_.camera, facts), *focal, name, params.search, before)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
@@ -53,15 +58,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / f"{name}.json", {"camera": camera_entry(result), "objects": objects})
 
 
-def things_of(slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params) -> list[Thing]:
+def things_of(
+    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, earlier: EarlierPhoto | None = None
+) -> list[Thing]:
+    """Every object of the photo; poses that dataset.yaml gives go before those found earlier, these before keypoints."""
     things = []
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        caster = Caster(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg))
+        before = earlier.objects.get(thing.name) if earlier and not thing.pose else None
+        scale = before.scale if before else AS_IT_IS
+        caster = Caster(scaled(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         pose = Pose(np.array(thing.pose.rotation), np.array(thing.pose.translation)) if thing.pose else None
-        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing)))
+        found = before.as_found() if before else None
+        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing), found, scale))
     return things
 
 
@@ -94,24 +105,34 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> d
     found, pose, trust = result.found[k], result.poses[k], trust_in(thing, result, k)
     reasons = doubts(iou, agreement, trust, found, params)
     return {
-        "rotation": pose.rotation.tolist(),
-        "translation": pose.translation.tolist(),
+        **pose_entry(pose),
+        "scale": list(thing.scale),
         "silhouette_iou": iou,
         "label_agreement": agreement,
-        "source": "given" if found is None else "keypoints" if found.by_keypoints else "found",
+        "source": source_of(found),
         "score": found.score if found else None,
-        "runner_up": runner_up_entry(found),
+        "runner_up": runner_up_entry(found, thing.caster),
         **msgspec.to_builtins(trust),
         "doubts": reasons,
         "left_out": bool(reasons) and found is not None and not params.keep_doubtful,
     }
 
 
-def runner_up_entry(found: Found | None) -> dict | None:
+def source_of(found: Found | None) -> str:
+    if found is None:
+        return "given"
+    return "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
+
+
+def runner_up_entry(found: Found | None, caster: Caster) -> dict | None:
     if found is None or found.runner_up is None:
         return None
     other = found.runner_up
-    return {"rotation": other.state.rotation.tolist(), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
+    return {**pose_entry(other.state.pose(caster)), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
+
+
+def pose_entry(pose: Pose) -> dict:
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
 
 
 def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:

@@ -138,7 +138,8 @@ class MeshFiles:
         """One per material of the object."""
         mesh, stem = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials), self._written(thing, meshes)
         place = np.eye(4)
-        place[:3, :3], place[:3, 3] = poses[thing.name]["rotation"], poses[thing.name]["translation"]
+        pose = poses[thing.name]
+        place[:3, :3], place[:3, 3] = np.array(pose["rotation"]) * pose.get("scale", (1.0, 1.0, 1.0)), pose["translation"]
         used = [self.materials[label - 1] for label in mesh.labels]
         return [Shape(f"{thing.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
 

@@ -14,6 +14,7 @@ from factorlib.align.camera import Camera, Pose
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json
+from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observations_of_photo
@@ -66,7 +67,8 @@ def occluders_of(inputs: Inputs, poses: dict) -> Occluders:
     """Every object of the photo where `align` put it."""
     slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
     for thing in slice_.objects:
-        mesh = slice_.meshes[thing.mesh]
-        meshes.append(read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials))
+        entry = slice_.meshes[thing.mesh]
+        mesh = read_mesh(inputs.file(entry.file), inputs.facts["dataset.materials"], entry.parts, entry.material, thing.materials)
+        meshes.append(scaled(mesh, poses[thing.name].get("scale", (1.0, 1.0, 1.0))))
     placed = [poses[thing.name] for thing in slice_.objects]
     return Occluders(meshes, [Pose(np.array(pose["rotation"]), np.array(pose["translation"])) for pose in placed])

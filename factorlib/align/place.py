@@ -14,21 +14,53 @@ from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import CLEARLY_BETTER, UNKNOWN_FOCAL, WELL_FOUND, Found, Search, find, focal_prior, found_near, with_focal_free
+from factorlib.align.search import (
+    CLEARLY_BETTER,
+    UNKNOWN_FOCAL,
+    WELL_FOUND,
+    Found,
+    RunnerUp,
+    Search,
+    find,
+    focal_prior,
+    found_before,
+    found_near,
+    with_focal_free,
+)  # fmt: skip
+from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
 
 log = logging.getLogger("factorlib.align")
 
 
+class Earlier(msgspec.Struct, frozen=True):
+    """A pose that an earlier result found, and its runner-up where that is still to be reckoned with."""
+
+    pose: Pose
+    runner_up: Pose | None = None
+    runner_up_score: float = 0.0
+    runner_up_difference_deg: float = 0.0
+
+
+class EarlierFocal(msgspec.Struct, frozen=True):
+    """The focal length that goes with earlier poses, photo pixels; where it was from, and its standard error (log)."""
+
+    focal: float
+    source: str
+    log_sigma: float
+
+
 class Thing(msgspec.Struct, frozen=True):
-    """An object to place: its mesh, what the photo says about it, and what the user said of its pose, if anything."""
+    """An object to place: its mesh, what the photo says about it, and what the user, or an earlier result, said of its pose."""
 
     name: str
     caster: Caster
     evidence: Evidence
     pose: Pose | None = None
     keypoints: Keypoints | None = None
+    earlier: Earlier | None = None
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the caster's mesh, against the file's
 
 
 class Placed(msgspec.Struct, frozen=True):
@@ -43,15 +75,24 @@ class Placed(msgspec.Struct, frozen=True):
 
 
 def placed(
-    things: Sequence[Thing], camera: Camera, focal: float | None, source: str | None, photo: str, search: Search = Search()
+    things: Sequence[Thing],
+    camera: Camera,
+    focal: float | None,
+    source: str | None,
+    photo: str,
+    search: Search = Search(),
+    before: EarlierFocal | None = None,
 ) -> Placed:
-    """Poses of all things.  The focal length, where not given, is found with the object that shows most, and kept.
+    """Poses of all things.  The focal length, where neither given nor found `before`, is found with the object that shows most.
 
     Raises InputError for an object to search whose mask has no pixel.
     """
     prior = beforehand = focal_prior(focal, source, camera.width, camera.height)
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     sigma, found = 0.0, {}
+    if before is not None:
+        prior, source, sigma = FocalPrior(before.focal, 0.0), before.source, before.log_sigma
+        camera = msgspec.structs.replace(camera, focal=before.focal)
     if prior.sigma > 0 and any(thing.pose is not None for thing in things):
         camera, source = _focal_of_given(things, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
@@ -64,7 +105,9 @@ def placed(
                 f"no pixel of the mask shows object {thing.name!r}", file="dataset.yaml", key=photo,
                 cure="remove the object from this photo, or check its mask and materials",
             )  # fmt: skip
-        if thing.keypoints is None:
+        if thing.earlier is not None:
+            found[k] = _found_before(thing, camera, sigma, search)
+        elif thing.keypoints is None:
             found[k] = find(thing.caster, thing.evidence, camera, prior, search)
         else:
             start = state_of_keypoints(thing.keypoints, thing.caster, camera, prior, photo, thing.name)
@@ -74,8 +117,23 @@ def placed(
             sigma = found[k].log_focal_sigma
             camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [thing.pose or found[k].state.pose(thing.caster) for k, thing in enumerate(things)]
+    poses = [_pose(thing, found.get(k)) for k, thing in enumerate(things)]
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))], beforehand)
+
+
+def _pose(thing: Thing, found: Found | None) -> Pose:
+    """What was said or found before is used to the last digit."""
+    if thing.pose is None and thing.earlier is None:
+        return found.state.pose(thing.caster)
+    return thing.pose or thing.earlier.pose
+
+
+def _found_before(thing: Thing, camera: Camera, sigma: float, search: Search) -> Found:
+    earlier, other = thing.earlier, None
+    if earlier.runner_up is not None:
+        state = state_of(earlier.runner_up, camera, thing.caster)
+        other = RunnerUp(state, earlier.runner_up_score, earlier.runner_up_difference_deg)
+    return found_before(thing.caster, thing.evidence, camera, state_of(earlier.pose, camera, thing.caster), sigma, other, search)
 
 
 def _judged(

@@ -16,6 +16,8 @@ from the residuals themselves keep parts that one of the two lacks from pulling.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -77,8 +79,10 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
 
 
 class Equations(msgspec.Struct, frozen=True):
-    information: Float[np.ndarray, "7 7"]
-    gradient: Float[np.ndarray, "7"]
+    """k unknowns, the first seven those of `State.moved`."""
+
+    information: Float[np.ndarray, "k k"]
+    gradient: Float[np.ndarray, "k"]
     scale: float
 
     def step(self, move_focal: bool) -> Float[np.ndarray, "7"]:
@@ -90,13 +94,16 @@ class Equations(msgspec.Struct, frozen=True):
         return np.clip(step, -0.3, 0.3)
 
 
-def normal_equations(caster: Caster, target: Target, window: Camera, hits: Hits, state: State, prior: FocalPrior) -> Equations:
-    residuals, rows = [np.zeros(0)], [np.zeros((0, 7))]
+def normal_equations(
+    caster: Caster, target: Target, window: Camera, hits: Hits, state: State, prior: FocalPrior, jacobian_of: Callable = State.jacobian
+) -> Equations:
+    """jacobian_of: of the image points by all unknowns, from the state and the points' arms, as `State.jacobian`."""
+    residuals, rows = [np.zeros(0)], [np.zeros((0, jacobian_of(state, np.zeros((0, 3))).shape[-1]))]
     for name, region in target.regions.items():
         points, arms = contour_of(caster, name, hits, window, state)
         if len(points) == 0:
             continue
-        jacobian = state.jacobian(arms) / target.pixel
+        jacobian = jacobian_of(state, arms) / target.pixel
         for residual, row in (_mesh_to_mask(region, points, jacobian), _mask_to_mesh(region, points, jacobian)):
             residuals.append(residual)
             rows.append(row)
@@ -140,7 +147,7 @@ def _mesh_to_mask(region: Region, points: np.ndarray, jacobian: np.ndarray) -> t
 
 def _mask_to_mesh(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(region.contour) == 0:
-        return np.zeros(0), np.zeros((0, 7))
+        return np.zeros(0), np.zeros((0, jacobian.shape[-1]))
     nearest = cKDTree(points).query(region.contour)[1]
     residual = np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour)
     return residual, np.einsum("nd,ndk->nk", region.outward, jacobian[nearest])

@@ -63,6 +63,7 @@ class Found(msgspec.Struct, frozen=True):
     log_focal_sigma: float
     runner_up: RunnerUp | None
     by_keypoints: bool = False  # started where the user's keypoints say; nothing else was tried
+    earlier: bool = False  # taken from an earlier result as it is
 
 
 def focal_prior(camera_focal: float | None, source: str | None, width: int, height: int) -> FocalPrior:
@@ -70,6 +71,11 @@ def focal_prior(camera_focal: float | None, source: str | None, width: int, heig
     if camera_focal is None:
         return FocalPrior(UNKNOWN_FOCAL.focal * max(width, height), UNKNOWN_FOCAL.sigma)
     return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
+
+
+def prior_before(source: str, focal: float | None, known_source: str | None, width: int, height: int) -> FocalPrior:
+    """What was known before a focal length of `source` was found; what was known from `known_source` counts only where it stood."""
+    return focal_prior(focal if source == known_source else None, known_source, width, height)
 
 
 def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
@@ -103,6 +109,13 @@ def found_near(caster: Caster, evidence: Evidence, camera: Camera, start: State,
             result = refined(caster, target, camera, start, prior, 0)
         state = result.state
     return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
+
+
+def found_before(caster: Caster, evidence: Evidence, camera: Camera, state: State, log_focal_sigma: float, other: RunnerUp | None, search: Search) -> Found:
+    """An earlier answer as it is, scored anew; `other` is its runner-up."""
+    target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    score = refined(caster, target, camera, state, FocalPrior(camera.focal, 0.0), 0).score
+    return Found(state, score, log_focal_sigma, other, earlier=True)
 
 
 def with_focal_free(caster: Caster, evidence: Evidence, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:

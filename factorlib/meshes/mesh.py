@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,6 +40,19 @@ class Mesh(msgspec.Struct, frozen=True):
     def radius(self) -> float:
         """Largest distance of a vertex from `centre`."""
         return float(np.linalg.norm(self.vertices[np.unique(self.faces)] - self.centre, axis=1).max())
+
+
+def scaled(mesh: Mesh, factors: Sequence[float]) -> Mesh:
+    """The mesh with its axes times `factors` > 0, about its origin; normals stay normal to it.
+
+    >>> tilted = Mesh(np.eye(3), np.array([[0, 1, 2]]), np.ones((3, 3)) / 3**0.5, np.array([1]))
+    >>> (scaled(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
+    [1.0, 1.0, 2.0]
+    """
+    factors = np.asarray(factors, dtype=float)
+    normals = mesh.normals / factors
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return msgspec.structs.replace(mesh, vertices=mesh.vertices * factors, normals=normals)
 
 
 def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:

@@ -21,6 +21,8 @@ class ObjectRow(msgspec.Struct, frozen=True):
     runner_up: dict | None  # score, normal_difference_deg
     doubts: list[str]
     left_out: bool
+    earlier: bool = False  # taken from an earlier result
+    scale: list[float] | None = None  # factors of the mesh's axes, where they are not 1
 
 
 class PoseRow(msgspec.Struct, frozen=True):
@@ -51,9 +53,11 @@ def _row(run: Artifacts, photo: str, entry: dict, facts: dict) -> PoseRow:
 def _object(name: str, said: dict) -> ObjectRow:
     iou, doubts = said.get("silhouette_iou"), said.get("doubts", [])
     suspicious = bool(doubts) or (iou is not None and iou < LOW_IOU)
+    scale = said.get("scale", [1.0] * 3)
     return ObjectRow(
-        name, iou, suspicious, said.get("label_agreement"), said.get("score"), said.get("runner_up"), doubts, said.get("left_out", False)
-    )
+        name, iou, suspicious, said.get("label_agreement"), said.get("score"), said.get("runner_up"), doubts, said.get("left_out", False),
+        said.get("source") == "refined", scale if scale != [1.0] * 3 else None,
+    )  # fmt: skip
 
 
 def _overlay(run: Artifacts, photo: str) -> str | None:

@@ -25,6 +25,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
     threads: threads of its numerics, part of what is computed (a sum depends on them), never the machine's
     logs:    hand it the log of the steps above it (not part of its key)
+    optional: run it only where it is asked for, or something that is asked for takes its results
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
              the folder among its inputs, and the key has the files' contents, not where they lie
     """
@@ -35,6 +36,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
     logs: bool = False
+    optional: bool = False
     given: dict[str, list[str]] = {}
     params: dict[str, Any] = {}
 
@@ -68,8 +70,8 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
 
     def needed(self, targets: list[str] | None) -> list[str]:
-        """The targets and everything above them, in order; all stages for None."""
-        wanted = set(self.stages if targets is None else targets)
+        """The targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
+        wanted = {name for name, stage in self.stages.items() if not stage.optional} if targets is None else set(targets)
         order = self.order()
         for name in reversed(order):
             if name in wanted:

@@ -47,7 +47,9 @@ def graph_lines(pipeline: Pipeline) -> list[str]:
     lines = []
     for name in pipeline.order():
         stage = pipeline.stages[name]
-        lines.append(f"{name:<10} {'per photo' if stage.over else 'whole set':<10} <- {', '.join(stage.inputs) or '(parameters only)'}")
+        taken = ", ".join(stage.inputs) or "(parameters only)"
+        asked = "   (only when asked for)" if stage.optional else ""
+        lines.append(f"{name:<10} {'per photo' if stage.over else 'whole set':<10} <- {taken}{asked}")
     return lines
 
 

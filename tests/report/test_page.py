@@ -203,11 +203,12 @@ def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
     poses = json.loads((tmp_path / "align" / "poses.json").read_text())
     poses["noon"]["objects"]["balls"] |= {
         "label_agreement": 0.71, "score": 0.912, "runner_up": {"score": 0.905, "normal_difference_deg": 41.0},
-        "doubts": ["mesh <and> mask differ"], "left_out": True,
+        "doubts": ["mesh <and> mask differ"], "left_out": True, "source": "refined", "scale": [1.0, 1.05, 0.952],
     }  # fmt: skip
     (tmp_path / "align" / "poses.json").write_text(json.dumps(poses))
     doubtful = page_of(msgspec.structs.replace(inputs, folders=inputs.folders | {"align": tmp_path / "align"}), tmp_path / "report")
     parsed(doubtful)
-    for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "noon: &#39;balls&#39; is left out"):
+    for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "noon: &#39;balls&#39; is left out",
+                  "pose of an earlier result, the mesh's axes times 1.000, 1.050, 0.952"):  # fmt: skip
         assert words in doubtful and words not in html, words
     assert "keypoints" in doubtful

@@ -44,3 +44,10 @@ def test_what_is_refused(tmp_path, old, new, words):
 def test_settings_reach_into_nested_parameters_and_leave_the_rest():
     pipeline = with_settings(Pipeline(1, {"s": Stage(params={"a": 1, "search": {"x": 1, "y": 2}})}), ["s.search.x=3", "s.b=no s.c=1e2"])
     assert pipeline.stages["s"].params == {"a": 1, "search": {"x": 3, "y": 2}, "b": "no", "c": 100.0}
+
+
+def test_an_optional_stage_runs_only_where_it_is_asked_for(tmp_path):
+    pipeline = read(tmp_path, GOOD + "  three: {inputs: [two], optional: true}\n")
+    assert pipeline.needed(None) == ["one", "two"] and pipeline.needed(["three"]) == ["one", "two", "three"]
+    taken = read(tmp_path, GOOD + "  three: {inputs: [one], optional: true}\n  four: {inputs: [three]}\n")
+    assert set(taken.needed(None)) == {"one", "two", "three", "four"}

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import logging
 
+import msgspec
 import numpy as np
 import pytest
 
+from factorlib.align.camera import Pose, rotation_of_vector
 from factorlib.align.raster import rasterise
 from factorlib.align.search import Search
 from factorlib.errors import InputError
@@ -123,3 +125,48 @@ def test_object_without_a_pixel_is_refused(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair(), edit=lambda label: label * 0)
     with pytest.raises(InputError, match="no pixel of the mask shows object 'thing'"):
         run(tmp_path, inputs)
+
+
+def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
+    """The inputs, with a folder that names the pose."""
+    folder = tmp_path / "earlier"
+    folder.mkdir()
+    thing = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "runner_up": runner_up}
+    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated"}, "objects": {"thing": thing}}})
+    return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
+
+
+def test_an_earlier_pose_and_focal_length_are_used_as_they_are(tmp_path):
+    inputs, _, camera, pose = step(tmp_path, chair(), chair())
+    entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera))[1]
+    thing = entry["objects"]["thing"]
+    assert thing["rotation"] == pose.rotation.tolist() and thing["translation"] == pose.translation.tolist()
+    assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["focal_source"] == "estimated"
+    assert thing["source"] == "refined" and thing["score"] > 0.97 and thing["doubts"] == [] and thing["runner_up"] is None
+
+
+def test_an_earlier_pose_is_judged_like_any_other(tmp_path):
+    """A rival that nobody ruled out is still a doubt, and so is a pose that misses the mask."""
+    inputs, _, camera, pose = step(tmp_path, chair(), chair())
+    turned = rotation_of_vector(np.array([0.0, 2.0, 0.0])) @ pose.rotation
+    rival = {"rotation": turned.tolist(), "translation": pose.translation.tolist(), "score": 1.0, "normal_difference_deg": 60.0}
+    thing = run(tmp_path, earlier(tmp_path, inputs, pose, camera, rival), "rival")[1]["objects"]["thing"]
+    assert thing["left_out"] and "another pose" in thing["doubts"][0] and np.allclose(thing["runner_up"]["rotation"], turned, atol=1e-9)
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    thing = run(wrong, earlier(wrong, inputs, Pose(turned, pose.translation), camera))[1]["objects"]["thing"]
+    assert thing["left_out"] and thing["silhouette_iou"] < 0.9
+
+
+def test_a_pose_that_the_dataset_gives_goes_before_an_earlier_one(tmp_path):
+    inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
+    entry = run(tmp_path, earlier(tmp_path, inputs, Pose(np.eye(3), pose.translation), camera))[1]
+    assert entry["objects"]["thing"]["source"] == "given" and np.allclose(entry["objects"]["thing"]["rotation"], pose.rotation)
+
+
+def test_a_photo_that_the_earlier_result_lacks_is_searched(tmp_path):
+    inputs, _, camera, pose = step(tmp_path, chair(), chair())
+    other = earlier(tmp_path, inputs, pose, camera)
+    path = other["poses"] / "poses.json"
+    path.write_text(path.read_text().replace('"a"', '"b"'))
+    assert run(tmp_path, other)[1]["objects"]["thing"]["source"] == "found"

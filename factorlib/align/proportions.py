@@ -1,0 +1,170 @@
+"""A mesh whose proportions differ from the object's: factors of its three axes, from all photos that show it.
+
+    x_cam = R · (s ∘ x_object) + t,        s₁ s₂ s₃ = 1: overall size is not seen
+
+The contours' normal equations of every sighting (`factorlib.align.refine`) get two more unknowns, which all sightings share:
+a surface point at arm a from the mesh's middle moves by R e_k e_kᵀ Rᵀ a as log s_k grows, and the contour with it.  The
+sightings' own unknowns are eliminated (Schur complement) and follow.
+
+One photo alone can take a wrong proportion for a turn.  So factors are used only where they pay on photos that had no say in
+them: each part of the sightings in turn is left out, the factors are fitted to the others, and only its poses are fitted to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.align.camera import Camera
+from factorlib.align.evidence import labelled_iou
+from factorlib.align.raster import Caster
+from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined
+from factorlib.align.state import State
+from factorlib.align.target import Target
+from factorlib.meshes.mesh import Mesh, scaled
+
+SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d
+DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3, 0.1, 0.1]) ** -2.0  # as of `refine`, and of d
+MOST = 0.15  # of a step
+STILL = 1e-4  # a step of d that ends the descent
+PARTS = 4  # that are left out in turn, at most
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When factors are used."""
+
+    least_gain: Share = 0.2  # of what the silhouettes of photos left out leave unexplained
+    least_share: Share = 0.003  # of the mask's pixels, likewise
+    steps: Annotated[int, msgspec.Meta(ge=1, le=100)] = 15
+
+
+class Sighting(msgspec.Struct, frozen=True):
+    """An object in a photo: its mesh with its own labels, as read; what is seen of it; where it is taken to be."""
+
+    mesh: Mesh
+    target: Target
+    camera: Camera
+    prior: FocalPrior
+    state: State
+
+
+class Fitted(msgspec.Struct, frozen=True):
+    """factors [3], their product 1, and the state of each sighting with them."""
+
+    factors: Float[np.ndarray, "3"]
+    states: list[State]
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What was found, and whether it is used; shares of the mask that silhouettes leave unexplained, mean over the sightings.
+
+    held_out_before, held_out_after: with the mesh as it is and with factors of other photos, poses fitted to both alike
+    """
+
+    used: bool
+    reason: str
+    fitted: Fitted
+    held_out_before: float | None = None
+    held_out_after: float | None = None
+
+
+def proportions(sightings: Sequence[Sighting], standards: Standards = Standards()) -> Verdict:
+    """Factors of the one mesh that all sightings show; exactly 1 where they are not used."""
+    as_it_is = Fitted(np.ones(3), [one.state for one in sightings])
+    if len(sightings) < 2:
+        return Verdict(False, "one photo alone can take a wrong proportion for a turn", as_it_is)
+    before, after = [], []
+    for part in parts(len(sightings)):
+        others = [one for k, one in enumerate(sightings) if k not in part]
+        factors = fitted(others, standards.steps).factors
+        for k in part:
+            before.append(unexplained(sightings[k], np.ones(3), standards.steps))
+            after.append(unexplained(sightings[k], factors, standards.steps))
+    losses = float(np.mean(before)), float(np.mean(after))
+    gain = losses[0] - losses[1]
+    if gain < max(standards.least_gain * losses[0], standards.least_share):
+        return Verdict(False, "photos left out are explained no better", as_it_is, *losses)
+    return Verdict(True, "photos left out are explained better", fitted(sightings, standards.steps), *losses)
+
+
+def parts(count: int) -> list[list[int]]:
+    """Which are left out together.
+
+    >>> parts(2), parts(6)
+    ([[0], [1]], [[0, 4], [1, 5], [2], [3]])
+    """
+    return [list(range(first, count, PARTS)) for first in range(min(count, PARTS))]
+
+
+def unexplained(one: Sighting, factors: Float[np.ndarray, "3"], steps: int) -> float:
+    """The share of the mask at the best pose of the mesh with these factors."""
+    return 1 - refined(Caster(scaled(one.mesh, factors)), one.target, one.camera, one.state, one.prior, steps).score
+
+
+def fitted(sightings: Sequence[Sighting], steps: int) -> Fitted:
+    """Factors and states together, by Gauss-Newton from the mesh as it is; the best met."""
+    shape, states, best, most = np.zeros(2), [one.state for one in sightings], None, -np.inf
+    for k in range(steps + 1):
+        casters = [Caster(scaled(one.mesh, factors_of(shape))) for one in sightings]
+        met = [_equations(*each) for each in zip(sightings, casters, states, strict=True)]
+        score = float(np.mean([score for _, score in met]))
+        if score > most:
+            best, most = Fitted(factors_of(shape), states), score
+        if k == steps:
+            break
+        by_shape, moves = joint_step([(one, equations) for one, (equations, _) in zip(sightings, met, strict=True)])
+        shape, states = shape + by_shape, [state.moved(move) for state, move in zip(states, moves, strict=True)]
+        if np.abs(by_shape).max() < STILL:
+            break
+    return best
+
+
+def factors_of(shape: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+    """Of product 1.
+
+    >>> float(factors_of(np.array([0.3, -0.1])).prod().round(12))
+    1.0
+    """
+    return np.exp(SHAPES @ shape)
+
+
+def _equations(one: Sighting, caster: Caster, state: State) -> tuple[Equations, float]:
+    window = one.target.camera(state.camera(one.camera))
+    hits = caster.cast(window, state.pose(caster))
+    equations = normal_equations(caster, one.target, window, hits, state, one.prior, jacobian_with_shape)
+    return equations, labelled_iou(one.target.evidence, caster.labels(hits))
+
+
+def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
+    """∂ image point / ∂ (the seven unknowns of `State.moved`, d), photo pixels."""
+    along = arms @ state.rotation  # the arm in the object's axes, as it is scaled
+    moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, SHAPES)
+    point = arms + state.middle()
+    slope = point[:, :2] / point[:, 2:]
+    by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (np.exp(state.log_focal) / point[:, 2])[:, None, None]
+    return np.concatenate([state.jacobian(arms), by_shape], axis=-1)
+
+
+def joint_step(each: Sequence[tuple[Sighting, Equations]]) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
+    """The damped step of d, and the sightings' own steps."""
+    shared, pull, own = np.diag(DAMPING[7:]), np.zeros(2), []
+    for one, equations in each:
+        free = 7 if one.prior.sigma > 0 else 6
+        matrix = equations.information + np.diag(DAMPING * (np.arange(9) < 7))
+        cross = matrix[:free, 7:]
+        away = np.linalg.solve(matrix[:free, :free], np.column_stack([cross, equations.gradient[:free]]))
+        shared = shared + equations.information[7:, 7:] - cross.T @ away[:, :2]
+        pull = pull + equations.gradient[7:] - cross.T @ away[:, 2]
+        own.append((free, away))
+    by_shape = np.clip(-np.linalg.solve(shared, pull), -MOST, MOST)
+    moves = []
+    for free, away in own:
+        move = np.zeros(7)
+        move[:free] = np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * MOST, 2 * MOST)
+        moves.append(move)
+    return by_shape, moves

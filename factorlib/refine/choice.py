@@ -1,0 +1,138 @@
+"""Which of an object's poses a photo's shading believes: the one found, that one moved by shading, or the runner-up.
+
+Every candidate gets a light of its own from the pixels that are fitted, with weights of the same lobes, and all are judged on the
+pixels held out, those that every candidate shows.  A candidate replaces the pose found only where it lowers the held-out loss by
+`least_gain` of itself and by SURE standard errors of that difference, cells being independent, and where it leaves the
+silhouette as it was but for `most_lost` of it (`rival` for the runner-up).  Where the silhouette fits better by more than
+`most_lost`, two witnesses agree and the gain alone is enough.  The same decides whether a runner-up is ruled out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.align.refine import refined
+from factorlib.align.state import State
+from factorlib.refine.descent import Moving, descended
+from factorlib.refine.light import pursued_light, robust_scale, together, whitened_residuals, with_weights
+from factorlib.solve.normal_equations import robust_losses
+from factorlib.solve.problem import of_rows
+from factorlib.solve.unknowns import Materials
+
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+SURE = 2.0
+LEAST_SHOWN = 100  # pixels, of each kind
+
+
+class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When a pose is replaced."""
+
+    least_gain: Share = 0.03  # of the held-out loss
+    most_lost: Share = 0.01  # of the labelled IoU, by moving
+    rival: Share = 0.05  # of the labelled IoU: a runner-up that lacks no more of it is tried
+    steps: Annotated[int, msgspec.Meta(ge=0, le=100)] = 8
+
+
+class Judged(msgspec.Struct, frozen=True):
+    """A candidate (found, moved or runner_up): its state, its labelled IoU, its mean held-out loss over the pixels that all
+    candidates show, and by what share that is less than the found pose's, with the standard error.
+    """
+
+    name: str
+    state: State
+    score: float
+    held_out_loss: float
+    gain: float
+    gain_stderr: float
+
+
+class Settled(msgspec.Struct, frozen=True):
+    """What shading says: the candidate to use, every candidate, and whether the runner-up has been tried and is another matter.
+
+    chosen: "found" where nothing is better;  ruled_out: None where no runner-up was tried, or it is chosen
+    """
+
+    chosen: str
+    candidates: dict[str, Judged]
+    ruled_out: bool | None
+
+
+def settled(
+    moving: Moving, found: State, runner_up: State | None, materials: Materials, operator, cell: Int[np.ndarray, "n"], standards: Standards
+) -> Settled | None:
+    """None where the candidates share too few pixels to be told apart."""
+    states = candidates(moving, found, runner_up, materials, operator, standards)
+    verdicts = judged(moving, states, materials, operator, cell)
+    return choice_of(verdicts, standards) if verdicts else None
+
+
+def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
+    """Of `judged` candidates; the first is the pose found."""
+    best = found = verdicts[0]
+    for one in sorted(verdicts[1:], key=lambda one: one.gain):
+        best = one if is_better(one, found, standards) else best
+    named = {one.name: one for one in verdicts}
+    other, own = named.get("runner_up"), max((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.gain)
+    ruled_out = None if other is None or best is other else is_better(own, other, standards)
+    return Settled(best.name, named, ruled_out)
+
+
+def candidates(moving: Moving, found: State, runner_up: State | None, materials: Materials, operator, standards: Standards) -> dict[str, State]:
+    """`found` stays as it is; the others move, first by contours, then by shading too."""
+    result = {"found": found}
+    for name, start in (("moved", found), ("runner_up", runner_up)):
+        if start is not None:
+            start = refined(moving.caster, moving.target, moving.camera, start, moving.prior, standards.steps).state
+            result[name] = descended(moving, start, materials, operator, standards.steps, standards.most_lost)
+    if runner_up is not None and moving.score(result["runner_up"]) < moving.score(found) - standards.rival:
+        del result["runner_up"]
+    return result
+
+
+def judged(moving: Moving, states: dict[str, State], materials: Materials, operator, cell: Int[np.ndarray, "n"]) -> list[Judged]:
+    """Every candidate, the first being the one that gains are relative to; empty where too few pixels are shown by all."""
+    seen = {name: moving.block(state, None) for name, state in states.items()}
+    common = np.logical_and.reduce([agrees for _, agrees in seen.values()])
+    held_out = next(iter(seen.values()))[0].held_out
+    if min((common & held_out).sum(), (common & ~held_out).sum()) < LEAST_SHOWN:
+        return []
+    fitted = {name: of_rows(block, agrees & ~held_out) for name, (block, agrees) in seen.items()}
+    lobes = together([pursued_light(block, materials, operator) for block in fitted.values()])
+    residual = {}
+    for name, (block, _) in seen.items():
+        light = with_weights(fitted[name], lobes, materials, operator)
+        residual[name] = whitened_residuals(of_rows(block, common & held_out), light, materials, operator)
+    scale = min(robust_scale(r) for r in residual.values())
+    losses = {name: robust_losses(r, scale).mean(1) for name, r in residual.items()}
+    first, of_cell = next(iter(losses.values())), cell[common & held_out]
+    return [
+        Judged(name, state, moving.score(state), float(losses[name].mean()), *gain_of(first, losses[name], of_cell))
+        for name, state in states.items()
+    ]
+
+
+def gain_of(before: Float[np.ndarray, "n"], after: Float[np.ndarray, "n"], cell: Int[np.ndarray, "n"]) -> tuple[float, float]:
+    """1 − after/before of the summed losses, and its standard error, the cells' sums being independent.
+
+    >>> gain_of(np.array([2.0, 2.0]), np.array([1.0, 1.0]), np.array([0, 1]))
+    (0.5, 0.0)
+    """
+    total = max(float(before.sum()), 1e-300)
+    share = float((before - after).sum()) / total
+    names = np.unique(cell, return_inverse=True)[1].reshape(-1)
+    scatter = np.bincount(names, weights=(before - after) - share * before) if len(cell) else np.zeros(0)
+    return share, float(np.sqrt(np.sum(scatter**2)) / total)
+
+
+def is_better(one: Judged, than: Judged, standards: Standards) -> bool:
+    """Whether shading settles for `one`."""
+    gain, more = one.gain - than.gain, one.score - than.score
+    stderr = float(np.hypot(one.gain_stderr, than.gain_stderr))
+    lost = standards.rival if "runner_up" in (one.name, than.name) else standards.most_lost
+    agreed = more > standards.most_lost or gain > SURE * stderr
+    return gain > standards.least_gain and agreed and more >= -lost

@@ -1,0 +1,137 @@
+"""A pose moved by shading and contours together: Gauss-Newton with the light's weights eliminated.
+
+    photometric    r_ic(θ, w) = (Σ_p w_pc B_ipc(θ) − radiance_ic)/σ_ic        θ: turn 3, place 3, focal length
+    contours       the normal equations of `factorlib.align.refine`
+
+w is linear: with A = ∂r/∂w over the lobes that shine and J = ∂r/∂θ, the pose sees only what no change of light explains,
+
+    H = JᵀWJ − JᵀWA (AᵀWA)⁻¹ AᵀWJ,        g = JᵀWr − JᵀWA (AᵀWA)⁻¹ AᵀWr                                        (1)
+
+(Golub and Pereyra's variable projection in Kaufman's form).  Without it the light, which was fitted to the pose as it is, would
+hold the pose where it is.  J is taken from normals of poses a little to either side; pixels near an edge do not vote.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.evidence import Evidence, labelled_iou
+from factorlib.align.raster import Caster
+from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
+from factorlib.align.state import State
+from factorlib.align.target import Target, target_of
+from factorlib.refine.light import pursued_light, robust_scale, whitened_residuals, with_weights
+from factorlib.refine.pixels import View
+from factorlib.solve.insertion import whitened_atoms
+from factorlib.solve.normal_equations import predicted_radiance, robust_losses
+from factorlib.solve.problem import Block, of_rows
+from factorlib.solve.unknowns import Light, Materials
+
+RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as of `factorlib.align.target`
+ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
+EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
+DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
+MOST = 0.1  # of a step
+
+
+class Moving(msgspec.Struct, frozen=True):
+    """The object that moves: what its contours are compared with, and observations of the photo with it in a state."""
+
+    caster: Caster
+    target: Target
+    camera: Camera
+    prior: FocalPrior
+    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]  # all pixels, and which of them agree
+
+    def score(self, state: State) -> float:
+        """Labelled IoU."""
+        hits = self.caster.cast(self.target.camera(state.camera(self.camera)), state.pose(self.caster))
+        return labelled_iou(self.target.evidence, self.caster.labels(hits))
+
+
+def moving_object(view: View, number: int, poses: Sequence[Pose], camera: Camera, evidence: Evidence, prior: FocalPrior) -> Moving:
+    """Object `number` of a photo, the others staying at their `poses`."""
+    caster = view.casters[number]
+
+    def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, "n"]]:
+        own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
+        seen = view.seen(own, posed)
+        return view.block(own, seen, like, posed), seen.agrees
+
+    return Moving(caster, target_of(evidence, caster.mesh.labels, RESOLUTION, MARGIN), camera, prior, block)
+
+
+def descended(moving: Moving, start: State, materials: Materials, operator, steps: int, most_lost: float) -> State:
+    """The state, of those met in `steps` steps from `start`, whose fitted pixels are explained best while the labelled
+    IoU is at most `most_lost` below that of the start."""
+    state, best, least, floor = start, start, np.inf, moving.score(start) - most_lost
+    shadows, light = None, None
+    for k in range(steps + 1):
+        every, agrees = moving.block(state, shadows)
+        shadows = every  # visibility hardly changes on the way
+        fit = of_rows(every, agrees & ~every.held_out)
+        if len(fit) == 0:
+            break
+        light = pursued_light(fit, materials, operator) if k in (0, steps // 2) else with_weights(fit, light, materials, operator)
+        residual = whitened_residuals(fit, light, materials, operator)
+        scale = robust_scale(residual) if k == 0 else scale
+        loss = float(robust_losses(residual, scale).mean())
+        if loss < least and moving.score(state) >= floor:
+            best, least = state, loss
+        if k < steps:
+            state = state.moved(_step(moving, state, every, agrees, fit, light, residual, materials, operator))
+    return best
+
+
+def _step(moving: Moving, state: State, every: Block, agrees, fit: Block, light: Light, residual, materials, operator) -> np.ndarray:
+    window = moving.target.camera(state.camera(moving.camera))
+    hits = moving.caster.cast(window, state.pose(moving.caster))
+    contours = normal_equations(moving.caster, moving.target, window, hits, state, moving.prior)
+    free = 7 if moving.prior.sigma > 0 else 6
+    jacobian = photometric_jacobian(moving, state, every, agrees & ~every.held_out, light, materials, operator, free)
+    information, gradient = projected_equations(jacobian, residual, fit, light, materials, operator)
+    hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
+    step = np.zeros(7)
+    step[:free] = -np.linalg.solve(hessian, contours.gradient[:free] + gradient)
+    return np.clip(step, -MOST, MOST)
+
+
+def photometric_jacobian(
+    moving: Moving, state: State, every: Block, rows: Bool[np.ndarray, "m"], light: Light, materials: Materials, operator, free: int
+) -> Float[np.ndarray, "n 3 k"]:
+    """∂r/∂θ at the n pixels `rows`, by central differences; 0 where the two sides show different things."""
+    result = np.zeros((int(rows.sum()), 3, free))
+    for k in range(free):
+        sides = []
+        for sign in (-1, 1):
+            block, agrees = moving.block(state.moved(sign * ASIDE[k] * np.eye(7)[k]), every)
+            sides.append((of_rows(block, rows), agrees[rows]))
+        (low, low_agrees), (high, high_agrees) = sides
+        smooth = low_agrees & high_agrees & (np.sum(low.normal * high.normal, axis=1) > EDGE_TURN)
+        difference = predicted_radiance(high, light, materials, operator) - predicted_radiance(low, light, materials, operator)
+        result[..., k] = np.where(smooth[:, None], difference * low.precision / (2 * ASIDE[k]), 0.0)
+    return result
+
+
+def projected_equations(jacobian, residual, fit: Block, light: Light, materials: Materials, operator) -> tuple[np.ndarray, np.ndarray]:
+    """H and g of equation (1), over the residuals' own spread and their correlation."""
+    atoms = whitened_atoms(fit, np.arange(len(fit)), materials, operator, light.axis, light.sharpness, light)
+    scale, k = robust_scale(residual), jacobian.shape[-1]
+    trust = 1 / np.sqrt(1 + (residual / scale) ** 2)
+    hessian, gradient = np.zeros((k, k)), np.zeros(k)
+    for c in range(3):
+        shining = atoms[c][:, light.weight[:, c] > 0]
+        j, a, w = jacobian[:, c], shining, trust[:, c, None]
+        gram = (w * a).T @ a
+        gram += 1e-6 * np.diag(np.diag(gram)) + 1e-12 * np.eye(len(gram))
+        cross = (w * j).T @ a
+        away = np.linalg.solve(gram, cross.T).T
+        hessian += (w * j).T @ j - away @ cross.T
+        gradient += (w * j).T @ residual[:, c] - away @ ((w * a).T @ residual[:, c])
+    variance = CORRELATION * (scale / 3) ** 2
+    return hessian / variance, gradient / variance

@@ -1,0 +1,126 @@
+"""The pixels of a photo that poses are compared on, and what posed meshes show in them.
+
+A pixel is fixed, and so is its view direction; only the normal under it moves with a pose.  Held out are whole cells of the
+image, for neighbouring pixels err alike, and they are the same cells whatever the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from factorlib.align.camera import Camera, Pose
+from factorlib.align.raster import Caster, face_normals, unit
+from factorlib.light.sphere import fibonacci_sphere
+from factorlib.solve.problem import Block, Noise
+from factorlib.urm.extract import GRAZING
+from factorlib.urm.visibility import Occluders, visibility
+
+EDGE = 5  # pixels: the square about a pixel that shows one material, all of it valid
+CELLS = 20  # along the masks' extent
+HELD_OUT = 0.3  # of the cells
+
+
+class Pixels(msgspec.Struct, frozen=True):
+    """n pixels, sorted by material.
+
+    x, y       column and row            radiance   in units of `unit`, the mean radiance of all
+    precision  1/σ of the noise model, 0 where a channel is clipped: it is not compared
+    material   index, from 0             cell       number of the pixel's cell
+    """
+
+    x: Int[np.ndarray, "n"]
+    y: Int[np.ndarray, "n"]
+    radiance: Float[np.ndarray, "n 3"]
+    unit: float
+    precision: Float[np.ndarray, "n 3"]
+    material: Int[np.ndarray, "n"]
+    cell: Int[np.ndarray, "n"]
+    held_out: Bool[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def pixels_of(
+    photo: Mapping[str, Float[np.ndarray, "h w"]], known: Sequence[bool], count: int, seed: int = 0, noise: Noise = Noise()
+) -> Pixels | None:
+    """At most `count` of the pixels inside a material that is `known`; None where there are too few cells to hold any out.
+
+    photo: channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
+    """
+    label = np.rint(photo["label"]).astype(int)
+    whole = (minimum_filter(label, EDGE) == maximum_filter(label, EDGE)) & np.array([False, *known])[label]
+    whole &= minimum_filter(photo["valid"], EDGE) > 0.5
+    y, x = np.nonzero(whole)
+    if len(x) == 0:
+        return None
+    random = np.random.default_rng(seed)
+    chosen = np.sort(random.permutation(len(x))[:count])
+    chosen = chosen[np.argsort(label[y[chosen], x[chosen]], kind="stable")]
+    x, y = x[chosen], y[chosen]
+    size = max(max(np.ptp(x), np.ptp(y)) + 1, CELLS) / CELLS
+    names, cell = np.unique((y // size).astype(int) * 1000 + (x // size).astype(int), return_inverse=True)
+    radiance = np.maximum(np.stack([photo[c][y, x] for c in "RGB"], axis=-1).astype(float), 0.0)
+    mean = max(float(radiance.mean()), 1e-30)
+    clipped = np.stack([photo[f"clipped.{c}"][y, x] for c in "RGB"], axis=-1) > 0.5
+    sigma = np.hypot(noise.absolute, noise.relative * radiance / mean)
+    out = random.permutation(len(names)) < HELD_OUT * len(names)
+    if not 2 <= out.sum() < len(names):
+        return None
+    return Pixels(x, y, radiance / mean, mean, np.where(clipped, 0.0, 1 / sigma), label[y, x] - 1, cell.reshape(-1), out[cell.reshape(-1)])
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """normal [n, 3]: camera frame, unit; material: whether the mesh shows the material there that the mask does, facing the camera."""
+
+    normal: Float[np.ndarray, "n 3"]
+    agrees: Bool[np.ndarray, "n"]
+
+
+class View:
+    """The meshes of a photo over its pixels."""
+
+    def __init__(self, pixels: Pixels, casters: Sequence[Caster], trusted: Sequence[bool], shadows: int = 0):
+        """trusted: objects whose pixels count;  shadows: directions in which they may shadow each other and themselves (0: not)."""
+        self.pixels, self.casters, self.trusted, self.shadows = pixels, casters, trusted, shadows
+
+    def seen(self, camera: Camera, poses: Sequence[Pose]) -> Seen:
+        """What the nearest mesh shows under each pixel."""
+        along = camera.rays_through(np.column_stack([self.pixels.x, self.pixels.y]) + 0.5)
+        n = len(self.pixels)
+        normal, label, nearest, view = np.tile([0.0, 0.0, -1.0], (n, 1)), np.zeros(n, int), np.full(n, np.inf), -unit(along)
+        for caster, pose, trusted in zip(self.casters, poses, self.trusted, strict=True):
+            hits = caster.cast_along(along, pose)
+            wins = (hits.face >= 0) & (hits.depth < nearest)
+            face, (u, v) = hits.face[wins], hits.uv[wins].T
+            corner = np.stack([1 - u - v, u, v], axis=1)
+            smooth = unit(np.einsum("nk,nkd->nd", corner, caster.mesh.normals[caster.mesh.faces[face]]) @ pose.rotation.T)
+            behind = np.sum(face_normals(caster.mesh, face) @ pose.rotation.T * view[wins], axis=1) < 0
+            nearest[wins], normal[wins] = hits.depth[wins], np.where(behind[:, None], -smooth, smooth)
+            label[wins] = caster.mesh.face_label[face] if trusted else 0
+        agrees = (label == self.pixels.material + 1) & (np.sum(normal * view, axis=1) > GRAZING)
+        return Seen(normal, agrees)
+
+    def block(self, camera: Camera, seen: Seen, like: Block | None = None, poses: Sequence[Pose] | None = None) -> Block:
+        """All pixels as observations; visibility as in `like`, or of `poses`."""
+        pixels, n = self.pixels, len(self.pixels)
+        view = -unit(camera.rays_through(np.column_stack([pixels.x, pixels.y]) + 0.5))
+        block = Block(
+            "photo", ("photo",), pixels.unit, seen.normal, view, pixels.radiance, np.zeros((n, 3), bool), pixels.precision,
+            pixels.material, np.zeros(n, int), pixels.held_out,
+        )  # fmt: skip
+        if like is not None:
+            return msgspec.structs.replace(block, visibility=like.visibility, directions=like.directions)
+        return self._shadowed(block, camera, seen, poses) if self.shadows and poses else block
+
+    def _shadowed(self, block: Block, camera: Camera, seen: Seen, poses: Sequence[Pose]) -> Block:
+        meshes, directions = [caster.mesh for caster in self.casters], fibonacci_sphere(self.shadows)
+        found = visibility(Occluders(meshes, poses), camera, self.pixels.x, self.pixels.y, seen.normal, self.shadows, len(self.pixels))
+        return block if found is None else msgspec.structs.replace(block, visibility=found, directions=directions[None])
+
+

@@ -1,0 +1,106 @@
+"""A mesh that is like the object but for its proportions: factors of its three axes, fitted once per mesh over all photos.
+
+Only where that pays on photos that had no say: see `factorlib.align.proportions`.  Writes meshes.json (factors, evidence) and
+poses.json (poses in the fitted mesh's frame, with its `scale`), which SET="align.poses=build/<dataset>/fit_mesh" uses.
+"""
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from factorlib.align.camera import Camera
+from factorlib.align.earlier import EarlierPhoto
+from factorlib.align.evidence import object_evidence, silhouette_iou
+from factorlib.align.proportions import Sighting, Standards, Verdict, proportions
+from factorlib.align.raster import Caster, rasterise
+from factorlib.align.refine import FocalPrior
+from factorlib.align.search import prior_before
+from factorlib.align.state import State, state_of
+from factorlib.align.target import target_of
+from factorlib.dataset.schema import ObjectsSlice
+from factorlib.images.exr import read_exr
+from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.mesh import scaled
+from factorlib.meshes.read import read_mesh
+from factorlib.stage import Inputs, Progress
+
+log = logging.getLogger("factorlib.align")
+MARGIN = 0.15  # of the mask's extent, seen around it
+
+
+class Params(Standards, frozen=True, forbid_unknown_fields=True):
+    """resolution: pixels of a mask's longer side;  least_iou: of mask and mesh, for a pose to be fitted from."""
+
+    resolution: Annotated[int, msgspec.Meta(ge=50, le=2000)] = 200
+    least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.6
+
+
+class Found(msgspec.Struct, frozen=True):
+    """A sighting and where it stands: photo, object, and the evidence that its overlap is measured by."""
+
+    photo: str
+    thing: str
+    sighting: Sighting
+    evidence: object
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    poses, slices = read_json(inputs["align"] / "poses.json"), inputs.facts["dataset.objects"]
+    found: dict[str, list[Found]] = {}
+    for photo in sorted(poses):
+        for mesh, one in sightings_of(photo, msgspec.convert(slices[photo], ObjectsSlice), poses[photo], inputs, params):
+            found.setdefault(mesh, []).append(one)
+    report = {}
+    for done, (mesh, sightings) in enumerate(sorted(found.items())):
+        progress(done, len(found), mesh)
+        verdict = proportions([one.sighting for one in sightings], params)
+        report[mesh] = entry_of(verdict, sightings)
+        if verdict.used:
+            log.warning("mesh '%s' fits better with its axes times %s", mesh, ", ".join(f"{f:.3f}" for f in verdict.fitted.factors))
+            for one, state in zip(sightings, verdict.fitted.states, strict=True):
+                place(poses[one.photo], one, state, verdict.fitted.factors)
+    write_json(out / "meshes.json", report)
+    write_json(out / "poses.json", poses)
+
+
+def sightings_of(photo: str, slice_: ObjectsSlice, entry: dict, inputs: Inputs, params: Params):
+    """(mesh, sighting) of every object whose pose was found, with its mask and the mesh as its file has it."""
+    channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_json(inputs["masks"] / f"{photo}.json")
+    earlier, (height, width) = msgspec.convert(entry, EarlierPhoto), channels["label"].shape
+    camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
+    prior = prior_before(entry["camera"]["focal_source"], facts["focal_px"], facts["focal_source"], width, height)
+    alone = prior if len(slice_.objects) == 1 else FocalPrior(camera.focal, 0.0)
+    for number, thing in enumerate(slice_.objects, start=1):
+        said, mesh = entry["objects"][thing.name], slice_.meshes[thing.mesh]
+        if said["source"] == "given" or said["silhouette_iou"] < params.least_iou:
+            continue
+        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials)
+        evidence = object_evidence(channels, number, read.labels, thing.mask is not None)
+        state = state_of(earlier.objects[thing.name].pose(), camera, scaled(read, earlier.objects[thing.name].scale))
+        target = target_of(evidence, read.labels, params.resolution, MARGIN)
+        yield thing.mesh, Found(photo, thing.name, Sighting(read, target, camera, alone, state), evidence)
+
+
+def entry_of(verdict: Verdict, sightings: list[Found]) -> dict:
+    """Of meshes.json."""
+    return {
+        "factors": verdict.fitted.factors.tolist(),
+        "used": verdict.used,
+        "reason": verdict.reason,
+        "held_out_unexplained": {"as_it_is": verdict.held_out_before, "fitted": verdict.held_out_after},
+        "sightings": [f"{one.photo}.{one.thing}" for one in sightings],
+    }
+
+
+def place(entry: dict, one: Found, state: State, factors: np.ndarray) -> None:
+    """Write an object's pose with the fitted mesh into its photo's entry of poses.json; its runner-up was of another mesh."""
+    caster = Caster(scaled(one.sighting.mesh, factors))
+    pose, camera = state.pose(caster), state.camera(one.sighting.camera)
+    if one.sighting.prior.sigma > 0:
+        entry["camera"]["focal_px"] = float(camera.focal)
+    iou = silhouette_iou(one.evidence, rasterise(caster, camera, pose).label)
+    changed = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "scale": factors.tolist()}
+    entry["objects"][one.thing] |= changed | {"silhouette_iou": iou, "runner_up": None}

@@ -1,0 +1,35 @@
+"""Shading moves a pose where the outline says nothing: by itself, if only the places of the light's lobes are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from benchmarks.refine import KINDS, TRUE, normal_error, photographed
+from factorlib.align.evidence import UNKNOWN, Evidence
+from factorlib.align.refine import FocalPrior
+from factorlib.align.state import state_of
+from factorlib.refine import descent
+from factorlib.refine.light import pursued_light
+from factorlib.refine.pixels import View, pixels_of
+from factorlib.reflection import reflection_operator
+from factorlib.solve.problem import of_rows
+
+OPERATOR = reflection_operator("network")
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_where_the_outline_is_left_out_shading_finds_the_way(number, monkeypatch):
+    photo = photographed("turned", number, np.random.default_rng([5, 0, KINDS.index("turned"), number]), OPERATOR)
+    label = photo.channels["label"].astype(np.int16)
+    about = binary_dilation(label > 0, iterations=20) & ~(label > 0)  # a contour may lie here at no cost
+    evidence, prior = Evidence(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
+    view = View(pixels_of(photo.channels, [True] * 3, 2400), [photo.given], [True])
+    moving = descent.moving_object(view, 0, [photo.pose], photo.camera, evidence, prior)
+    start, true = (state_of(pose, photo.camera, photo.given) for pose in (photo.pose, photo.truth))
+    light = pursued_light(of_rows(*moving.block(true, None)), TRUE, OPERATOR)
+    monkeypatch.setattr(descent, "pursued_light", lambda *given: light)
+    found = descent.descended(moving, start, TRUE, OPERATOR, steps=10, most_lost=0.05)
+    before, after = (normal_error(photo, state.pose(photo.given)) for state in (start, found))
+    assert before > 1.5 and after < 0.6 * before

@@ -1,0 +1,117 @@
+"""The refine stage from masks, poses and a solve to poses.json, and what align makes of that."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.refine import TRUE, photographed
+from factorlib.align.earlier import read_earlier
+from factorlib.errors import InputError
+from factorlib.images.exr import write_exr
+from factorlib.jsonfile import write_json
+from factorlib.meshes import write_ply
+from factorlib.reflection import reflection_operator
+from factorlib.reflection.network import SHIPPED
+from factorlib.stage import Inputs, silent
+from stages import align, refine
+
+OPERATOR = reflection_operator("network")
+NAMES = ["red", "green", "blue"]
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A photo of one material whose pose is off, before any stage has seen it."""
+    return photographed("turned", 3, np.random.default_rng(2), OPERATOR)
+
+
+def pose_entry(pose):
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def inputs_of(tmp_path, photo, **entry):
+    masks, aligned, solved = (tmp_path / name for name in ("masks", "align", "solve"))
+    for folder in (masks, aligned, solved):
+        folder.mkdir()
+    zero = np.zeros(photo.channels["label"].shape)
+    write_exr(masks / "a.exr", {**photo.channels, "left_out": zero, "object": zero})
+    facts = {"width": zero.shape[1], "height": zero.shape[0], "focal_px": photo.camera.focal, "focal_source": "dataset"}
+    write_json(masks / "a.json", facts)
+    camera = {"focal_px": photo.camera.focal, "focal_source": "dataset", "focal_relative_stderr": 0.0, "principal_point": list(photo.camera.centre)}
+    thing = {**pose_entry(photo.pose), "source": "found", "runner_up": None, "left_out": False, "silhouette_iou": 0.0} | entry
+    write_json(aligned / "a.json", {"camera": camera, "objects": {"thing": thing}})
+    write_materials(solved, [0.1] * 3)
+    write_ply(tmp_path / "thing.ply", photo.given.mesh)
+    facts = {
+        "dataset.materials": NAMES,
+        "dataset.objects": {
+            "camera": {}, "objects": [{"name": "thing", "mesh": "thing"}], "meshes": {"thing": {"file": "thing.ply", "material": "blue"}},
+        },
+    }  # fmt: skip
+    folders = {"masks": masks, "align": aligned, "solve": solved, "train": SHIPPED}
+    return Inputs(folders, facts, {"thing.ply": tmp_path / "thing.ply"}, "a")
+
+
+def write_materials(folder, stderr):
+    table = {
+        name: {"diffuse": TRUE.diffuse[m].tolist(), "specular": TRUE.specular[m].tolist(), "roughness": float(TRUE.roughness[m]),
+               "stderr": {"diffuse": stderr}}
+        for m, name in enumerate(NAMES)
+    }  # fmt: skip
+    write_json(folder / "materials.json", {"materials": table, "model": {"self_shadowing": False}})
+
+
+def run(stage, inputs, out, **params):
+    out.mkdir()
+    stage.main(stage.Params(**params), inputs, out, silent)
+    return json.loads((out / "a.json").read_text())
+
+
+def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
+    inputs = inputs_of(tmp_path, turned)
+    entry = run(refine, inputs, tmp_path / "refined")
+    thing = entry["objects"]["thing"]
+    assert np.allclose(thing["rotation"], turned.truth.rotation, atol=0.02) and not np.allclose(turned.pose.rotation, turned.truth.rotation, atol=0.02)
+    told = thing["refined"]
+    assert told["chosen"] == "moved" and told["moved"]["rotation_deg"] > 2 and thing["silhouette_iou"] > 0.98
+    assert told["candidates"]["moved"]["held_out_loss"] < told["candidates"]["found"]["held_out_loss"]
+    assert told["candidates"]["moved"]["gain"] > 2 * told["candidates"]["moved"]["gain_stderr"]
+    write_json(tmp_path / "refined" / "poses.json", {"a": entry})
+    again = msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": tmp_path / "refined"})
+    thing_again = run(align, again, tmp_path / "aligned")["objects"]["thing"]
+    assert all(thing_again[name] == thing[name] for name in ("rotation", "translation")) and thing_again["source"] == "refined"
+    assert not thing_again["left_out"]
+
+
+def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, caplog):
+    """A given pose, and materials that no photo showed."""
+    given = run(refine, inputs_of(tmp_path, turned, source="given"), tmp_path / "given")
+    unknown = tmp_path / "unknown"
+    unknown.mkdir()
+    inputs = inputs_of(unknown, turned)
+    write_materials(inputs["solve"], [0.8] * 3)
+    for entry in (given, run(refine, inputs, unknown / "out")):
+        thing = entry["objects"]["thing"]
+        assert thing["refined"] is None
+        assert {name: thing[name] for name in ("rotation", "translation")} == pose_entry(turned.pose)
+    assert "too few pixels of known materials" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("[]", "Expected `object`"),
+        ('{"a": {"camera": {"focal_px": -1}, "objects": {}}}', "focal_px"),
+        ('{"a": {"camera": {"focal_px": 1}, "objects": {"t": {"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}}}}', "a.objects.t"),
+        ('{"a": {"camera": {"focal_px": 1}, "objects": {"t": {"translation": [0,0,1]}}}}', "rotation"),
+    ],
+)
+def test_a_folder_without_poses_is_refused(tmp_path, text, words):
+    (tmp_path / "poses.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_earlier(tmp_path)
+    assert words in str(caught.value) and "poses.json" in str(caught.value) and "result of `align`, `fit_mesh` or `refine`" in str(caught.value)
