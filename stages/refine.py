@@ -18,6 +18,7 @@ from factorlib.align.search import normal_difference, prior_before
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
+from factorlib.images.tone import straightened
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
@@ -43,7 +44,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name, table = inputs.photo, inputs["solve"] / "materials.json"
     photo, entry = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["align"] / f"{name}.json")
     materials, known = known_materials(table, inputs.facts["dataset.materials"])
-    shadows = params.directions if read_json(table)["model"].get("self_shadowing") else 0
+    model = read_json(table)["model"]
+    if tone := model.get("tone", {}).get(name):
+        photo |= {c: straightened(photo[c], **tone) for c in "RGB"}
+    shadows = params.directions if model.get("self_shadowing") else 0
     scene = scene_of(inputs, photo, entry, shadows)
     pixels, operator = pixels_of(photo, known, params.pixels, params.seed), reflection_operator("network", weights=inputs["train"])
     if pixels is None:

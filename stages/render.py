@@ -16,7 +16,7 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.export.materials import Material, read_materials
 from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import exposure_of, picture, write_png
-from factorlib.images.tone import curve
+from factorlib.images.tone import shown
 from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes, read_lobes
 from factorlib.reflection import reflection_operator
@@ -54,8 +54,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
     model = read_json(inputs["solve"] / "materials.json")["model"]
+    tone = model.get("tone", {}).get(name)
     again = resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs, model))
-    _write(out / "resynthesis" / name, toned(again, model.get("tone", {}).get(name)), exposure)
+    _write(out / "resynthesis" / name, shown(again, **tone) if tone else again, exposure)
     seen = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
@@ -64,11 +65,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         _write(out / "materials" / name / label, ball(reflector, material, params.ball_size), exposure, disc=True)
         _write_map(out / "reflectance_maps" / name / label, reflector, material, normals, exposure, params.map_size)
     progress(total, total, name)
-
-
-def toned(radiance: np.ndarray, tone: dict | None) -> np.ndarray:
-    """Through the photo's tone curve, where the solve found one."""
-    return radiance if tone is None else tone["pivot"] * curve(radiance / tone["pivot"], tone["exponent"])
 
 
 def shadowed(inputs: Inputs, model: dict) -> Observations | None:

@@ -39,5 +39,15 @@ def by_log_exponent(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"
     return exponent * (at_x - at_black - curve(x, exponent) * (at_one - at_black)) / _range(exponent)
 
 
+def shown(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
+    """What a photo shows of linear radiance, where radiance `pivot` stays what it is."""
+    return pivot * curve(radiance / pivot, exponent)
+
+
+def straightened(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
+    """The inverse of `shown`."""
+    return pivot * inverse(radiance / pivot, exponent)
+
+
 def _range(exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"] | float:
     return (1 + TOE) ** exponent - TOE**exponent

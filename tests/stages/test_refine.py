@@ -12,7 +12,8 @@ from benchmarks.refine import TRUE, photographed
 from factorlib.align.earlier import read_earlier
 from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
-from factorlib.jsonfile import write_json
+from factorlib.images.tone import shown
+from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
@@ -85,6 +86,19 @@ def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
     thing_again = run(align, again, tmp_path / "aligned")["objects"]["thing"]
     assert all(thing_again[name] == thing[name] for name in ("rotation", "translation")) and thing_again["source"] == "refined"
     assert not thing_again["left_out"]
+
+
+def test_a_photo_with_a_tone_curve_is_straightened_first(tmp_path, turned):
+    (tmp_path / "linear").mkdir(), (tmp_path / "bent").mkdir()
+    straight = run(refine, inputs_of(tmp_path / "linear", turned), tmp_path / "straight")
+    tone = {"exponent": 1.6, "pivot": 0.4}
+    channels = {name: shown(of, **tone) if name in "RGB" else of for name, of in turned.channels.items()}
+    inputs = inputs_of(tmp_path / "bent", msgspec.structs.replace(turned, channels=channels))
+    table = inputs["solve"] / "materials.json"
+    write_json(table, read_json(table) | {"model": {"tone": {"a": tone}}})
+    again = run(refine, inputs, tmp_path / "again")
+    found, expected = (entry["objects"]["thing"]["refined"]["candidates"]["found"]["held_out_loss"] for entry in (again, straight))
+    assert found == pytest.approx(expected, rel=1e-2)
 
 
 def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, caplog):
