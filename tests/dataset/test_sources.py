@@ -113,16 +113,32 @@ def test_a_light_of_photos_of_which_one_is_not_in_the_model_is_refused(folder):
     assert caught.value.key == "photos[1].world_from_camera"
 
 
-def test_photos_are_found_by_path_then_file_name_then_name_and_by_hand(folder):
-    colmap(folder, names=("photos/hall.png", "other/hall.png", "b/ATTIC.PNG", "c/attic.jpg"))
-    told = read_dataset(write(folder, {"colmap": "sparse/0"})).told
-    camera_of = {name: told[name] for name in PHOTOS}
-    assert set(camera_of) == set(PHOTOS)
-    colmap(folder, names=("x/hall.png", "y/hall.png"))
-    with pytest.raises(InputError, match="could be 'x/hall.png', 'y/hall.png'") as caught:
-        read_dataset(folder)
-    assert caught.value.key == "cameras.images.hall"
+@pytest.mark.parametrize(
+    "names, found",
+    [
+        (("photos/hall.png", "other/hall.png"), "photos/hall.png"),
+        (("other/hall.png", "hall.jpg"), "other/hall.png"),
+        (("b/hall.JPG", "attic.png"), "b/hall.JPG"),
+    ],
+)
+def test_a_photo_is_found_by_path_then_file_name_then_that_without_suffix(folder, names, found):
+    images = colmap(folder, names)
+    told = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).told["hall"]
+    assert np.allclose(told.poses["thing"].rotation, images[found].cam_from_world().rotation.matrix())
+
+
+def test_what_follows_a_dot_is_no_suffix_unless_of_an_image(folder):
+    (folder / "photos/r_0.5.png").write_text("")
+    transforms(folder, [frame("train/r_0.5", np.eye(3), (0, 0, 5)), frame("train/r_0", np.eye(3), (0, 0, 6))])
+    told = read_dataset(write(folder, {"transforms": "transforms.json"}, photo={"image": "photos/r_0.5.png"})).told
+    assert set(told) == {"hall"}
+
+
+def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(folder):
     images = colmap(folder, names=("x/hall.png", "y/hall.png"))
+    with pytest.raises(InputError, match="could be 'x/hall.png', 'y/hall.png'") as caught:
+        read_dataset(write(folder, {"colmap": "sparse/0"}))
+    assert caught.value.key == "cameras.images.hall"
     cameras = {"colmap": "sparse/0", "images": {"hall": "y/hall.png", "attic": "x/hall.png"}, "world_from_object": {"thing": {}}}
     told = read_dataset(write(folder, cameras)).told
     assert np.allclose(told["hall"].poses["thing"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
@@ -134,6 +150,23 @@ def test_a_photo_that_is_not_in_the_model_is_told_and_searched(folder, caplog):
         dataset = read_dataset(write(folder, {"colmap": "sparse/0"}))
     assert set(dataset.told) == {"hall"} and "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
     assert dataset_slice(dataset, "objects", "attic").facts["told"] is None
+
+
+def test_an_image_without_a_pose_is_not_in_the_model(folder):
+    colmap(folder)
+    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
+    model.deregister_frame(next(image.frame_id for image in model.images.values() if image.name == "attic.png"))
+    model.write_binary(str(folder / "sparse/0"))
+    assert set(read_dataset(write(folder, {"colmap": "sparse/0"})).told) == {"hall"}
+
+
+def test_keypoints_go_before_the_sources_pose(folder):
+    colmap(folder)
+    corners = ([0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1])
+    keypoints = [{"pixel": [10.0 * k, 5.0 * k * k], "point": point} for k, point in enumerate(corners)]
+    things = ({"name": "thing", "mesh": "thing", "keypoints": keypoints}, {"name": "other", "mesh": "thing"})
+    cameras = {"colmap": "sparse/0", "world_from_object": {"thing": {}, "other": {}}}
+    assert set(read_dataset(write(folder, cameras, things)).told["hall"].poses) == {"other"}
 
 
 def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
@@ -169,6 +202,7 @@ def test_a_change_of_one_pose_changes_the_slice_of_that_photo_only(folder):
         ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -0.1), ["distorts", "image_undistorter"]),
         ("OPENCV_FISHEYE", (60.0, 60.0, 100.0, 75.0, 0.1, 0.0, 0.0, 0.0), ["distorts", "image_undistorter"]),
         ("PINHOLE", (300.0, 310.0, 100.0, 75.0), ["not square", "SIMPLE_PINHOLE"]),
+        ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -8.0), ["no ray", "image_undistorter"]),
     ],
 )
 def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused(folder, model, params, words):
@@ -384,6 +418,12 @@ def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(
     point = np.array([0.2, -0.1, 1.0])
     place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
     assert np.allclose(Camera(width, height, focal, centre).project(point), place, atol=0 if scale in (1, 2, 0.5) else 0.5)
+
+
+@pytest.mark.parametrize("width, height", [(67, 50), (50, 67)])
+def test_the_longer_side_says_how_much_smaller_a_photo_is(width, height):
+    told = Told("colmap", 300.0, None, (200, 150) if width > height else (150, 200), {})
+    assert camera_told(told, width, height, "hall") == (300.0 * 67 / 200, (width / 2, height / 2))
 
 
 @pytest.mark.parametrize(
