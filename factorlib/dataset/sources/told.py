@@ -9,7 +9,6 @@ import logging
 from pathlib import Path, PurePosixPath
 
 import msgspec
-import pycolmap
 
 from factorlib.dataset.check import IMAGES, Refusal
 from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ObjectEntry, PhotoEntry, Pose, Told
@@ -103,8 +102,7 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal)
 def _pose(name: str, shot: Shot, source: CameraSource) -> Pose:
     """cam_from_object of scale 1: the camera's unit becomes the mesh's, which no picture can tell."""
     similarity = source.world_from_object[name]
-    turn = rigid(similarity.rotation, similarity.translation).rotation
-    cam_from_object = shot.cam_from_world * pycolmap.Rigid3d(turn, similarity.translation)
+    cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
     return Pose(as_rows(cam_from_object.rotation), tuple(float(x) / similarity.scale for x in cam_from_object.translation))
 
 
