@@ -17,6 +17,7 @@ from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
 from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Found, Search
+from factorlib.align.told import camera_told
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
@@ -30,6 +31,7 @@ from factorlib.stage import Inputs, Progress
 log = logging.getLogger("factorlib.align")
 AS_IT_IS = (1.0, 1.0, 1.0)
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
+CURE_OF_TOLD = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
@@ -45,12 +47,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
     earlier = read_earlier(inputs["poses"]).get(name) if "poses" in inputs.folders else None
     things = things_of(slice_, channels, inputs, params, earlier)
-    focal, before = (facts["focal_px"], facts["focal_source"]), earlier.focal if earlier else None
-    result = placed(things, camera_of(slice_.camera, facts), *focal, name, params.search, before)
+    result = placed(things, *camera_of(slice_, facts, name), name, params.search, earlier.focal if earlier else None)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    objects = {thing.name: entry(thing, k, result, maps, params) for k, thing in enumerate(things)}
+    told = slice_.told.source if slice_.told else None
+    sources = {thing.name: "given" if thing.pose else told for thing in slice_.objects}
+    objects = {thing.name: entry(thing, k, result, maps, params, sources[thing.name]) for k, thing in enumerate(things)}
     for thing_name, facts_of_it in objects.items():
         complain(name, thing_name, facts_of_it, params.strict)
     left_out = np.isin(maps.object, [k for k, facts_of_it in enumerate(objects.values(), start=1) if facts_of_it["left_out"]])
@@ -61,19 +64,26 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def things_of(
     slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, earlier: EarlierPhoto | None = None
 ) -> list[Thing]:
-    """Every object of the photo; poses that dataset.yaml gives go before those found earlier, these before keypoints."""
+    """Every object of the photo; poses that dataset.yaml or its source of cameras gives go before those found earlier,
+    these before keypoints."""
     things = []
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        before = earlier.objects.get(thing.name) if earlier and not thing.pose else None
+        pose = pose_of(thing, slice_.told)
+        before = earlier.objects.get(thing.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
         caster = Caster(scaled(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
-        pose = Pose(np.array(thing.pose.rotation), np.array(thing.pose.translation)) if thing.pose else None
         found = before.as_found() if before else None
         things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing), found, scale))
     return things
+
+
+def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:
+    """The pose that dataset.yaml gives, or else its source of cameras."""
+    pose = thing.pose or (told.poses.get(thing.name) if told else None)
+    return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
 
 
 def keypoints_of(thing: schema.ObjectEntry) -> Keypoints | None:
@@ -82,10 +92,18 @@ def keypoints_of(thing: schema.ObjectEntry) -> Keypoints | None:
     return Keypoints(np.array([k.pixel for k in thing.keypoints]), np.array([k.point for k in thing.keypoints]))
 
 
-def camera_of(given: schema.Camera, facts: dict) -> Camera:
-    """The photo's camera, principal point in the middle unless given; its focal length is settled later."""
-    centre = given.principal_point or (facts["width"] / 2, facts["height"] / 2)
-    return Camera(facts["width"], facts["height"], 1.0, tuple(centre))
+def camera_of(slice_: schema.ObjectsSlice, facts: dict, photo: str) -> tuple[Camera, float | None, str | None]:
+    """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
+
+    What dataset.yaml gives goes before what its source of cameras tells, and that before EXIF and the middle of the photo.
+    """
+    width, height = facts["width"], facts["height"]
+    focal, source, centre = facts["focal_px"], facts["focal_source"], (width / 2, height / 2)
+    if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
+        told_focal, centre = camera_told(slice_.told, width, height, photo)
+        if source != "dataset":
+            focal, source = told_focal, slice_.told.source
+    return Camera(width, height, 1.0, tuple(slice_.camera.principal_point or centre)), focal, source
 
 
 def camera_entry(result: Placed) -> dict:
@@ -98,8 +116,11 @@ def camera_entry(result: Placed) -> dict:
     }
 
 
-def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> dict:
-    """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out."""
+def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> dict:
+    """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
+
+    source: where the pose is from, if it was not searched.
+    """
     seen = np.where(maps.object == k + 1, maps.label, 0)
     iou, agreement = silhouette_iou(thing.evidence, seen), label_agreement(thing.evidence, seen)
     found, pose, trust = result.found[k], result.poses[k], trust_in(thing, result, k)
@@ -109,19 +130,13 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params) -> d
         "scale": list(thing.scale),
         "silhouette_iou": iou,
         "label_agreement": agreement,
-        "source": source_of(found),
+        "source": source if found is None else "refined" if found.earlier else "keypoints" if found.by_keypoints else "found",
         "score": found.score if found else None,
         "runner_up": runner_up_entry(found, thing.caster),
         **msgspec.to_builtins(trust),
         "doubts": reasons,
         "left_out": bool(reasons) and found is not None and not params.keep_doubtful,
     }
-
-
-def source_of(found: Found | None) -> str:
-    if found is None:
-        return "given"
-    return "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
 
 
 def runner_up_entry(found: Found | None, caster: Caster) -> dict | None:
@@ -136,10 +151,11 @@ def pose_entry(pose: Pose) -> dict:
 
 
 def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:
+    cure = CURE_OF_TOLD if facts["source"] in schema.SOURCES else CURE
     for reason in facts["doubts"]:
         if strict:
-            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=CURE)
-        log.warning("%s: %s: %s; %s", photo, thing, reason, CURE)
+            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=cure)
+        log.warning("%s: %s: %s; %s", photo, thing, reason, cure)
     if facts["left_out"]:
         log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, thing)
 

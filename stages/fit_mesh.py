@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from factorlib.align.camera import Camera
-from factorlib.align.earlier import EarlierPhoto
+from factorlib.align.earlier import SEARCHED, EarlierPhoto
 from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.proportions import Sighting, Standards, Verdict, proportions
 from factorlib.align.raster import Caster, rasterise
@@ -71,11 +71,11 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: dict, inputs: Inputs, 
     channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_json(inputs["masks"] / f"{photo}.json")
     earlier, (height, width) = msgspec.convert(entry, EarlierPhoto), channels["label"].shape
     camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
-    prior = prior_before(entry["camera"]["focal_source"], facts["focal_px"], facts["focal_source"], width, height)
+    prior = prior_before(camera.focal, entry["camera"]["focal_source"], facts["focal_px"], width, height)
     alone = prior if len(slice_.objects) == 1 else FocalPrior(camera.focal, 0.0)
     for number, thing in enumerate(slice_.objects, start=1):
         said, mesh = entry["objects"][thing.name], slice_.meshes[thing.mesh]
-        if said["source"] == "given" or said["silhouette_iou"] < params.least_iou:
+        if said["source"] not in SEARCHED or said["silhouette_iou"] < params.least_iou:
             continue
         read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials)
         evidence = object_evidence(channels, number, read.labels, thing.mask is not None)

@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from factorlib.align.camera import Camera, angle_between
-from factorlib.align.earlier import EarlierPhoto
+from factorlib.align.earlier import SEARCHED, EarlierPhoto
 from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import normal_difference, prior_before
@@ -70,12 +70,12 @@ def scene_of(inputs: Inputs, photo: dict, entry: dict, shadows: int) -> Scene:
         file = inputs.file(mesh.file)
         caster = Caster(scaled(read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials), pose.scale))
         evidence, other = object_evidence(photo, number, caster.mesh.labels, thing.mask is not None), pose.runner_up
-        moves = said["source"] != "given"
+        moves = said["source"] in SEARCHED
         things.append(Thing(caster, evidence, pose.pose(), other.pose() if other else None, moves, not said["left_out"]))
     height, width = photo["label"].shape
     camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
     facts = read_json(inputs["masks"] / f"{inputs.photo}.json")
-    return Scene(camera, things, prior_before(entry["camera"]["focal_source"], facts["focal_px"], facts["focal_source"], width, height), shadows)
+    return Scene(camera, things, prior_before(camera.focal, entry["camera"]["focal_source"], facts["focal_px"], width, height), shadows)
 
 
 def told(thing: Thing, result: Refined, camera: Camera) -> dict:

@@ -3,6 +3,8 @@
 Writes align.json to build/bench/align, after every photo anew, and prints the tables; --docs also refreshes docs/align.md.
 The whole set: `python -m benchmarks.align --views 20 --seeds 3 --wrong-views 2`.  Rows of kinds that are not run stay as they
 were, so that the kinds can be run one after another; only their doubts are told anew, by the standards of now (`--kinds ""`: of all).
+
+`--real FOLDER` aligns real photographs instead, a dataset with reference_poses.json, and writes real.json: see `real`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ import typer
 
 from benchmarks.align.cases import RIGHT, WRONG, keys
 from benchmarks.align.measure import judged, measured_key
-from benchmarks.align.tables import as_tables
+from benchmarks.align.real import measured_photo, real_keys
+from benchmarks.align.tables import as_tables, real_tables
 from benchmarks.markdown import refresh
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import read_json, write_json
@@ -32,7 +35,10 @@ def main(
     jobs: Annotated[int, typer.Option(help="processes, one thread each")] = 1,
     docs: Annotated[bool, typer.Option(help="also refresh the tables of docs/align.md")] = False,
     out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "align",
+    real: Annotated[list[Path] | None, typer.Option(help="datasets of real photographs with reference_poses.json, instead")] = None,
 ) -> None:
+    if real:
+        return real_photos(real, jobs, docs, out)
     chosen = tuple(kind for kind in kinds.split(",") if kind)
     for kind in chosen:
         if kind not in RIGHT + WRONG:
@@ -51,6 +57,31 @@ def main(
         print(f"\n{inner}")
     if docs:
         refresh(ROOT / "docs" / "align.md", tables)
+
+
+def real_photos(folders: list[Path], jobs: int, docs: bool, out: Path) -> None:
+    """Sets that are not run stay in real.json as they were."""
+    out.mkdir(parents=True, exist_ok=True)
+    before = read_json(out / "real.json")["photos"] if (out / "real.json").is_file() else []
+    rows = [row for row in before if row["set"] not in {folder.resolve().name for folder in folders}]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for some in pool.map(measured_photo, real_keys(folders)):
+            rows += some
+            for row in some:
+                print(real_said(row), flush=True)
+            write_json(out / "real.json", {"photos": rows})
+    write_json(out / "real.json", {"photos": rows})
+    tables = real_tables(rows)
+    for inner in tables.values():
+        print(f"\n{inner}")
+    if docs:
+        refresh(ROOT / "docs" / "align.md", tables)
+
+
+def real_said(row: dict) -> str:
+    errors = f"{row['rotation_error_deg']:.1f}° turned, {row['about_the_ray_deg']:.1f}° less the ray's, normals {row['normal_error_deg']:.1f}°"
+    fit = f"focal × {row['focal_ratio']:.2f} ({row['focal_source']}), IoU {row['silhouette_iou']:.3f}, {row['processor_s']:.0f} s"
+    return f"{row['set']}/{row['photo']}: {errors}, {fit}; {'; '.join(row['doubts']) or 'no doubt'}"
 
 
 def said(row: dict) -> str:

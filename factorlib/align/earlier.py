@@ -18,6 +18,7 @@ FILE = "poses.json"
 Vec3 = tuple[float, float, float]
 POSITIVE = Annotated[float, msgspec.Meta(gt=0)]
 Factors = tuple[POSITIVE, POSITIVE, POSITIVE]
+SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
 ROTATION_ERROR = 1e-3  # of RᵀR from the identity
 
 

@@ -67,7 +67,7 @@ class Placed(msgspec.Struct, frozen=True):
     """The photo's camera with its focal length, where that is from, its standard error (log), and each object's pose."""
 
     camera: Camera
-    focal_source: str  # dataset | exif | estimated
+    focal_source: str  # dataset | colmap | transforms | bop | exif | estimated
     log_focal_sigma: float
     poses: list[Pose]
     found: list[Found | None]  # None where the pose was given

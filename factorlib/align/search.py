@@ -73,9 +73,10 @@ def focal_prior(camera_focal: float | None, source: str | None, width: int, heig
     return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
 
 
-def prior_before(source: str, focal: float | None, known_source: str | None, width: int, height: int) -> FocalPrior:
-    """What was known before a focal length of `source` was found; what was known from `known_source` counts only where it stood."""
-    return focal_prior(focal if source == known_source else None, known_source, width, height)
+def prior_before(found: float, source: str, exif: float | None, width: int, height: int) -> FocalPrior:
+    """What was known before a focal length was found: EXIF's where it stood, nothing where it was estimated, else all."""
+    known = {"exif": exif, "estimated": None}.get(source, found)
+    return focal_prior(known, source, width, height)
 
 
 def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:

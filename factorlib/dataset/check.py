@@ -1,6 +1,7 @@
 """What can be wrong with a dataset without opening a single image or mesh; each is refused with its key and a cure.
 
-`check_dataset` and `check_truth` walk a decoded file once and raise at the first thing that does not hold.
+`check_dataset` and `check_truth` walk a decoded file once and raise at the first thing that does not hold; `check_lights`
+follows once cameras that are known from elsewhere have been read.
 """
 
 from __future__ import annotations
@@ -13,7 +14,18 @@ from typing import Any, NoReturn
 
 import msgspec
 
-from factorlib.dataset.schema import ENCODINGS, FORMAT, MAX_MATERIALS, DatasetFile, MeshEntry, ObjectEntry, PhotoEntry, TruthFile
+from factorlib.dataset.schema import (
+    ENCODINGS,
+    FORMAT,
+    MAX_MATERIALS,
+    SOURCES,
+    CameraSource,
+    DatasetFile,
+    MeshEntry,
+    ObjectEntry,
+    PhotoEntry,
+    TruthFile,
+)
 from factorlib.errors import InputError, did_you_mean
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -43,7 +55,7 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     refuse = Refusal(file, file.parent)
     if spec.format != FORMAT:
         refuse("format", f"format {spec.format} is not known", f"this version reads format: {FORMAT}")
-    _check_numbers(spec, refuse)
+    check_numbers(spec, refuse)
     _check_materials(spec.materials, refuse)
     for name, mesh in spec.meshes.items():
         _check_mesh(name, mesh, spec.materials, refuse)
@@ -52,7 +64,8 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     _check_unique("photos", (photo.name for photo in spec.photos), "photo", refuse)
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    _check_lights(spec.photos, refuse)
+    if spec.cameras is not None:
+        _check_source(spec.cameras, spec, refuse)
     if spec.truth is not None:
         check_path("truth", spec.truth, (".yaml", ".yml"), refuse, must_exist=False)
 
@@ -60,31 +73,42 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
 def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -> None:
     """The same for truth.yaml: every name in it is one of the dataset's, every map a path inside `folder`."""
     refuse = Refusal(file, folder)
-    _check_numbers(truth, refuse)
+    check_numbers(truth, refuse)
     photos = {photo.name: photo for photo in spec.photos}
     lights = {photo.illumination or photo.name for photo in spec.photos}
     for name in truth.materials:
-        _check_known(f"materials.{name}", name, spec.materials, "material", refuse)
+        check_known(f"materials.{name}", name, spec.materials, "material", refuse)
     for group, known, kind in (("illumination", lights, "illumination"), ("normals", photos, "photo")):
         for name, path in getattr(truth, group).items():
-            _check_known(f"{group}.{name}", name, known, kind, refuse)
+            check_known(f"{group}.{name}", name, known, kind, refuse)
             check_path(f"{group}.{name}", path, MAPS, refuse, must_exist=False)
     for name, poses in truth.poses.items():
-        _check_known(f"poses.{name}", name, photos, "photo", refuse)
+        check_known(f"poses.{name}", name, photos, "photo", refuse)
         for thing, pose in poses.items():
-            _check_known(f"poses.{name}.{thing}", thing, [o.name for o in photos[name].objects], "object", refuse)
-            _check_rotation(f"poses.{name}.{thing}.rotation", pose.rotation, refuse)
+            check_known(f"poses.{name}.{thing}", thing, [o.name for o in photos[name].objects], "object", refuse)
+            check_rotation(f"poses.{name}.{thing}.rotation", pose.rotation, refuse)
 
 
 def check_path(key: str, path: str, suffixes: Iterable[str], refuse: Refusal, must_exist: bool = True) -> None:
     """A path of a known suffix that leads to a file inside the dataset's folder, links followed."""
-    target, root = refuse.folder / path, refuse.folder.resolve()
-    if not path or Path(path).is_absolute() or not target.resolve().is_relative_to(root):
-        refuse(key, f"{path!r} leads outside the dataset", f"copy the file into {root} and name it relative to that folder")
+    target = _inside(key, path, refuse, "file")
     if target.suffix.lower() not in suffixes:
         refuse(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
     if must_exist and not target.is_file():
         refuse(key, f"there is no file {path!r}", _nearby(target))
+
+
+def check_folder(key: str, path: str, refuse: Refusal) -> None:
+    """A path that leads to a folder inside the dataset's, links followed."""
+    if not _inside(key, path, refuse, "folder").is_dir():
+        refuse(key, f"there is no folder {path!r}", "copy it there, or correct the path")
+
+
+def _inside(key: str, path: str, refuse: Refusal, kind: str) -> Path:
+    target, root = refuse.folder / path, refuse.folder.resolve()
+    if not path or Path(path).is_absolute() or not target.resolve().is_relative_to(root):
+        refuse(key, f"{path!r} leads outside the dataset", f"copy the {kind} into {root} and name it relative to that folder")
+    return target
 
 
 def _nearby(target: Path) -> str:
@@ -93,7 +117,7 @@ def _nearby(target: Path) -> str:
     return cure if cure.startswith("did") else f"put it at {target}, or correct the path"
 
 
-def _check_numbers(value: Any, refuse: Refusal) -> None:
+def check_numbers(value: Any, refuse: Refusal) -> None:
     for key, number in _numbers(msgspec.to_builtins(value), ""):
         if not math.isfinite(number):
             refuse(key, f"{number} is not a finite number", "give a number, or leave the key out")
@@ -115,7 +139,7 @@ def _check_name(key: str, name: str, refuse: Refusal) -> None:
         refuse(key, f"{name!r} is not a name", "names are made of A-Z a-z 0-9 _ and -, for they name files")
 
 
-def _check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:
+def check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:
     known = list(known)
     if name not in known:
         refuse(key, f"unknown {kind} {name!r}", did_you_mean(name, known) if known else f"the dataset has no {kind} here")
@@ -147,10 +171,10 @@ def _check_mesh(name: str, mesh: MeshEntry, materials: list[str], refuse: Refusa
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
     if mesh.material is not None:
-        _check_known(f"{key}.material", mesh.material, materials, "material", refuse)
+        check_known(f"{key}.material", mesh.material, materials, "material", refuse)
     for part, material in (mesh.parts or {}).items():
         _check_part(f"{key}.parts.{part}", part, mesh, refuse)
-        _check_known(f"{key}.parts.{part}", material, materials, "material", refuse)
+        check_known(f"{key}.parts.{part}", material, materials, "material", refuse)
 
 
 def _check_part(key: str, part: str, mesh: MeshEntry, refuse: Refusal) -> None:
@@ -166,11 +190,11 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
         refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
     check_path(f"{key}.image", photo.image, IMAGES, refuse)
     if photo.encoding is not None:
-        _check_known(f"{key}.encoding", photo.encoding, ENCODINGS, "encoding", refuse)
+        check_known(f"{key}.encoding", photo.encoding, ENCODINGS, "encoding", refuse)
     if photo.illumination is not None:
         _check_name(f"{key}.illumination", photo.illumination, refuse)
     if photo.world_from_camera is not None:
-        _check_rotation(f"{key}.world_from_camera", photo.world_from_camera, refuse)
+        check_rotation(f"{key}.world_from_camera", photo.world_from_camera, refuse)
     if photo.camera is not None and photo.camera.focal_px is not None and photo.camera.focal_px <= 0:
         refuse(f"{key}.camera.focal_px", f"a focal length of {photo.camera.focal_px}", "give pixels, more than 0, or leave it out")
     _check_masks(f"{key}.masks", photo, spec.materials, refuse)
@@ -187,23 +211,23 @@ def _check_masks(key: str, photo: PhotoEntry, materials: list[str], refuse: Refu
     if not photo.masks:
         refuse(key, "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
     for material, path in photo.masks.items():
-        _check_known(f"{key}.{material}", material, materials, "material", refuse)
+        check_known(f"{key}.{material}", material, materials, "material", refuse)
         check_path(f"{key}.{material}", path, (".png",), refuse)
 
 
 def _check_object(key: str, thing: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
     _check_name(f"{key}.name", thing.name, refuse)
-    _check_known(f"{key}.mesh", thing.mesh, spec.meshes, "mesh", refuse)
+    check_known(f"{key}.mesh", thing.mesh, spec.meshes, "mesh", refuse)
     mesh = spec.meshes[thing.mesh]
     for part, material in thing.materials.items():
         _check_part(f"{key}.materials.{part}", part, mesh, refuse)
         if mesh.parts:
-            _check_known(f"{key}.materials.{part}", part, mesh.parts, "part", refuse)
-        _check_known(f"{key}.materials.{part}", material, spec.materials, "material", refuse)
+            check_known(f"{key}.materials.{part}", part, mesh.parts, "part", refuse)
+        check_known(f"{key}.materials.{part}", material, spec.materials, "material", refuse)
     if thing.mask is not None:
         check_path(f"{key}.mask", thing.mask, (".png",), refuse)
     if thing.pose is not None:
-        _check_rotation(f"{key}.pose.rotation", thing.pose.rotation, refuse)
+        check_rotation(f"{key}.pose.rotation", thing.pose.rotation, refuse)
     if thing.keypoints:
         _check_keypoints(f"{key}.keypoints", thing, refuse)
 
@@ -233,7 +257,7 @@ def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: 
         refuse(key, f"every {name} lies on one line", "name places in different directions: about a line the object could turn")
 
 
-def _check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
+def check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
     gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
     worst = max(abs(entry) for row in gram for entry in row)
     if worst > ROTATION_TOLERANCE:
@@ -246,8 +270,40 @@ def _check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
         )
 
 
-def _check_lights(photos: list[PhotoEntry], refuse: Refusal) -> None:
+def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
+    """One source, its path inside the folder, and every photo, object and mesh it names one of the dataset's."""
+    named = [kind for kind in SOURCES if getattr(source, kind) is not None]
+    if len(named) != 1:
+        refuse("cameras", f"names {' and '.join(named) or 'no source'}", f"name one of {', '.join(SOURCES)}")
+    kind, path = named[0], getattr(source, named[0])
+    if kind == "transforms":
+        check_path("cameras.transforms", path, (".json",), refuse)
+    else:
+        check_folder(f"cameras.{kind}", path, refuse)
+    for key in ("world_from_object", "world_from_camera") if kind == "bop" else ("obj_ids", "mesh_unit_mm"):
+        if getattr(source, key) != getattr(CameraSource(), key):
+            cure = "a BOP scene gives poses by obj_ids" if kind == "bop" else "for this source, world_from_object gives poses"
+            refuse(f"cameras.{key}", f"does not go with {kind}", f"leave it out: {cure}")
+    for name in source.images:
+        check_known(f"cameras.images.{name}", name, [photo.name for photo in spec.photos], "photo", refuse)
+    for name, similarity in source.world_from_object.items():
+        key = f"cameras.world_from_object.{name}"
+        check_known(key, name, {thing.name: None for photo in spec.photos for thing in photo.objects}, "object", refuse)
+        check_rotation(f"{key}.rotation", similarity.rotation, refuse)
+        _check_positive(f"{key}.scale", similarity.scale, refuse)
+    for name in source.obj_ids:
+        check_known(f"cameras.obj_ids.{name}", name, spec.meshes, "mesh", refuse)
+    _check_positive("cameras.mesh_unit_mm", source.mesh_unit_mm, refuse)
+
+
+def _check_positive(key: str, number: float, refuse: Refusal) -> None:
+    if number <= 0:
+        refuse(key, f"{number} is not more than 0", "give how many units of the one are one of the other")
+
+
+def check_lights(photos: list[PhotoEntry], file: Path) -> None:
     """Photos that share a light are all fixed to the camera, or all to the world."""
+    refuse = Refusal(file, file.parent)
     first: dict[str, int] = {}
     for index, photo in enumerate(photos):
         light = photo.illumination or photo.name

@@ -1,6 +1,7 @@
 """Reading a dataset: YAML to types, then every check that needs no pixel.
 
-Imports nothing heavy, for a run that finds nothing to do passes here too.
+Imports nothing heavy, for a run that finds nothing to do passes here too; only a dataset that names a source of cameras
+pays for pycolmap (.2 s).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import logging
 import os
 from pathlib import Path
 
-from factorlib.dataset.check import Refusal, check_dataset, check_truth
+from factorlib.dataset.check import Refusal, check_dataset, check_lights, check_truth
 from factorlib.dataset.companions import companions_of_mesh
 from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
 from factorlib.errors import InputError
@@ -34,7 +35,13 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name")
     spec = read_yaml(file, DatasetFile)
     check_dataset(spec, file)
-    return Dataset(folder=folder, spec=spec, companions=_companions(spec, file), truth=_read_truth(spec, file))
+    companions, told = _companions(spec, file), {}
+    if spec.cameras is not None:
+        from factorlib.dataset.sources.told import told_by_source
+
+        spec, told = told_by_source(spec, file)
+    check_lights(spec.photos, file)
+    return Dataset(folder=folder, spec=spec, companions=companions, told=told, truth=_read_truth(spec, file))
 
 
 def _companions(spec: DatasetFile, file: Path) -> dict[str, list[str]]:

@@ -15,6 +15,7 @@ import msgspec
 FORMAT = 1
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
 MAX_MATERIALS = LEFT_OUT - 1
+SOURCES = ("colmap", "transforms", "bop")
 ENCODINGS = ("srgb", "linear", "gamma2.2")
 
 Vec2 = tuple[float, float]
@@ -80,6 +81,32 @@ class PhotoEntry(_Format):
     objects: list[ObjectEntry] = []
 
 
+class Similarity(_Format):
+    """world_from_object: x_world = scale · rotation · x_object + translation; as it stands, the mesh lies in the world's frame."""
+
+    scale: float = 1.0
+    rotation: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation: Vec3 = (0.0, 0.0, 0.0)
+
+
+class CameraSource(_Format):
+    """Where cameras, and perhaps poses, are known from: exactly one of colmap, transforms, bop.
+
+    colmap, bop: a folder; transforms: a json.  images: photo -> its image in the source (BOP: its id), where the file's
+    name does not tell.  world_from_object: object -> where it lies in the source's world; its pose is the source's then.
+    world_from_camera: the source's rotations fix lights to its world.  obj_ids: mesh -> BOP's obj_id.
+    """
+
+    colmap: str | None = None
+    transforms: str | None = None
+    bop: str | None = None
+    images: dict[str, str | int] = {}
+    world_from_object: dict[str, Similarity] = {}
+    world_from_camera: bool = False
+    obj_ids: dict[str, int] = {}
+    mesh_unit_mm: float = 1.0
+
+
 class DatasetFile(_Format):
     """dataset.yaml."""
 
@@ -87,6 +114,7 @@ class DatasetFile(_Format):
     materials: list[str]
     photos: list[PhotoEntry]
     meshes: dict[str, MeshEntry] = {}
+    cameras: CameraSource | None = None
     truth: str | None = None
 
 
@@ -107,15 +135,31 @@ class TruthFile(_Format):
     poses: dict[str, dict[str, Pose]] = {}
 
 
+class Told(msgspec.Struct, frozen=True):
+    """What a source of cameras says of one photo, in its own pixels: of an image of `size` (width, height).
+
+    size: None where the source does not say it, the height None where only the width counts (a focal length in widths);
+    principal_point: None where the source does not say it; poses: object -> cam_from_object, in the mesh's units
+    """
+
+    source: Literal["colmap", "transforms", "bop"]
+    focal_px: float
+    principal_point: Vec2 | None
+    size: tuple[float, float | None] | None
+    poses: dict[str, Pose]
+
+
 class Dataset(msgspec.Struct, frozen=True):
     """A dataset that has been read and found good.
 
     companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
+    told: photo -> what the source of cameras says of it
     """
 
     folder: Path
     spec: DatasetFile
     companions: dict[str, list[str]] = {}
+    told: dict[str, Told] = {}
     truth: TruthFile | None = None
 
     @property
@@ -145,11 +189,12 @@ class PhotoSlice(msgspec.Struct, frozen=True):
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):
-    """What is needed to lay meshes over a photo: its camera, its objects, and the meshes these use."""
+    """What is needed to lay meshes over a photo: its camera, its objects, the meshes these use, and what else is known."""
 
     camera: Camera
     objects: list[ObjectEntry]
     meshes: dict[str, MeshEntry]
+    told: Told | None = None
 
 
 class LightSlice(msgspec.Struct, frozen=True):

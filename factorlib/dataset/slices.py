@@ -58,7 +58,8 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {thing.mesh: dataset.spec.meshes[thing.mesh] for thing in photo.objects}
-    facts = schema.ObjectsSlice(camera=photo.camera or schema.Camera(), objects=photo.objects, meshes=meshes)
+    camera = photo.camera or schema.Camera()
+    facts = schema.ObjectsSlice(camera=camera, objects=photo.objects, meshes=meshes, told=dataset.told.get(photo.name))
     files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
     return facts, files + _object_masks(photo)
 

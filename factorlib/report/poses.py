@@ -41,11 +41,12 @@ def pose_rows(run: Artifacts) -> list[PoseRow]:
 
 
 def _row(run: Artifacts, photo: str, entry: dict, facts: dict) -> PoseRow:
+    source = entry["camera"].get("focal_source", facts.get("focal_source"))
     return PoseRow(
         photo,
         _overlay(run, photo),
         entry["camera"].get("focal_px"),
-        facts.get("focal_source"),
+        None if source == "estimated" else source,
         [_object(name, said) for name, said in entry["objects"].items()],
     )
 

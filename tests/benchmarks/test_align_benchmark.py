@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from benchmarks.align import cases, shapes
+from benchmarks.align import cases, real, shapes
 from benchmarks.align.measure import normal_error_deg
-from benchmarks.align.tables import as_tables
+from benchmarks.align.tables import as_tables, real_tables
 from benchmarks.markdown import refresh
+from factorlib.align.camera import Pose, angle_between, rotation_of_vector
+from factorlib.align.coarse import toward
 from factorlib.align.raster import rasterise
 from factorlib.dataset.read import read_dataset
+from factorlib.errors import InputError
+from factorlib.jsonfile import write_json
 from factorlib.meshes.read import read_mesh
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "align.md"
@@ -81,3 +85,55 @@ def test_tables_have_their_place(tmp_path):
     page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
     refresh(page, tables)
     assert all(inner in page.read_text(encoding="utf-8") for inner in tables.values())
+
+
+# ---- real photographs: a rendered one stands in for them --------------------------------------------------------
+
+
+def test_a_turn_of_the_ray_to_the_object_is_no_error_of_the_pose():
+    """The camera looks straight at the object, and past it: what it sees of the object is the same."""
+    rotation, centre = rotation_of_vector(np.array([0.4, -0.9, 0.3])), np.array([0.2, -0.1, 0.5])
+    straight = Pose(rotation, np.array([0.0, 0.0, 5.0]) - rotation @ centre)
+    ray = toward(np.array([0.2, -0.35]))
+    past = Pose(ray @ straight.rotation, ray @ straight.translation)
+    assert angle_between(straight.rotation, past.rotation) > 15
+    assert np.allclose(real.about_the_ray(past, centre), real.about_the_ray(straight, centre))
+
+
+def test_a_common_turn_is_taken_off_and_nothing_else():
+    turn, apart = np.array([0.05, 0.02, -0.1]), np.array([0.0, 0.01, 0.0])
+    angle, left = real.common_turn([turn.tolist()] * 3)
+    assert angle == pytest.approx(np.rad2deg(np.linalg.norm(turn))) and np.allclose(left, 0, atol=1e-5)
+    assert real.common_turn([apart.tolist(), (-apart).tolist()])[1] == pytest.approx([np.rad2deg(0.01)] * 2)
+
+
+def real_set(folder):
+    """A photo of a known pose, which dataset.yaml gives away; and the reference beside it, its focal length a tenth too long."""
+    made = cases.case("exact", "stack", 0, 0)
+    cases.write_set(folder, [made])
+    pose = {"rotation": made.pose.rotation.tolist(), "translation": made.pose.translation.tolist()}
+    text = (folder / "dataset.yaml").read_text(encoding="utf-8")
+    (folder / "dataset.yaml").write_text(text.replace("mesh: stack", f"mesh: stack\n    pose: {pose}"), encoding="utf-8")
+    camera = {"focal_px": 1.1 * made.camera.focal, "principal_point": list(made.camera.centre)}
+    write_json(folder / "reference_poses.json", {made.name: {"camera": camera, "objects": {"thing": pose}, "silhouette_iou": 0.9}})
+    return made
+
+
+def test_a_real_photo_is_aligned_with_its_cameras_withheld(tmp_path):
+    made = real_set(tmp_path / "set")
+    dataset = read_dataset(tmp_path / "set")
+    assert dataset.photo(made.name).objects[0].pose and not real.withheld(dataset).photo(made.name).objects[0].pose
+    assert list(real.real_keys([tmp_path / "set"])) == [(tmp_path / "set", made.name)]
+    (row,) = real.measured_photo((tmp_path / "set", made.name))
+    assert 0 < row["rotation_error_deg"] < 0.5 and row["focal_source"] == "estimated" and row["silhouette_iou"] > 0.98
+    assert row["focal_ratio"] == pytest.approx(1 / 1.1, rel=0.02) and row["doubts"] == []
+    tables = real_tables([row])
+    assert "| set thing | 1 |" in tables["real-sets"] and f"| set, {made.name} |" in tables["real-photos"]
+    page = tmp_path / "align.md"
+    page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
+    refresh(page, tables)
+
+
+def test_a_folder_without_reference_poses_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"there is no reference_poses\.json"):
+        list(real.real_keys([tmp_path]))

@@ -1,0 +1,134 @@
+"""A NeRF-style transforms.json, as nerfstudio and instant-ngp write it and as NeRF's own scenes have it.
+
+Its cameras are OpenGL's (x right, y up, z backward) and its matrices lead from camera to world.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import msgspec
+import pycolmap
+
+from factorlib.dataset.check import Refusal, check_numbers, check_rotation
+from factorlib.dataset.schema import Vec3
+from factorlib.dataset.sources.shot import Shot, rigid
+from factorlib.yamlfile import convert
+
+FISHEYE, PERSPECTIVE = "OPENCV_FISHEYE", ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+Row4 = tuple[float, float, float, float]
+
+
+class Lens(msgspec.Struct, frozen=True):
+    """Of all frames, or of one; pixels, centres at 0.5."""
+
+    camera_model: str | None = None
+    is_fisheye: bool | None = None
+    camera_angle_x: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+
+class Frame(Lens, frozen=True, kw_only=True):
+    """transform_matrix: world_from_camera, OpenGL, 3 or 4 rows."""
+
+    file_path: str
+    transform_matrix: list[Row4]
+
+
+class TransformsFile(Lens, frozen=True, kw_only=True):
+    frames: list[Frame]
+
+
+def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
+    """The frames of the dataset's file `path`, in its order."""
+    content = read_source(refuse.folder / path, TransformsFile)
+    said = Refusal(refuse.folder / path, refuse.folder)
+    return [_shot(f"frames[{index}]", frame, lens_of(frame, content), said) for index, frame in enumerate(content.frames)]
+
+
+def read_source(file: Path, type_: type):
+    """A json as a value of `type_`.  Raises InputError that names file and key."""
+    refuse = Refusal(file, file.parent)
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        refuse("", f"not readable as JSON ({error})", "copy it again from where it came")
+    check_numbers(content, refuse)
+    return convert(content, type_, file)
+
+
+def lens_of(frame: Frame, content: TransformsFile) -> Lens:
+    """What the frame itself says, and the file's own for the rest."""
+    own = {name: getattr(frame, name) for name in Lens.__struct_fields__}
+    return Lens(**{name: getattr(content, name) if value is None else value for name, value in own.items()})
+
+
+def _shot(key: str, frame: Frame, lens: Lens, refuse: Refusal) -> Shot:
+    camera, size = _camera(key, lens, refuse)
+    return Shot(
+        image=frame.file_path,
+        camera=camera,
+        size=size,
+        centred=lens.cx is None or lens.cy is None,
+        cam_from_world=_cam_from_world(f"{key}.transform_matrix", frame.transform_matrix, refuse),
+        key=f"{Path(refuse.file).name}: {key}",
+    )
+
+
+def _cam_from_world(key: str, rows: list[Row4], refuse: Refusal) -> pycolmap.Rigid3d:
+    if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
+        refuse(key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+    check_rotation(key, tuple(row[:3] for row in rows[:3]), refuse)
+    opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
+    centre: Vec3 = tuple(row[3] for row in rows[:3])
+    return rigid(opencv, centre).inverse()
+
+
+def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
+    """With the size of its image; without `w`, a field of view is a focal length in widths of the photo."""
+    if lens.fl_x is None and lens.camera_angle_x is None:
+        refuse(f"{key}.fl_x", "neither fl_x nor camera_angle_x is given", "give the focal length fl_x in pixels, with w and h")
+    if lens.fl_x is None and lens.w is None:
+        return _pinhole(0.5 / math.tan(lens.camera_angle_x / 2), 1, 1), (1.0, None)
+    focal = lens.fl_x if lens.fl_x is not None else 0.5 * lens.w / math.tan(lens.camera_angle_x / 2)
+    if focal <= 0:
+        refuse(f"{key}.fl_x", f"a focal length of {focal}", "give pixels, more than 0")
+    if lens.w is None or lens.h is None:
+        size, (width, height) = None, (2 * (lens.cx or focal), 2 * (lens.cy or focal))
+    else:
+        size = (width, height) = lens.w, lens.h
+    fy = lens.fl_y if lens.fl_y is not None else focal
+    cx, cy = lens.cx if lens.cx is not None else width / 2, lens.cy if lens.cy is not None else height / 2
+    return pycolmap.Camera(width=round(width), height=round(height), **_model(key, lens, [focal, fy, cx, cy], refuse)), size
+
+
+def _model(key: str, lens: Lens, pinhole: list[float], refuse: Refusal) -> dict:
+    """COLMAP's model and its parameters."""
+    k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2))
+    if not any((k1, k2, k3, k4, p1, p2)) and not lens.is_fisheye and lens.camera_model in (None, *PERSPECTIVE):
+        return {"model": "PINHOLE", "params": pinhole}
+    if lens.is_fisheye or lens.camera_model == FISHEYE:
+        return {"model": FISHEYE, "params": [*pinhole, k1, k2, k3, k4]}
+    if lens.camera_model in (None, *PERSPECTIVE) and k4 == 0:
+        return {"model": "FULL_OPENCV", "params": [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]}
+    refuse(
+        f"{key}.camera_model", f"the camera model {lens.camera_model!r} with k4 = {k4} is not read here",
+        f"undistort the photos, or give {', '.join((*PERSPECTIVE, FISHEYE))}",
+    )  # fmt: skip
+
+
+def _pinhole(focal: float, width: int, height: int) -> pycolmap.Camera:
+    return pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=[focal, width / 2, height / 2])

@@ -1,0 +1,166 @@
+"""A rendered scene whose cameras stand in a COLMAP model, a transforms.json or a BOP scene, through `masks` and `align`."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import msgspec
+import numpy as np
+import pycolmap
+import pytest
+import yaml
+
+from factorlib.align.camera import Camera, Pose, rotation_of_vector
+from factorlib.align.raster import Caster, rasterise
+from factorlib.dataset.read import read_dataset
+from factorlib.dataset.slices import dataset_slice
+from factorlib.errors import InputError
+from factorlib.generate.folder import write_labels, write_photo
+from factorlib.meshes import write_ply
+from factorlib.stage import Inputs
+from stages import align, masks
+from tests.align.scenes import blob, chair, normal_error_deg
+
+CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))
+POSE = Pose(rotation_of_vector(np.array([0.7, -1.1, 0.4])), np.array([0.1, 0.2, 5.0]))
+WORLD = {"scale": 2.0, "rotation": rotation_of_vector(np.array([-0.3, 0.2, 1.5])).tolist(), "translation": [1.0, -2.0, 0.5]}
+CASTER = Caster(chair())
+
+
+def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, told=True):
+    """A dataset of one photo of a chair, `scale` times as large as the image of the source; `told` poses, or the camera only."""
+    for name in ("photos", "masks"):
+        (folder / name).mkdir(parents=True)
+    seen = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
+    label = rasterise(CASTER, seen, POSE).label
+    write_photo(folder / "photos/000003.png", np.repeat(label[..., None] * 0.5, 3, axis=-1))
+    write_labels(folder / "masks/000003.png", label)
+    write_ply(folder / "chair.ply", mesh or chair())
+    thing = {"name": "thing", "mesh": "chair"}
+    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [thing]} | (photo or {})
+    meshes = {"chair": {"file": "chair.ply", "material": "white"}}
+    cameras = SOURCES[source](folder, pose) if told else {source: SOURCES[source](folder, pose)[source]}
+    spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
+    return folder
+
+
+def cam_from_world(pose):
+    """Of x_world = 2 R x_object + t, in the world's units: cam_from_object after object_from_world, twice as long."""
+    turn, shift = np.array(WORLD["rotation"]), np.array(WORLD["translation"])
+    rotation = pose.rotation @ turn.T
+    return rotation, 2 * pose.translation - rotation @ shift
+
+
+def colmap(folder, pose):
+    rotation, translation = cam_from_world(pose)
+    model = pycolmap.Reconstruction()
+    parameters = [CAMERA.focal, *CAMERA.centre]
+    model.add_camera_with_trivial_rig(pycolmap.Camera(model="SIMPLE_PINHOLE", width=200, height=150, params=parameters, camera_id=1))
+    image = pycolmap.Image(name="000003.png", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
+    (folder / "sparse").mkdir()
+    model.write_binary(str(folder / "sparse"))
+    return {"colmap": "sparse", "world_from_object": {"thing": WORLD}}
+
+
+def transforms(folder, pose):
+    rotation, translation = cam_from_world(pose)
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3], world_from_camera[:3, 3] = rotation.T @ np.diag([1, -1, -1]), -rotation.T @ translation
+    frame = {"file_path": "./images/000003.png", "transform_matrix": world_from_camera.tolist()}
+    lens = {"fl_x": CAMERA.focal, "fl_y": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    return {"transforms": "transforms.json", "world_from_object": {"thing": WORLD}}
+
+
+def bop(folder, pose):
+    (folder / "scene").mkdir()
+    matrix = [CAMERA.focal, 0, CAMERA.centre[0] - 0.5, 0, CAMERA.focal, CAMERA.centre[1] - 0.5, 0, 0, 1]
+    thing = {"obj_id": 4, "cam_R_m2c": pose.rotation.ravel().tolist(), "cam_t_m2c": (1000 * pose.translation).tolist()}
+    (folder / "scene/scene_camera.json").write_text(json.dumps({"3": {"cam_K": matrix}}))
+    (folder / "scene/scene_gt.json").write_text(json.dumps({"3": [thing]}))
+    return {"bop": "scene", "obj_ids": {"chair": 4}, "mesh_unit_mm": 1000}
+
+
+SOURCES = {"colmap": colmap, "transforms": transforms, "bop": bop}
+
+
+def aligned(folder, **params):
+    dataset = read_dataset(folder)
+    parts = {name: dataset_slice(dataset, name, "hall") for name in ("materials", "photo", "objects")}
+    folders = {name: folder.parent / name for name in ("masks", "align")}
+    for made in folders.values():
+        made.mkdir()
+    files = {path: folder / path for part in parts.values() for path in part.files}
+    inputs = Inputs(folders, {f"dataset.{name}": part.facts for name, part in parts.items()}, files, "hall")
+    masks.main(masks.Params(), inputs, folders["masks"])
+    align.main(align.Params(**params), inputs, folders["align"], lambda *_: None)
+    return json.loads((folders["align"] / "hall.json").read_text())
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_the_poses_of_the_scene_come_out(tmp_path, source):
+    entry = aligned(scene(tmp_path / "set", source))
+    camera, thing = entry["camera"], entry["objects"]["thing"]
+    assert (camera["focal_source"], thing["source"]) == (source, source) and thing["doubts"] == []
+    assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
+    assert np.allclose(thing["rotation"], POSE.rotation, atol=1e-12) and np.allclose(thing["translation"], POSE.translation, atol=1e-12)
+    assert thing["silhouette_iou"] > 0.995
+
+
+@pytest.mark.parametrize("source", ["colmap", "transforms"])
+def test_a_photo_of_twice_the_size_is_the_same_scene(tmp_path, source):
+    entry = aligned(scene(tmp_path / "set", source, scale=2))
+    assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
+    assert entry["objects"]["thing"]["silhouette_iou"] > 0.995
+
+
+def test_where_only_the_camera_is_told_the_pose_is_searched(tmp_path):
+    entry = aligned(scene(tmp_path / "set", "colmap", told=False))
+    camera, thing = entry["camera"], entry["objects"]["thing"]
+    assert (camera["focal_source"], thing["source"]) == ("colmap", "found") and camera["focal_px"] == 300.0
+    assert camera["principal_point"] == list(CAMERA.centre)
+    found = Pose(np.array(thing["rotation"]), np.array(thing["translation"]))
+    assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, found) < 1
+
+
+def test_what_dataset_yaml_says_of_the_camera_wins(tmp_path):
+    camera = aligned(scene(tmp_path / "set", "colmap", photo={"camera": {"focal_px": 310.0}}))["camera"]
+    assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (310.0, "dataset", list(CAMERA.centre))
+
+
+def test_what_dataset_yaml_says_of_the_principal_point_wins(tmp_path):
+    camera = aligned(scene(tmp_path / "set", "colmap", photo={"camera": {"principal_point": [100.0, 75.0]}}))["camera"]
+    assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (300.0, "colmap", [100.0, 75.0])
+
+
+def test_a_pose_in_dataset_yaml_wins(tmp_path):
+    given = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 6.0]}
+    entry = aligned(scene(tmp_path / "set", "colmap", photo={"objects": [{"name": "thing", "mesh": "chair", "pose": given}]}))
+    assert entry["objects"]["thing"]["source"] == "given" and entry["objects"]["thing"]["translation"] == [0.0, 0.0, 6.0]
+
+
+def test_a_told_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING, "factorlib.align"):
+        thing = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["thing"]
+    assert thing["doubts"] and not thing["left_out"] and "world_from_object" in caplog.text
+
+
+def test_a_photo_that_was_cropped_is_refused(tmp_path):
+    folder = scene(tmp_path / "set", "colmap")
+    for path in ("photos/000003.png", "masks/000003.png"):
+        (folder / path).unlink()
+    write_photo(folder / "photos/000003.png", np.full((120, 200, 3), 0.5))
+    write_labels(folder / "masks/000003.png", np.ones((120, 200), int))
+    with pytest.raises(InputError, match="the photo has 200×120 pixels, its image in the source 200×150") as caught:
+        aligned(folder)
+    assert caught.value.key == "cameras.colmap: hall" and "cropped" in str(caught.value)
+
+
+def test_the_slice_of_a_told_photo_is_of_its_type(tmp_path):
+    from factorlib.dataset.schema import ObjectsSlice
+
+    facts = dataset_slice(read_dataset(scene(tmp_path / "set", "bop")), "objects", "hall").facts
+    assert msgspec.convert(json.loads(json.dumps(facts)), ObjectsSlice).told.source == "bop"
