@@ -71,7 +71,7 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
         if event.phase != "descent":
             found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
 
-    options = Bundle(lobes=variant.lobes, sample=variant.sample, tolerance=1e-3)  # tolerance as the stage's
+    options = Bundle(lobes=variant.lobes, sample=variant.sample)
     joint = solve(blocks, len(seen.materials), operator, options, threaded, lambda event: None, keep)
     result = joint.solution
     answer = answer_of(blocks, result.materials, result.lights)

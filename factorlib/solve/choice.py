@@ -47,6 +47,7 @@ def matte_where_it_may_be(
 ) -> tuple[Solution, Bool[np.ndarray, "m"], list[Specular]]:
     """The solution with needless specular parts gone, which materials those are, and the evidence for every material.
 
+    start: nearly at rest, so that iterations change the held-out loss less than what is decided
     held: the held-out observations;  losses: those of a solution, one of each held-out observation;
     decided: materials that are not tried;  matte: those that have lost their specular part already
     """
@@ -60,8 +61,6 @@ def matte_where_it_may_be(
         trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
         return trial if losses(trial).mean() > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
 
-    if decided is None or not decided.any():  # else the rounds began at rest
-        start = rested(start, start.materials, matte)  # nearer to rest, iterations change the held-out loss less
     base = start.materials  # all go on from here by as many iterations
     chosen = rested(start, base, matte)
     best = losses(chosen)

@@ -1,7 +1,7 @@
 """Whether the photos of a light have a tone curve: where held-out observations are explained better with one.
 
-An exponent for each photo is let loose where one Gauss-Newton step of everything promises a gain from it.  Then the problem is
-brought to rest with and without, by as many iterations, and the lights whose own held-out loss falls by `LEAST_GAIN` of itself
+The problem is brought to rest.  An exponent for each photo is let loose where one Gauss-Newton step of everything then promises a gain
+from it: the problem comes to rest once more, with and without, by as many iterations, and the lights whose own held-out loss falls by `LEAST_GAIN` of itself
 keep their curves.  A light that has curves already, from an earlier solution, keeps them.
 """
 
@@ -32,26 +32,26 @@ class Tone(msgspec.Struct, frozen=True):
     held_out_loss_without: float | None = None
 
 
+def rested(blocks: Sequence[Block], at: Solution, lights: Sequence[Light], operator, loss, map_: Callable) -> Solution:
+    """With other lights, and some iterations later."""
+    at = evaluated(blocks, at.materials, lights, operator, loss, map_)
+    return descend(blocks, at, operator, loss, Descent(ITERATIONS), map_)
+
+
 def toned_where_it_pays(
     blocks: Sequence[Block], held: Sequence[Block], start: Solution, operator, loss, losses: Callable, map_: Callable
 ) -> tuple[Solution, list[Tone]]:
     """The solution with the tone curves that it needs, and the evidence for every light.
 
-    held: the held-out observations, block by block;  losses: those of a solution, one of each held-out observation
+    start: at rest;  held: the held-out observations, block by block;  losses: those of a solution, one of each held-out observation
     """
-
-    def rested(lights: Sequence[Light]) -> Solution:
-        at = evaluated(blocks, start.materials, lights, operator, loss, map_)
-        return descend(blocks, at, operator, loss, Descent(ITERATIONS), map_)
-
     had = np.array([len(light.log_tone) > 0 for light in start.lights])
-    without = descend(blocks, start, operator, loss, Descent(ITERATIONS), map_)
-    if promised_gain(blocks, without, operator, loss, map_) < PROMISED:
-        return without, [Tone(bool(has)) for has in had]
-    found = rested(loosened(start.lights, ~had))
+    if promised_gain(blocks, start, operator, loss, map_) < PROMISED:
+        return start, [Tone(bool(has)) for has in had]
+    without, found = (rested(blocks, start, lights, operator, loss, map_) for lights in (start.lights, loosened(start.lights, ~had)))
     with_, without_ = (_of_each_light(losses(s), held) for s in (found, without))
     kept = (with_ < (1 - LEAST_GAIN) * without_) & ~had
-    chosen = without if not kept.any() else found if (kept | had).all() else rested(loosened(start.lights, kept))
+    chosen = without if not kept.any() else found if (kept | had).all() else rested(blocks, start, loosened(start.lights, kept), operator, loss, map_)
     evidence = zip((kept | had).tolist(), with_.tolist(), without_.tolist(), had, strict=True)
     return chosen, [Tone(True) if has else Tone(*decided) for *decided, has in evidence]
 
