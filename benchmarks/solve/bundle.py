@@ -1,7 +1,7 @@
 """The bundle solver on a set: operators, lobe limits and reductions of the observations.
 
-Time starts before the observations are reduced.  Points over time are the accepted ones at the end of every round and
-of the polish; they are scored after the solve, off the clock.
+Time starts before the observations are reduced.  Points over time are the accepted ones of
+every round and of the polish; they are scored after the solve, off the clock.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
 
     def keep(event, solution) -> None:
         answer = answer_of(blocks, solution.materials, solution.lights)
-        if event.phase != "descent":
-            found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
+        found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
 
     options = Bundle(lobes=variant.lobes, sample=variant.sample)
     joint = solve(blocks, len(seen.materials), operator, options, threaded, lambda event: None, keep)
@@ -99,7 +98,7 @@ def points(spheres: SphereSet, found: list[Snapshot], judge) -> list[dict]:
     return rows
 
 
-def thinned(found: list[Snapshot], most: int = 40) -> list[Snapshot]:
+def thinned(found: list[Snapshot], most: int = 60) -> list[Snapshot]:
     """At most that many, the last among them."""
     step = -(-len(found) // most)
     return found[::-1][::step][::-1]
