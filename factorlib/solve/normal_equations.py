@@ -13,7 +13,7 @@ from one [n, 4p] block per channel rather than from a sparse [3n, 6p] Jacobian.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
@@ -29,11 +29,19 @@ from factorlib.solve.unknowns import Light, Materials
 CHUNK = 4096  # observations whose responses are held at once
 
 
+LightPrior = Callable[[Block, Light], tuple[float, Float[np.ndarray, "l"], Float[np.ndarray, "l l"]]]
+
+
 class Loss(msgspec.Struct, frozen=True):
-    """robust_scale: k of the pseudo-Huber loss, in σ;  prior: weight π of the paper's tint prior."""
+    """robust_scale: k of the pseudo-Huber loss, in σ;  prior: weight π of the paper's tint prior.
+
+    light_prior: what is known of lights beforehand, as from captured ones; off where None.  It adds a value ρ(light) to the loss of
+    each illumination: ρ, half its gradient and half its Gauss-Newton Hessian by the light's unknowns (`Light.moved`)
+    """
 
     robust_scale: float = 10.0
     prior: float = 1e-4
+    light_prior: LightPrior | None = None
 
 
 class System(msgspec.Struct, frozen=True):
@@ -101,7 +109,8 @@ def robust_losses(residual: Float[np.ndarray, "n 3"], scale: float) -> Float[np.
 def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:
     """The loss of one illumination over what is not held out, prior included."""
     residual = residuals(block, predicted_radiance(block, light, materials, operator))[~block.held_out]
-    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0]
+    beforehand = loss.light_prior(block, light)[0] if loss.light_prior else 0.0
+    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0] + beforehand
 
 
 def system(
@@ -126,6 +135,11 @@ def system(
     gradient[lobes] += prior_gradient
     hessian[lobes, lobes] += prior_hessian
     k = 7 * m
+    if loss.light_prior:
+        beforehand, light_gradient, light_hessian = loss.light_prior(block, light)
+        prior += beforehand
+        gradient[k:] += light_gradient
+        hessian[k:, k:] += light_hessian
     return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:], scores)
 
 

@@ -86,3 +86,23 @@ def test_the_prior_pulls_a_tinted_light_toward_grey(problem):
     assert (pull[:p] > 0).all()  # less red
     assert (pull[p : 3 * p] < 0).all()  # more green and blue
     np.testing.assert_allclose(pull[: 3 * p].sum(), 0, atol=1e-9 * np.abs(pull).max())
+
+
+def dimmed(block, light):
+    """A prior that knows lights to be dark: ρ = 0.3 Σ e²."""
+    first, last = 3 * len(light), 6 * len(light)
+    gradient, hessian = np.zeros(light.unknowns), np.zeros((light.unknowns, light.unknowns))
+    gradient[first:last] = 0.3 * light.energy.T.reshape(-1)
+    hessian[range(first, last), range(first, last)] = 0.3
+    return 0.3 * float(np.sum(light.energy**2)), gradient, hessian
+
+
+def test_a_prior_on_light_is_part_of_loss_and_gradient(problem):
+    data, light = problem
+    loss = Loss(robust_scale=3.0, prior=0.0, light_prior=dimmed)
+    found = system(data, light, MATERIALS, OPERATOR, loss)
+    expected = derivative(lambda d: fit_loss(data, light.moved(d, MATERIALS.blur), MATERIALS, OPERATOR, loss), light.unknowns)
+    np.testing.assert_allclose(found.light_gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(found.loss, fit_loss(data, light, MATERIALS, OPERATOR, loss))
+    without = system(data, light, MATERIALS, OPERATOR, Loss(robust_scale=3.0, prior=0.0))
+    assert found.loss > without.loss and (found.light_hessian - without.light_hessian).trace() == pytest.approx(0.9 * len(light))
