@@ -32,7 +32,7 @@ from factorlib.solve.paper import solve as solve_as_the_paper
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable
 from factorlib.solve.resume import Journal
 from factorlib.solve.shadowing import without_shadows
-from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
+from factorlib.solve.told import beyond_cameras, ill_explained, untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
 from factorlib.solve.warm import from_earlier
@@ -225,6 +225,7 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
     _warn(ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator))
+    _warn(beyond_cameras(blocks, joint.solution.lights))
     found, components = joint.solution.materials, connected_components(blocks, len(names))
     component_of = {m: k for k, (members, _) in enumerate(components) for m in members}
     model = {

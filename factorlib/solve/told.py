@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from factorlib.solve.normal_equations import predicted_radiance, residuals
 from factorlib.solve.problem import Block, connected_components
+from factorlib.solve.tone import is_wild
 from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
 
 FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
@@ -120,3 +121,13 @@ def ill_explained(blocks: Sequence[Block], materials: Materials, lights: Sequenc
                 "Look at what `align` drew: wrong normals, poses or masks there make every material in it wrong"
             )
     return said
+
+
+def beyond_cameras(blocks: Sequence[Block], lights: Sequence[Light]) -> list[str]:
+    """Tone curves that have run toward the bounds of what cameras do."""
+    return [
+        f"the tone curves of illumination '{block.name}' have exponents of {', '.join(f'{g:.2g}' for g in np.exp(light.log_tone))}, "
+        "more than a camera does: something else is wrong there, as normals or `encoding`. SET=\"solve.tone=off\" goes without them"
+        for block, light in zip(blocks, lights, strict=True)
+        if is_wild(light)
+    ]

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.images.tone import curve, inverse, slope
-from factorlib.solve.unknowns import Light
+from factorlib.solve.unknowns import TONE, Light
+
+WILD = 0.8  # of the logarithms of the exponents' bounds
 
 
 def toned(linear: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
@@ -28,3 +30,9 @@ def slope_at(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.nda
 
 def exponents(light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 1"]:
     return np.exp(light.log_tone)[photo][:, None]
+
+
+def is_wild(light: Light) -> bool:
+    """Whether an exponent has run near the bounds of what cameras do."""
+    low, high = WILD * np.log(TONE)
+    return bool(((light.log_tone < low) | (light.log_tone > high)).any())

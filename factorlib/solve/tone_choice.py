@@ -1,8 +1,10 @@
-"""Whether the photos of a light have a tone curve: where held-out observations are explained better with one.
+"""Whether the photos of a light have a tone curve: where held-out observations are explained much better with one.
 
 The problem is brought to rest.  An exponent for each photo is let loose where one Gauss-Newton step of everything then promises a gain
-from it: the problem comes to rest once more, with and without, by as many iterations, and the lights whose own held-out loss falls by `LEAST_GAIN` of itself
-keep their curves.  A light that has curves already, from an earlier solution, keeps them.
+from it: the problem comes to rest once more, with and without, by as many iterations, and the lights whose own held-out loss falls
+by `LEAST_GAIN` of itself keep their curves.  So large a gain, because an exponent also takes up some of what the rest of the model
+has wrong, normals and reflections between objects; where it runs toward its bounds that is all it does, and it is not believed.
+A light that has curves already, from an earlier solution, keeps them.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ from jaxtyping import Bool, Float
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.problem import Block
 from factorlib.solve.step import damped_step
+from factorlib.solve.tone import is_wild
 from factorlib.solve.unknowns import Light
 
-PROMISED = 0.02  # of the fitted loss, below which no curve is tried
-LEAST_GAIN = 0.03  # of its own held-out loss, that a light's curves must be worth
+PROMISED = 0.05  # of the fitted loss, below which no curve is tried
+LEAST_GAIN = 0.2  # of its own held-out loss, that a light's curves must be worth
 ITERATIONS = 6
 DAMPING = 1e-3
 
@@ -51,6 +54,9 @@ def toned_where_it_pays(
     without, found = (rested(blocks, start, lights, operator, loss, map_) for lights in (start.lights, loosened(start.lights, ~had)))
     with_, without_ = (_of_each_light(losses(s), held) for s in (found, without))
     kept = (with_ < (1 - LEAST_GAIN) * without_) & ~had
+    if kept.any():
+        settled = rested(blocks, found, found.lights, operator, loss, map_)
+        kept &= ~np.array([is_wild(light) for light in settled.lights])
     chosen = without if not kept.any() else found if (kept | had).all() else rested(blocks, start, loosened(start.lights, kept), operator, loss, map_)
     evidence = zip((kept | had).tolist(), with_.tolist(), without_.tolist(), had, strict=True)
     return chosen, [Tone(True) if has else Tone(*decided) for *decided, has in evidence]

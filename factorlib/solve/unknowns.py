@@ -19,7 +19,7 @@ from factorlib.light.lobes import lobe_integral
 
 ROUGHNESS = (0.1, 1.0)  # the operators' domain
 SHARPNESS = (0.1, 2000.0)  # from nearly constant to 1.3° wide, about a texel of the exported map
-TONE = (0.4, 2.5)  # exponents of tone curves
+TONE = (0.6, 1.7)  # exponents of tone curves: what cameras do
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
