@@ -34,6 +34,7 @@ from factorlib.solve.problem import Block, Noise, blocks_of_observations, mirror
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.warm import materials_held, with_exposures
+from factorlib.stage import serial_map
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate, read_observations
 
@@ -113,7 +114,7 @@ def light_of(block: Block, materials: Materials, operator) -> Light:
     bundle, light, best, least = DEFAULT, starting_light(block, materials), None, np.inf
     for number in range(bundle.rounds):
         at = evaluated([block], materials, [light], operator, bundle.loss, materials_held)
-        at = with_new_lobes([block], at, operator, bundle.loss, bundle, number, materials_held)
+        at = with_new_lobes([block], at, operator, bundle.loss, bundle, number, serial_map)
         at = descend([block], at, operator, bundle.loss, Descent(bundle.iterations, bundle.tolerance), materials_held)
         light = blurred(pruned(at.lights[0]), sharpest_told(materials))
         held = held_out_loss([block], materials, [light], operator, bundle.loss)
