@@ -53,7 +53,7 @@ help:
 	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'
-	@echo 'make bench-operator                     time, error and looks of the reflection operators, to build/bench/operator'
+	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'
 	@echo 'make bench-solve                     the joint solve: speed against error, to build/bench/solve'
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from benchmarks.markdown import refresh, table
 from benchmarks.solve.workers import threaded
 from factorlib.dataset.read import read_dataset
+from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Bundle, Joint, Start, candidates, from_nothing, held_out_loss, solve, with_new_lobes
@@ -65,7 +66,9 @@ def splits_of(dataset: str) -> tuple[list[str], list[Split]]:
     folder = ROOT / "data" / dataset if "/" not in dataset else Path(dataset)
     spec, built = read_dataset(folder).spec, ROOT / "build" / folder.resolve().name
     rotations = {p.name: np.array(p.world_from_camera) for p in spec.photos if p.world_from_camera is not None}
-    parts = [merge(usable(read_observations(path)), MERGE_DEGREES) for path in sorted((built / "urm").glob("*.parquet"))]
+    if not (files := sorted((built / "urm").glob("*.parquet"))):
+        raise InputError("there are no observations yet", file=built / "urm", cure=f"run: make urm train DATASET={dataset}")
+    parts = [merge(usable(read_observations(path)), MERGE_DEGREES) for path in files]
     blocks = blocks_of_observations(concatenate(parts), Noise(), world_from_camera=rotations)
     return list(spec.materials), [_split(block) for block in blocks]
 

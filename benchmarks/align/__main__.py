@@ -52,11 +52,7 @@ def main(
             print(said(row), flush=True)
             write_json(out / "align.json", {"photos": rows})
     write_json(out / "align.json", {"photos": rows})
-    tables = as_tables(rows)
-    for inner in tables.values():
-        print(f"\n{inner}")
-    if docs:
-        refresh(ROOT / "docs" / "align.md", tables)
+    publish(as_tables(rows), docs)
 
 
 def real_photos(folders: list[Path], jobs: int, docs: bool, out: Path) -> None:
@@ -71,7 +67,10 @@ def real_photos(folders: list[Path], jobs: int, docs: bool, out: Path) -> None:
                 print(real_said(row), flush=True)
             write_json(out / "real.json", {"photos": rows})
     write_json(out / "real.json", {"photos": rows})
-    tables = real_tables(rows)
+    publish(real_tables(rows), docs)
+
+
+def publish(tables: dict[str, str], docs: bool) -> None:
     for inner in tables.values():
         print(f"\n{inner}")
     if docs:
