@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.images.tone import curve
 from factorlib.reflection import reflection_operator
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.roughness import materials_out_of_valleys, reflectances
@@ -30,6 +31,17 @@ def test_a_roughness_far_off_is_found_again():
     found = materials_out_of_valleys(blocks, wrong, lights, OPERATOR, Loss(), serial_map)
     assert abs(found.roughness[0] - truth.roughness[0]) < 0.1  # the grid's own spacing
     np.testing.assert_array_equal(found.roughness[1:], wrong.roughness[1:])  # what is right stays
+
+
+def test_a_tone_curve_is_undone_first():
+    blocks, truth, lights = problem(materials=3, lights=2)
+    bent = [msgspec.structs.replace(b, radiance=curve(b.radiance, 1.6)) for b in blocks]
+    curved = [msgspec.structs.replace(light, log_tone=np.log([1.6])) for light in lights]
+    wrong = Materials(truth.diffuse * 1.3, truth.specular * 0.5, np.array([0.95, *truth.roughness[1:]]))
+    found = materials_out_of_valleys(bent, wrong, curved, OPERATOR, Loss(), serial_map)
+    straight = materials_out_of_valleys(blocks, wrong, lights, OPERATOR, Loss(), serial_map)
+    assert found.roughness[0] == straight.roughness[0]
+    np.testing.assert_allclose(found.diffuse[0], truth.diffuse[0], rtol=0.15)
 
 
 def test_a_material_that_nothing_shows_stays():

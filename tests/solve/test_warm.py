@@ -11,7 +11,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion
 from factorlib.solve.bundle import Bundle, solve
 from factorlib.solve.descent import Descent, descend, evaluated
-from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table
+from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table, Tone
 from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.warm import Spreading, from_earlier, known_of, materials_held, with_exposures
@@ -143,6 +143,16 @@ def begun(earlier, blocks, names=NAMES):
 def explained(blocks, materials, lights, atol=1e-3):
     for b, light in zip(blocks, lights, strict=True):
         np.testing.assert_allclose(predicted_radiance(b, light, materials, OPERATOR), b.radiance, atol=atol, rtol=atol)
+
+
+def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
+    blocks, lights = truth(0, 1)
+    earlier = written(blocks, MATERIALS, lights)
+    model = msgspec.structs.replace(earlier.table.model, tone={blocks[0].photos[0]: Tone(1.3, blocks[0].unit)})
+    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
+    found = known_of(earlier, NAMES, blocks).lights
+    np.testing.assert_allclose(np.exp(found[0].log_tone), [1.3])
+    assert len(found[1].log_tone) == 0
 
 
 def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
