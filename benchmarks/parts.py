@@ -27,11 +27,14 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, Joint, Start, candidates, from_nothing, held_out_loss, solve, with_new_lobes
+from factorlib.solve.bundle import Joint, candidates, solve
 from factorlib.solve.descent import Descent, descend, evaluated
+from factorlib.solve.held_out import held_out_loss
 from factorlib.solve.insertion import blurred, pruned, sharpest_told
 from factorlib.solve.normal_equations import Loss, predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, mirror_cells, of_rows, usable
+from factorlib.solve.rounds import Start, from_nothing, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.warm import materials_held, with_exposures

@@ -32,8 +32,9 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.refine.photo import Refined, Scene, Thing, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, Noise, blocks_of_observations
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.stage import serial_map

@@ -22,11 +22,13 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes, write_lobes
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, Event, Joint, candidates, solve
+from factorlib.solve.bundle import Joint, candidates, solve
 from factorlib.solve.coverage import relative_standard_errors
 from factorlib.solve.earlier import Earlier, read_earlier
 from factorlib.solve.gauge import RULE
+from factorlib.solve.history import Event
 from factorlib.solve.normal_equations import Loss
+from factorlib.solve.options import Bundle
 from factorlib.solve.paper import REPORTS, Paper
 from factorlib.solve.paper import solve as solve_as_the_paper
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components, usable

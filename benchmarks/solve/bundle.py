@@ -13,7 +13,8 @@ from benchmarks.solve.scores import EVERY, Answer, answer_of, material_scores, p
 from benchmarks.solve.sets import SphereSet
 from benchmarks.solve.workers import threaded
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.urm.merge import merge
 

@@ -12,8 +12,9 @@ import numpy as np
 from benchmarks.solve.clock import Clock
 from benchmarks.solve.workers import threaded
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, Noise, blocks_of_observations
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.urm.observations import Observations

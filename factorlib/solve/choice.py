@@ -5,6 +5,9 @@ first, loses its specular part; the rest of the problem is brought to rest again
 by more than `LEAST_GAIN` of itself nor that of all observations by more than `MOST_HARM`, the specular part stays away.  A material that
 reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out highlights
 better than the right one, and a dark glossy material would lose all it shows.
+
+What is brought to rest for a trial are the `LIGHTS` lights that show most of the material, so that a trial costs the same
+however large the set.
 """
 
 from __future__ import annotations
@@ -13,9 +16,10 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.held_out import Judge
 from factorlib.solve.problem import Block
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, Materials
 
@@ -23,6 +27,7 @@ LEAST_GAIN = 0.03  # of its own held-out loss, that a specular part must be wort
 MOST_HARM = 0.05  # of all held-out loss, which moves by some 3 % as the descent goes on
 HOPELESS = 1.3  # times the held-out loss after `GLANCE` iterations: the specular part is needed, and no more is tried
 GLANCE, ITERATIONS = 3, 6
+LIGHTS = 8
 
 
 class Specular(msgspec.Struct, frozen=True):
@@ -36,46 +41,55 @@ class Specular(msgspec.Struct, frozen=True):
 
 def matte_where_it_may_be(
     blocks: Sequence[Block],
-    held: Sequence[Block],
     start: Solution,
     operator,
     loss,
-    losses: Callable,
+    losses: Judge,
     map_: Callable,
     decided: Bool[np.ndarray, "m"] | None = None,
     matte: Bool[np.ndarray, "m"] | None = None,
 ) -> tuple[Solution, Bool[np.ndarray, "m"], list[Specular]]:
     """The solution with needless specular parts gone, which materials those are, and the evidence for every material.
 
-    start: nearly at rest, so that iterations change the held-out loss less than what is decided
-    held: the held-out observations;  losses: those of a solution, one of each held-out observation;
+    start: nearly at rest, so that iterations change the held-out loss less than what is decided;
     decided: materials that are not tried;  matte: those that have lost their specular part already
     """
     matte = np.zeros(len(start.materials), bool) if matte is None else matte.copy()
     tried = ~matte if decided is None else ~decided
-    seen = np.isin(np.arange(len(matte)), np.concatenate([block.material for block in blocks]))
-    material = np.concatenate([block.material for block in held])
+    count = np.array([np.bincount(block.material, minlength=len(matte)) for block in blocks])
+    everywhere = np.arange(len(blocks))
 
-    def rested(start: Solution, materials: Materials, which: Bool[np.ndarray, "m"], most: float = np.inf) -> Solution:
-        trial = evaluated(blocks, materials, start.lights, operator, loss, map_)
-        trial = descend(blocks, trial, operator, loss, Descent(GLANCE), map_, matte=which)
-        return trial if losses(trial).mean() > most else descend(blocks, trial, operator, loss, Descent(ITERATIONS), map_, matte=which)
+    def rested(of: Int[np.ndarray, "k"], materials: Materials, matte: Bool[np.ndarray, "m"], most: float = np.inf) -> Solution:
+        """The lights `of` and the materials; not all the way where a glance at the held-out loss says that it ends above `most`."""
+        own = [blocks[k] for k in of]
+        trial = evaluated(own, materials, [start.lights[k] for k in of], operator, loss, map_)
+        trial = descend(own, trial, operator, loss, Descent(GLANCE), map_, matte=matte)
+        hopeless = np.isfinite(most) and np.concatenate(losses(own, trial)).mean() > most
+        return trial if hopeless else descend(own, trial, operator, loss, Descent(ITERATIONS), map_, matte=matte)
 
     base = start.materials  # all go on from here by as many iterations
-    chosen = rested(start, base, matte)
-    best = losses(chosen)
+    chosen = rested(everywhere, base, matte)
+    best = losses(blocks, chosen)
     evidence = untried(matte)
     for m in np.argsort(base.specular.mean(1), kind="stable"):
-        own = material == m
-        if not tried[m] or not seen[m] or not own.any() or base.specular[m].mean() > base.diffuse[m].mean():
+        of = np.sort(np.argsort(-count[:, m], kind="stable")[:LIGHTS])
+        of = of[count[of, m] > 0]
+        own = np.concatenate([blocks[k].material[blocks[k].held_out] == m for k in of]) if len(of) else np.zeros(0, bool)
+        if not tried[m] or not own.any() or base.specular[m].mean() > base.diffuse[m].mean():
             continue
-        without = without_specular(base, m)
-        trial = rested(start, without, matte | (np.arange(len(matte)) == m), HOPELESS * best.mean())
-        found = losses(trial)
-        needed = found.mean() > (1 + MOST_HARM) * best.mean() or found[own].mean() > (1 + LEAST_GAIN) * best[own].mean()
-        evidence[m] = Specular(bool(needed), float(best[own].mean()), float(found[own].mean()))
-        if not needed:
-            base, chosen, best, matte[m] = without, trial, found, True
+        without, with_ = without_specular(base, m), np.concatenate([best[k] for k in of])
+        trial = rested(of, without, matte | (np.arange(len(matte)) == m), HOPELESS * with_.mean())
+        found = losses([blocks[k] for k in of], trial)
+        without_ = np.concatenate(found)
+        needed = without_.mean() > (1 + MOST_HARM) * with_.mean() or without_[own].mean() > (1 + LEAST_GAIN) * with_[own].mean()
+        evidence[m] = Specular(bool(needed), float(with_[own].mean()), float(without_[own].mean()))
+        if needed:
+            continue
+        base, matte[m] = without, True
+        if len(of) < len(blocks):
+            trial = rested(everywhere, base, matte)
+            found = losses(blocks, trial)
+        chosen, best = trial, found
     return chosen, matte, evidence
 
 

@@ -36,9 +36,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.light.sphere import fibonacci_sphere
-from factorlib.solve.bundle import Event, Joint, Report, Snapshot, held_out_loss, unwatched
+from factorlib.solve.bundle import Joint
 from factorlib.solve.descent import Solution, evaluated
 from factorlib.solve.gauge import in_gauge
+from factorlib.solve.held_out import held_out_loss
+from factorlib.solve.history import Event, Report, Snapshot, unwatched
 from factorlib.solve.normal_equations import Loss
 from factorlib.solve.problem import Block
 from factorlib.solve.shadowing import without_shadows

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.held_out import Judge
 from factorlib.solve.problem import Block
 from factorlib.solve.step import damped_step
 from factorlib.solve.tone import is_wild
@@ -42,17 +43,17 @@ def rested(blocks: Sequence[Block], at: Solution, lights: Sequence[Light], opera
 
 
 def toned_where_it_pays(
-    blocks: Sequence[Block], held: Sequence[Block], start: Solution, operator, loss, losses: Callable, map_: Callable
+    blocks: Sequence[Block], start: Solution, operator, loss, losses: Judge, map_: Callable
 ) -> tuple[Solution, list[Tone]]:
     """The solution with the tone curves that it needs, and the evidence for every light.
 
-    start: at rest;  held: the held-out observations, block by block;  losses: those of a solution, one of each held-out observation
+    start: at rest
     """
     had = np.array([len(light.log_tone) > 0 for light in start.lights])
     if promised_gain(blocks, start, operator, loss, map_) < PROMISED:
         return start, [Tone(bool(has)) for has in had]
     without, found = (rested(blocks, start, lights, operator, loss, map_) for lights in (start.lights, loosened(start.lights, ~had)))
-    with_, without_ = (_of_each_light(losses(s), held) for s in (found, without))
+    with_, without_ = (_means(losses(blocks, s)) for s in (found, without))
     kept = (with_ < (1 - LEAST_GAIN) * without_) & ~had
     if kept.any():
         settled = rested(blocks, found, found.lights, operator, loss, map_)
@@ -75,10 +76,9 @@ def loosened(lights: Sequence[Light], which: Bool[np.ndarray, "k"]) -> list[Ligh
     return [_straight(light) if one else light for light, one in zip(lights, which, strict=True)]
 
 
-def _of_each_light(losses: Float[np.ndarray, "n"], held: Sequence[Block]) -> Float[np.ndarray, "k"]:
-    """The mean over each light's observations, 0 for none."""
-    parts = np.split(losses, np.cumsum([len(block) for block in held])[:-1])
-    return np.array([part.mean() if len(part) else 0.0 for part in parts])
+def _means(losses: Sequence[Float[np.ndarray, "n"]]) -> Float[np.ndarray, "k"]:
+    """Of each light's observations, 0 for none."""
+    return np.array([of_light.mean() if len(of_light) else 0.0 for of_light in losses])
 
 
 def _straight(light: Light) -> Light:

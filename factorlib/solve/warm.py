@@ -23,13 +23,15 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from factorlib.solve.bundle import Bundle, Start, from_nothing, held_out_loss, robust_scale, with_new_lobes
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.earlier import Earlier
+from factorlib.solve.held_out import held_out_loss
 from factorlib.solve.insertion import blurred, pruned, sharpest_told
 from factorlib.solve.normal_equations import Loss, System, fit_loss, predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.roughness import materials_out_of_valleys
+from factorlib.solve.rounds import Start, from_nothing, robust_scale, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
 from factorlib.solve.weights import refitted_weights

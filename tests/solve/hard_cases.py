@@ -12,8 +12,9 @@ import msgspec
 import numpy as np
 
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, Joint, solve
+from factorlib.solve.bundle import Joint, solve
 from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
 from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
 from factorlib.solve.uncertainty import standard_errors

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import connected_components
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light

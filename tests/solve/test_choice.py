@@ -4,7 +4,8 @@ import msgspec
 import numpy as np
 
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import mirror_cells
 from factorlib.solve.unknowns import Materials
 from factorlib.stage import serial_map

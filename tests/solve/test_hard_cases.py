@@ -9,7 +9,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import held_out_loss
+from factorlib.solve.held_out import held_out_loss
 from factorlib.solve.normal_equations import Loss, material_slices
 from factorlib.solve.problem import Noise, blocks_of_observations, of_rows
 from factorlib.stage import Inputs, silent
@@ -173,7 +173,7 @@ def test_where_nothing_is_held_out_fitted_observations_choose_the_round():
 
 def test_one_bad_vote_of_held_out_observations_does_not_end_a_solve_that_still_finds_lobes(monkeypatch):
     votes = iter([1.0, 1.2] + [0.5] * 100)
-    monkeypatch.setattr("factorlib.solve.bundle.held_out_loss", lambda *_: next(votes))
+    monkeypatch.setattr("factorlib.solve.history.held_out_loss", lambda *_: next(votes))
     history = answered(CASES[ONE](0)).joint.history
     assert [event.held_out for event in history if event.phase == "round"][:3] == [1.0, 1.2, 0.5]
 

@@ -7,8 +7,9 @@ import pytest
 from factorlib.checkpoint import Checkpoint
 from factorlib.light.sphere import fibonacci_sphere
 from factorlib.reflection import reflection_operator
-from factorlib.solve import bundle, insertion
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve import insertion, rounds
+from factorlib.solve.bundle import solve
+from factorlib.solve.options import Bundle
 from factorlib.solve.resume import Journal
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, random_light
@@ -26,7 +27,7 @@ def small():
     """Most of the time would go into looking for lobes, and few observations would leave no phase to settle."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(insertion, "DICTIONARY", {1.0: 16, 30.0: 60})
-        patch.setattr(bundle, "A_LOBE", 5)
+        patch.setattr(rounds, "A_LOBE", 5)
         yield
 
 

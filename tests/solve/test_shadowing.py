@@ -6,9 +6,10 @@ import pytest
 
 from factorlib.light.sphere import fibonacci_sphere
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.insertion import lobes_inserted
 from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, system
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.unknowns import Light, Materials

@@ -6,7 +6,8 @@ import pytest
 
 from factorlib.images.tone import curve
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
+from factorlib.solve.options import Bundle
 from factorlib.solve.told import beyond_cameras
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light

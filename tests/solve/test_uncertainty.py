@@ -6,10 +6,11 @@ import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.coverage import LARGEST, relative_standard_errors
 from factorlib.solve.descent import Descent, descend, evaluated
 from factorlib.solve.normal_equations import Loss, system
+from factorlib.solve.options import Bundle
 from factorlib.solve.problem import of_rows
 from factorlib.solve.uncertainty import clusters_of, reduced_scores, standard_errors
 from factorlib.solve.unknowns import Materials

@@ -9,10 +9,11 @@ import pytest
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion
-from factorlib.solve.bundle import Bundle, solve
+from factorlib.solve.bundle import solve
 from factorlib.solve.descent import Descent, descend, evaluated
 from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table, Tone
 from factorlib.solve.normal_equations import Loss, predicted_radiance
+from factorlib.solve.options import Bundle
 from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.warm import Spreading, from_earlier, known_of, materials_held, with_exposures
 from factorlib.stage import serial_map
