@@ -212,18 +212,34 @@ def _refusal(message: str, keys: Keys, value: Any, type_: type, path, lines: dic
         given = _at_keys(value, keys)
         message = f"{message[:1].lower()}{message[1:]}" + (f": {given!r}" if not isinstance(given, dict | list) else "")
         quoted = isinstance(given, int | float) and "expected `str" in message
-        cure = f'put it in quotes: "{given}"' if quoted else "write a value of that kind"
+        cure = f'put it in quotes: "{given}"' if quoted else _choices(type_, keys) or "write a value of that kind"
     key = ".".join(part for part in (prefix, key_path(keys)) if part)
     return InputError(message, file=_at(path, lines.get(keys)), key=key or None, cure=cure)
+
+
+def _choices(type_: type, keys: Keys) -> str | None:
+    """What may be written where only some words may."""
+    from msgspec import inspect
+
+    words = [word for info in _alternatives(_types_at(type_, keys)) if isinstance(info, inspect.LiteralType) for word in info.values]
+    return f"one of {', '.join(map(str, words))}" if words else None
+
+
+def _types_at(type_: type, keys: Keys) -> list:
+    """What may stand where `keys` lead to."""
+    from msgspec import inspect
+
+    here = [inspect.type_info(type_)]
+    for key in keys:
+        here = [below for info in _alternatives(here) for below in _below(info, key)]
+    return here
 
 
 def _fields_at(type_: type, keys: Keys) -> list[str]:
     """Names of the fields of the struct that `keys` lead to."""
     from msgspec import inspect
 
-    here = [inspect.type_info(type_)]
-    for key in keys:
-        here = [below for info in _alternatives(here) for below in _below(info, key)]
+    here = _types_at(type_, keys)
     return [field.encode_name for info in _alternatives(here) if isinstance(info, inspect.StructType) for field in info.fields]
 
 

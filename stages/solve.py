@@ -66,12 +66,12 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     solver: Literal["bundle", "paper"] = "bundle"
     operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
     merge_degrees: Annotated[float, Meta(ge=0, le=30)] = 2.0
-    lobes: Annotated[int, Meta(ge=1, le=1024)] = 48
+    lobes: Annotated[int, Meta(ge=1, le=1024)] = 72
     insert: Annotated[int, Meta(ge=1, le=64)] = 12
     rounds: Annotated[int, Meta(ge=1, le=100)] = 12
     iterations: Annotated[int, Meta(ge=1, le=1000)] = 10
     polish: Annotated[int, Meta(ge=0, le=1000)] = 20
-    settle: Annotated[int, Meta(ge=0, le=1000)] = 4
+    settle: Annotated[int, Meta(ge=0, le=1000)] = 2
     sample: Annotated[int, Meta(ge=50)] = 1500
     tolerance: Annotated[float, Meta(gt=0, lt=1)] = 1e-3
     least_gain: Annotated[float, Meta(ge=0, lt=1)] = 0.01

@@ -1,7 +1,7 @@
 """YAML is read as YAML 1.2 says, and every complaint says where and what to do."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import pytest
@@ -22,6 +22,7 @@ class Outer(msgspec.Struct, forbid_unknown_fields=True):
     table: dict[str, Inner] = {}
     rows: list[Inner] = []
     either: Inner | str | None = None
+    mode: Literal["auto", "off"] = "auto"
 
 
 def refusal(tmp_path, text):
@@ -70,6 +71,7 @@ def test_a_good_file(tmp_path):
         ("ratio: 1\nrows:\n- {size: 0}\n", 3, "rows[0].size", ">= 1"),
         ("ratio: 1\ntable:\n  ok: {size: 1}\n  bad: {size: 1, name: 7}\n", 4, "table.bad.name", '"7"'),
         ("ratio: one\n", 1, "ratio", "'one'"),
+        ("ratio: 1\nmode: on\n", 2, "mode", "one of auto, off"),
         ("table: {}\n", 1, None, "'ratio' is missing"),
         ("ratio: 1\nrows: [\n", 3, None, "not YAML"),
         ("ratio: 1\nrows: &a [*a]\n", 2, "rows[0]", "contains itself"),

@@ -23,7 +23,7 @@ from factorlib.solve.normal_equations import Loss
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block
 from factorlib.solve.resume import Journal
-from factorlib.solve.rounds import Fit, Start, bare, best_round, descent_of, from_nothing, further_rounds, sampled_for, tidied
+from factorlib.solve.rounds import Fit, Start, answer_of, bare, best_round, descent_of, from_nothing, further_rounds, sampled_for
 from factorlib.solve.shadowing import without_shadows
 from factorlib.solve.tone_choice import Tone, rested, toned_where_it_pays
 from factorlib.solve.unknowns import Materials
@@ -180,4 +180,4 @@ def polished(
         best = evaluated(of, at.solution.materials, at.solution.lights, operator, loss, map_)
         best = descend(of, best, operator, loss, descent_of(bundle, iterations), map_, partial(record, number, "polish"), matte)
         at = journal.keep(f"polish {phase}", Polished(bare(best), history))
-    return tidied(everything, at.solution, operator, loss, map_), at.history
+    return answer_of(everything, at.solution, operator, loss, map_), at.history

@@ -12,12 +12,12 @@ from factorlib.solve.normal_equations import Loss
 class Bundle(msgspec.Struct, frozen=True):
     """How the joint problem is solved; `lobes` and `sample` (the least observations that rounds use) are counted per illumination."""
 
-    lobes: int = 48
+    lobes: int = 72
     insert: int = 12
     rounds: int = 12
     iterations: int = 10
     polish: int = 20
-    settle: int = 4
+    settle: int = 2
     sample: int = 1500
     tolerance: float = 1e-3
     least_gain: float = 0.01

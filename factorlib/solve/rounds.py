@@ -218,18 +218,35 @@ def _out_of_valleys(blocks, current: Solution, operator, loss: Loss, map_: Calla
 
 def tidied(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
     """Pruned, no sharper than the materials can tell, and in gauge."""
-    sharpest = sharpest_told(current.materials)
-    materials, lights = in_gauge(current.materials, [blurred(pruned(light), sharpest) for light in current.lights], blocks)
+    materials, lights = in_gauge(current.materials, [pruned(light) for light in _no_sharper(current)], blocks)
     return evaluated(blocks, materials, lights, operator, loss, map_)
 
 
+def answer_of(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
+    """Tidied, the weights those that fit all observations best."""
+    at = evaluated(blocks, current.materials, _no_sharper(current), operator, loss, map_)
+    lights = [pruned(light) for light in _refitted_lights(blocks, at, operator, loss)]
+    return Solution(*in_gauge(at.materials, lights, blocks), [])
+
+
+def _no_sharper(current: Solution) -> list[Light]:
+    """The lights, no lobe of which is sharper than the materials can tell."""
+    sharpest = sharpest_told(current.materials)
+    return [blurred(light, sharpest) for light in current.lights]
+
+
 def refitted(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
+    """With the weights that lower the loss most."""
+    return evaluated(blocks, current.materials, _refitted_lights(blocks, current, operator, loss), operator, loss, map_)
+
+
+def _refitted_lights(blocks, current: Solution, operator, loss: Loss) -> list[Light]:
     lights = []
     for block, light, equations in zip(blocks, current.lights, current.systems, strict=True):
-        refitted = refitted_weights(light, equations)
-        better = fit_loss(block, refitted, current.materials, operator, loss) <= equations.loss
-        lights.append(refitted if better else light)
-    return evaluated(blocks, current.materials, lights, operator, loss, map_)
+        found = refitted_weights(light, equations)
+        better = fit_loss(block, found, current.materials, operator, loss) <= equations.loss
+        lights.append(found if better else light)
+    return lights
 
 
 def bare(solution: Solution) -> Solution:

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 
 from factorlib.reflection import reflection_operator
+from factorlib.solve import choice
 from factorlib.solve.bundle import solve
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import mirror_cells
@@ -40,6 +41,14 @@ def test_matte_materials_lose_their_specular_part_and_glossy_ones_keep_it():
     assert joint.matte.tolist() == [True, True, False]
     assert (joint.solution.materials.specular[:2] == 0).all()
     assert joint.specular[2].held_out_loss_without > 1.05 * joint.specular[2].held_out_loss_with
+
+
+def test_few_lights_that_show_a_material_decide_as_all_do(monkeypatch):
+    monkeypatch.setattr(choice, "LIGHTS", 1)
+    joint = chosen(MIXED, [0, 1, 2])
+    assert joint.matte.tolist() == [True, True, False]
+    assert (joint.solution.materials.specular[:2] == 0).all()
+    assert len(joint.solution.lights) == 2
 
 
 def test_a_matte_scene_ends_without_specular_and_with_few_lobes():
