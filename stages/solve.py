@@ -91,9 +91,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
     earlier = _earlier(params, inputs)
-    read = [read_observations(path) for path in sorted(inputs["urm"].glob("*.parquet"))]
-    seen = concatenate([merge(usable(part), params.merge_degrees) for part in read])
-    _warn_of_unusable(read)
+    seen = concatenate([_merged(path, params.merge_degrees) for path in sorted(inputs["urm"].glob("*.parquet"))])
     blocks = blocks_of_observations(
         seen,
         Noise(params.noise_absolute, params.noise_relative),
@@ -195,14 +193,16 @@ def _warn(sentences: list[str]) -> None:
         log.warning("%s", sentence)
 
 
-def _warn_of_unusable(read: list[Observations]) -> None:
-    for part in read:
-        left_out = len(part) - len(usable(part))
-        if left_out:
-            log.warning(
-                "photo '%s': %d of %d observations are left out, their radiance, normal or view not finite or their weight not positive",
-                ", ".join(part.photos), left_out, len(part),
-            )  # fmt: skip
+def _merged(path: Path, degrees: float) -> Observations:
+    """The usable observations of a photo, merged; no two photos are held unmerged at once."""
+    read = read_observations(path)
+    seen = usable(read)
+    if len(seen) < len(read):
+        log.warning(
+            "photo '%s': %d of %d observations are left out, their radiance, normal or view not finite or their weight not positive",
+            ", ".join(read.photos), len(read) - len(seen), len(read),
+        )  # fmt: skip
+    return merge(seen, degrees)
 
 
 def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations) -> None:
