@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -89,9 +90,16 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # a photo, then an illumination on one thread: how many there are changes no bit
+        _main(params, inputs, out, progress, lambda function, items: list(pool.map(function, items)))
+
+
+def _main(params: Params, inputs: Inputs, out: Path, progress: Progress, spread: Callable) -> None:
     materials: list[str] = inputs.facts["dataset.materials"]
     earlier = _earlier(params, inputs)
-    seen = concatenate([_merged(path, params.merge_degrees) for path in sorted(inputs["urm"].glob("*.parquet"))])
+    read = spread(partial(_merged, degrees=params.merge_degrees), sorted(inputs["urm"].glob("*.parquet")))
+    seen = concatenate([photo.merged for photo in read])
+    _warn_of_unusable(read)
     blocks = blocks_of_observations(
         seen,
         Noise(params.noise_absolute, params.noise_relative),
@@ -102,10 +110,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _warn_of_gaps(materials, blocks, seen)
     _warn(untold_by_observations(materials, blocks))
     operator = reflection_operator(operator_of(params), weights=inputs["train"])
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # each illumination on one thread: how many there are changes no bit
-        spread = lambda function, items: list(pool.map(function, items))  # noqa: E731
-        journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
-        joint = _solved(params, blocks, materials, operator, spread, progress, journal, earlier)
+    journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
+    joint = _solved(params, blocks, materials, operator, spread, progress, journal, earlier)
     shown = blocks if joint.self_shadowing else [without_shadows(block) for block in blocks]
     _write(out, materials, shown, joint, operator, params.solver, earlier)
 
@@ -193,16 +199,27 @@ def _warn(sentences: list[str]) -> None:
         log.warning("%s", sentence)
 
 
-def _merged(path: Path, degrees: float) -> Observations:
-    """The usable observations of a photo, merged; no two photos are held unmerged at once."""
+class _Read(msgspec.Struct, frozen=True):
+    """A photo's usable observations, merged, how many there were, and how many of those were unusable."""
+
+    merged: Observations
+    count: int
+    unusable: int
+
+
+def _merged(path: Path, degrees: float) -> _Read:
     read = read_observations(path)
     seen = usable(read)
-    if len(seen) < len(read):
-        log.warning(
-            "photo '%s': %d of %d observations are left out, their radiance, normal or view not finite or their weight not positive",
-            ", ".join(read.photos), len(read) - len(seen), len(read),
-        )  # fmt: skip
-    return merge(seen, degrees)
+    return _Read(merge(seen, degrees), len(read), len(read) - len(seen))
+
+
+def _warn_of_unusable(read: list[_Read]) -> None:
+    for photo in read:
+        if photo.unusable:
+            log.warning(
+                "photo '%s': %d of %d observations are left out, their radiance, normal or view not finite or their weight not positive",
+                ", ".join(photo.merged.photos), photo.unusable, photo.count,
+            )  # fmt: skip
 
 
 def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations) -> None:

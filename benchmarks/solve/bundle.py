@@ -6,6 +6,8 @@ every round and of the polish; they are scored after the solve, off the clock.
 
 from __future__ import annotations
 
+from functools import partial
+
 import msgspec
 
 from benchmarks.solve.clock import Clock, Taken
@@ -17,6 +19,7 @@ from factorlib.solve.bundle import solve
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.urm.merge import merge
+from factorlib.urm.observations import concatenate
 
 JUDGE = "network"
 
@@ -42,9 +45,8 @@ VARIANTS = (
     Variant(operator="closed_form"),
     Variant(lobes=16),
     Variant(lobes=32),
-    Variant(lobes=72),
+    Variant(lobes=48),
     Variant(merge_degrees=0.0),
-    Variant(merge_degrees=1.0),
     Variant(merge_degrees=4.0),
     Variant(sample=700),
     Variant(sample=4000),
@@ -64,8 +66,10 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
     """The answers of one solve, the last one being the result."""
     operator = reflection_operator(variant.operator)
     seen = spheres.observations(without)
+    photos = [seen.take(seen.photo == k) for k in range(len(seen.photos))]  # as they lie on disk
     clock, found = Clock(), []
-    blocks = blocks_of_observations(merge(seen, variant.merge_degrees), Noise())
+    merged = concatenate(threaded(partial(merge, degrees=variant.merge_degrees), photos))
+    blocks = blocks_of_observations(merged, Noise())
 
     def keep(event, solution) -> None:
         answer = answer_of(blocks, solution.materials, solution.lights)
