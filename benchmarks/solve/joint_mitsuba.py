@@ -6,6 +6,7 @@ Pictures   of 64², means over 4 × 4 pixels, those where all sixteen count; int
            samples a pixel in each pass, forward and backward with seeds of their own.
 Loss       mean squared difference over the picture's peak, all pairs together; one step of Adam after all of them.
 End        flat: the mean loss of the last `FLAT` steps is within 1 % of that of as many before; or the time limit.
+Points     on the way: mean over pairs of the dB of the last eight losses, which hold the noise of `SPP` samples a pixel.
 Score      pictures of 256² by Mitsuba, `SCORE_SPP` samples; the best of the learning rates by final loss, all their times.
 """
 
@@ -41,16 +42,17 @@ def run(spheres: SphereSet, limit_s: float) -> dict:
 
 
 def _optimised(joint: Joint, rate: float, limit_s: float) -> dict:
-    clock, losses, points = Clock(), [], []
+    clock, by_pair, losses, points = Clock(), [], [], []
     joint.begin(rate)
     while True:
-        losses.append(joint.step(len(losses)))
+        by_pair.append(joint.step(len(losses)))
+        losses.append(float(np.mean(by_pair[-1])))
         taken, flat = clock.taken(), _flat(losses)
         done = flat or taken.wall > limit_s
         if done or len(losses) & (len(losses) - 1) == 0:  # powers of two
             errors = material_scores(joint.materials(), joint.spheres)
             kept = {kind: errors[kind]["mean"] for kind in ("diffuse", "specular", "roughness")}
-            db = -10 * np.log10(np.mean(losses[-8:]))
+            db = np.mean(-10 * np.log10(np.mean(by_pair[-8:], axis=0)))
             points.append({"stage": f"step {len(losses)}", **msgspec.to_builtins(taken), "mean_db": float(db), **kept})
         if done:
             loss = float(np.mean(losses[-FLAT:]))
@@ -98,11 +100,11 @@ class Joint:
             optimiser[f"{name} roughness"] = mi.Float(0.4)
         self.optimiser = optimiser
 
-    def step(self, number: int) -> float:
-        """Gradients of all pairs, then one step within bounds; the loss before it."""
+    def step(self, number: int) -> list[float]:
+        """Gradients of all pairs, then one step within bounds; each pair's loss before it."""
         import drjit as dr
 
-        total = 0.0
+        losses = []
         for k, (pair, parameters) in enumerate(self.parameters.items()):
             self._set(parameters, pair)
             seed = 2 * (number * len(self.parameters) + k)
@@ -111,14 +113,14 @@ class Joint:
             )
             scale = self.mi.TensorXf(np.repeat(self.mask[..., None], 3, 2).astype(np.float32) / self.spheres.pairs[pair].peak)
             squares = dr.square((image - self.mi.TensorXf(self.shown[pair])) * scale)
-            loss = dr.sum(squares, axis=None) / (3.0 * float(self.mask.sum()) * len(self.parameters))
-            dr.backward(loss)
-            total += float(np.array(loss).item())
+            loss = dr.sum(squares, axis=None) / (3.0 * float(self.mask.sum()))
+            dr.backward(loss / len(self.parameters))
+            losses.append(float(np.array(loss).item()))
         self.optimiser.step()
         for name in self.optimiser.keys():  # noqa: SIM118
             low, high = ROUGHNESS if name.endswith("roughness") else (1e-4, 1e6 if name in self.spheres.illuminations else 1.0)
             self.optimiser[name] = dr.clip(self.optimiser[name], low, high)
-        return total
+        return losses
 
     def _set(self, parameters, pair: tuple[str, str]) -> None:
         material, light = pair
