@@ -242,10 +242,15 @@ def test_clean_takes_a_dataset_and_then_gc_its_results(project):
     assert "current" not in state(project).values()
 
 
+def heed_interrupts():
+    """A shell hands SIGINT down as ignored to what it runs in the background, this test perhaps."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def background(project, *settings):
     command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=heed_interrupts)
 
 
 def wait_until(true, seconds=20):
