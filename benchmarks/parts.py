@@ -28,16 +28,16 @@ from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import Joint, candidates, solve
-from factorlib.solve.descent import Descent, descend, evaluated
+from factorlib.solve.descent import Descent, Solution, descend
 from factorlib.solve.held_out import held_out_loss
-from factorlib.solve.insertion import blurred, pruned, sharpest_told
+from factorlib.solve.insertion import blurred, pruned
 from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, Noise, blocks_of_observations, mirror_cells, of_rows, usable
 from factorlib.solve.rounds import Start, from_nothing, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import Light, Materials
-from factorlib.solve.warm import materials_held, with_exposures
+from factorlib.solve.warm import with_exposures
 from factorlib.stage import serial_map
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate, read_observations
@@ -118,15 +118,15 @@ def flat(split: Split) -> float:
 def light_of(block: Block, materials: Materials, operator) -> Light:
     """The light of one block, its materials held: rounds of insertion and descent while held-out observations gain."""
     bundle, light, best, least = DEFAULT, starting_light(block, materials), None, np.inf
+    every = np.ones(7 * len(materials), bool)
     for number in range(bundle.rounds):
-        at = evaluated([block], materials, [light], operator, bundle.loss, materials_held)
-        at = with_new_lobes([block], at, operator, bundle.loss, bundle, number, serial_map)
-        at = descend([block], at, operator, bundle.loss, Descent(bundle.iterations, bundle.tolerance), materials_held)
-        light = blurred(pruned(at.lights[0]), sharpest_told(materials))
-        held = held_out_loss([block], materials, [light], operator, bundle.loss)
-        if held > (1 - bundle.least_gain) * least:
+        at = with_new_lobes([block], Solution(materials, [light], []), operator, bundle.loss, bundle, number, serial_map)
+        at = descend([block], at, operator, bundle.loss, Descent(bundle.iterations, bundle.tolerance), serial_map, held=every)
+        light = blurred(pruned(at.lights[0]), materials.sharpest)
+        held_out = held_out_loss([block], materials, [light], operator, bundle.loss)
+        if held_out > (1 - bundle.least_gain) * least:
             break
-        best, least = light, held
+        best, least = light, held_out
     return best or light
 
 

@@ -25,6 +25,7 @@ from factorlib.solve.problem import Block
 from factorlib.solve.resume import Journal
 from factorlib.solve.rounds import Fit, Start, answer_of, bare, best_round, descent_of, from_nothing, further_rounds, sampled_for
 from factorlib.solve.shadowing import without_shadows
+from factorlib.solve.step import specular_unknowns
 from factorlib.solve.tone_choice import Tone, rested, toned_where_it_pays
 from factorlib.solve.unknowns import Materials
 
@@ -169,6 +170,7 @@ def polished(
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     many = sampled_for(everything, fit.solution.lights, bundle, times=MANY)
     number, loss, journal = fit.history[-1].round, fit.loss, journal or Journal()
+    held = None if matte is None else specular_unknowns(matte)
     phases = [(many, bundle.polish), (everything, min(bundle.settle, bundle.polish))]
     at = Polished(fit.solution, fit.history)
     for phase, (of, iterations) in enumerate(phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]):
@@ -178,6 +180,6 @@ def polished(
         history = list(at.history)
         record = recorder(of, history, operator, loss, report, snapshot)
         best = evaluated(of, at.solution.materials, at.solution.lights, operator, loss, map_)
-        best = descend(of, best, operator, loss, descent_of(bundle, iterations), map_, partial(record, number, "polish"), matte)
+        best = descend(of, best, operator, loss, descent_of(bundle, iterations), map_, partial(record, number, "polish"), held)
         at = journal.keep(f"polish {phase}", Polished(bare(best), history))
     return answer_of(everything, at.solution, operator, loss, map_), at.history

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Int
 from factorlib.solve.descent import Descent, Solution, descend, evaluated
 from factorlib.solve.held_out import Judge
 from factorlib.solve.problem import Block
+from factorlib.solve.step import specular_unknowns
 from factorlib.solve.unknowns import LEAST_REFLECTANCE, Materials
 
 LEAST_GAIN = 0.03  # of its own held-out loss, that a specular part must be worth
@@ -61,11 +62,11 @@ def matte_where_it_may_be(
 
     def rested(of: Int[np.ndarray, "k"], materials: Materials, matte: Bool[np.ndarray, "m"], most: float = np.inf) -> Solution:
         """The lights `of` and the materials; not all the way where a glance at the held-out loss says that it ends above `most`."""
-        own = [blocks[k] for k in of]
+        own, held = [blocks[k] for k in of], specular_unknowns(matte)
         trial = evaluated(own, materials, [start.lights[k] for k in of], operator, loss, map_)
-        trial = descend(own, trial, operator, loss, Descent(GLANCE), map_, matte=matte)
+        trial = descend(own, trial, operator, loss, Descent(GLANCE), map_, held=held)
         hopeless = np.isfinite(most) and np.concatenate(losses(own, trial)).mean() > most
-        return trial if hopeless else descend(own, trial, operator, loss, Descent(ITERATIONS), map_, matte=matte)
+        return trial if hopeless else descend(own, trial, operator, loss, Descent(ITERATIONS), map_, held=held)
 
     base = start.materials  # all go on from here by as many iterations
     chosen = rested(everywhere, base, matte)

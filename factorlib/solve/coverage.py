@@ -19,7 +19,7 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.light.lobes import lobe_integral
 from factorlib.solve.insertion import whitened_atoms
-from factorlib.solve.normal_equations import Loss, material_slices, operator_inputs, whitened_rows
+from factorlib.solve.normal_equations import Loss, responses, whitened_rows
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.unknowns import Light, Materials
 
@@ -67,10 +67,9 @@ def _jacobians(block: Block, light: Light, materials: Materials, operator, loss:
     unknowns = 7 * len(materials) + light.unknowns
     whole = [np.zeros((len(block), unknowns)) for _ in range(3)]
     plain = msgspec.structs.replace(loss, robust_scale=1e6)
-    for m, rows in material_slices(block):
-        response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[m], operator))
-        for c, channel in enumerate(whitened_rows(block, rows, light, materials, m, response, plain)):
-            whole[c][rows, channel.places] = channel.jacobian.numpy()
+    for some in responses(block, light, materials, operator):
+        for c, channel in enumerate(whitened_rows(block, light, materials, some, plain)):
+            whole[c][some.rows, channel.places] = channel.jacobian.numpy()
     first = 7 * len(materials)
     others = np.r_[0:first, first + 6 * len(light) : unknowns]
     return [jacobian[:, others] for jacobian in whole]

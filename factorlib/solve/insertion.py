@@ -26,7 +26,6 @@ from factorlib.solve.unknowns import Light, Materials
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations that vote
-RESOLVED = 16.0  # a lobe this many times as sharp as the sharpest reflection widens it by 3 %: nothing sharper can be told
 TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
 
 
@@ -40,7 +39,7 @@ def lobes_inserted(block: Block, light: Light, materials: Materials, operator, c
     rows = _sampled_rows(block, seed)
     residual = -residuals(block, predicted_radiance(block, light, materials, operator))[rows]
     axis, sharpness = dictionary()
-    told = sharpness <= max(sharpest_told(materials), sharpness.min())
+    told = sharpness <= max(materials.sharpest, sharpness.min())
     axis, sharpness = axis[told], sharpness[told]
     atoms = whitened_atoms(block, rows, materials, operator, axis, sharpness, light)
     chosen, weights = _pursuit(atoms, residual, axis, sharpness, count)
@@ -91,11 +90,6 @@ def _pursuit(atoms, residual, axis, sharpness, count: int) -> tuple[list[int], l
         apart = np.linalg.norm(axis - axis[best], axis=1)
         allowed &= (apart > width) | (np.abs(np.log(sharpness / sharpness[best])) > 1)
     return chosen, weights
-
-
-def sharpest_told(materials: Materials) -> float:
-    """The sharpness beyond which lobes reflect alike: GGX spreads a mirror direction's light by about 2α² (radians²)."""
-    return RESOLVED / (2 * float(materials.roughness.min()) ** 4)
 
 
 def blurred(light: Light, sharpest: float) -> Light:

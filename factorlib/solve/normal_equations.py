@@ -13,7 +13,7 @@ from one [n, 4p] block per channel rather than from a sparse [3n, 6p] Jacobian.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 import numpy as np
@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Float, Int
 
 from factorlib.images.tone import by_log_exponent, curve, slope
-from factorlib.solve.problem import Block
-from factorlib.solve.shadowing import shadowed, shadowed_response
+from factorlib.solve.problem import Block, not_held_out
+from factorlib.solve.shadowing import Turning, shadowed, shadowed_response
 from factorlib.solve.tone import exponents, toned
 from factorlib.solve.unknowns import Light, Materials
 
@@ -109,51 +109,85 @@ def robust_losses(residual: Float[np.ndarray, "n 3"], scale: float) -> Float[np.
 def fit_loss(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> float:
     """The loss of one illumination over what is not held out, prior included."""
     residual = residuals(block, predicted_radiance(block, light, materials, operator))[~block.held_out]
-    beforehand = loss.light_prior(block, light)[0] if loss.light_prior else 0.0
-    return robust_loss(residual, loss.robust_scale)[0] + _prior(block, light, loss)[0] + beforehand
+    return robust_loss(residual, loss.robust_scale)[0] + beforehand(block, light, loss)[0]
+
+
+class Responses(msgspec.Struct, frozen=True):
+    """What `rows` of one material reflect of each lobe at unit weight, as they are seen and exposed.
+
+    parts: the fields of the operator's Response [n, p];  turning: how they change as lobes turn, by visibility alone
+    """
+
+    material: int
+    rows: slice
+    parts: dict[str, Float[torch.Tensor, "n p"]]
+    turning: Turning | None
+
+
+def responses(block: Block, light: Light, materials: Materials, operator) -> Iterator[Responses]:
+    """Of all observations, some at a time."""
+    for m, rows in material_slices(block):
+        exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
+        response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[m], operator))
+        parts = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
+        yield Responses(m, rows, *shadowed_response(parts, block, rows, light, materials.roughness[m]))
 
 
 def system(
-    block: Block, light: Light, materials: Materials, operator, loss: Loss, clusters: Int[np.ndarray, "n"] | None = None
+    block: Block,
+    light: Light,
+    materials: Materials,
+    operator,
+    loss: Loss,
+    clusters: Int[np.ndarray, "n"] | None = None,
+    shown: Iterable[Responses] | None = None,
 ) -> System:
-    """Loss, gradient and Gauss–Newton Hessian of one illumination (all of Σ r², without the factor 2).
+    """Loss, gradient and Gauss–Newton Hessian of one illumination (all of Σ r², without the factor 2), of what is not held out.
 
-    clusters: number of each observation's cluster, from 0, for `System.scores`
+    clusters: number of each observation's cluster, from 0, for `System.scores`;
+    shown: the observations' responses to the light, where they are known already
     """
-    p, m = len(light), len(materials)
-    size = light.unknowns
-    hessian = np.zeros((7 * m + size, 7 * m + size))
-    gradient = np.zeros(7 * m + size)
-    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, 7 * m + size))
-    total = 0.0
-    for index, rows in material_slices(block):
-        response = operator.response(*operator_inputs(block, rows, light.axis, light.sharpness, materials.roughness[index], operator))
-        own = None if clusters is None else (scores, clusters[rows])
-        total += _add_rows(hessian, gradient, own, block, rows, light, materials, index, response, loss)
-    prior, prior_gradient, prior_hessian = _prior(block, light, loss)
-    lobes = slice(7 * m + 2 * p, 7 * m + 6 * p)
-    gradient[lobes] += prior_gradient
-    hessian[lobes, lobes] += prior_hessian
-    k = 7 * m
-    if loss.light_prior:
-        beforehand, light_gradient, light_hessian = loss.light_prior(block, light)
-        prior += beforehand
-        gradient[k:] += light_gradient
-        hessian[k:, k:] += light_hessian
+    k, size = 7 * len(materials), 7 * len(materials) + light.unknowns
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, size))
+    if clusters is not None:
+        clusters = clusters[~block.held_out]
+    block, total = not_held_out(block), 0.0
+    for some in responses(block, light, materials, operator) if shown is None else shown:
+        for channel in whitened_rows(block, light, materials, some, loss):
+            total += channel.loss
+            places, scaled, residual = channel.places, channel.jacobian, channel.residual
+            hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
+            gradient[places] += (scaled.T @ residual).numpy()
+            if scores is not None:
+                np.add.at(scores, (clusters[some.rows][:, None], places[None]), (scaled * residual[:, None]).numpy())
+    prior, prior_gradient, prior_hessian = beforehand(block, light, loss)
+    gradient[k:] += prior_gradient
+    hessian[k:, k:] += prior_hessian
     return System(total + prior, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:], scores)
 
 
-def _add_rows(hessian, gradient, scores, block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> float:
-    """Add the rows of one material; returns their loss."""
-    total = 0.0
-    for channel in whitened_rows(block, rows, light, materials, m, response, loss):
-        total += channel.loss
-        places, scaled, residual = channel.places, channel.jacobian, channel.residual
-        hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
-        gradient[places] += (scaled.T @ residual).numpy()
-        if scores is not None:
-            np.add.at(scores[0], (scores[1][:, None], places[None]), (scaled * residual[:, None]).numpy())
-    return total
+def energy_systems(
+    block: Block, light: Light, materials: Materials, shown: Iterable[Responses], loss: Loss
+) -> tuple[float, Float[np.ndarray, "3 p"], Float[np.ndarray, "3 p p"]]:
+    """Loss, gradient and Hessian of one illumination as `system` has them, by the lobes' energies of each channel alone."""
+    p, total = len(light), 0.0
+    gradient, hessian = np.zeros((3, p)), np.zeros((3, p, p))
+    weight, spread = torch.from_numpy(light.weight), torch.from_numpy(light.spread)
+    for some in shown:
+        for c in range(3):
+            basis = _basis(some, materials, c)
+            seen = _whitened(block, some.rows, c, basis @ weight[:, c], light, loss)
+            scaled = basis / spread * (seen.rising * seen.scale[:, None])
+            hessian[c] += (scaled.T @ scaled).numpy()
+            gradient[c] += (scaled.T @ seen.residual).numpy()
+            total += seen.loss
+    prior, prior_gradient, prior_hessian = beforehand(block, light, loss)
+    for c in range(3):
+        own = slice((3 + c) * p, (4 + c) * p)
+        gradient[c] += prior_gradient[own]
+        hessian[c] += prior_hessian[own, own]
+    return total + prior, gradient, hessian
 
 
 class Channel(msgspec.Struct, frozen=True):
@@ -168,47 +202,65 @@ class Channel(msgspec.Struct, frozen=True):
     loss: float
 
 
-def whitened_rows(block: Block, rows: slice, light: Light, materials: Materials, m: int, response, loss: Loss) -> Iterator[Channel]:
-    """The three channels of rows of material m; rows that are held out weigh nothing."""
-    p, first = len(light), 7 * len(materials)
-    exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
+def whitened_rows(block: Block, light: Light, materials: Materials, some: Responses, loss: Loss) -> Iterator[Channel]:
+    """The three channels of some observations; those that are held out weigh nothing."""
+    p, first, m, rows, r = len(light), 7 * len(materials), some.material, some.rows, some.parts
     normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
     tangents = [torch.from_numpy(t) for t in light.tangents()]
     by_tangent = [(normal @ t.T, view @ t.T) for t in tangents]
-    r = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
-    r, turning = shadowed_response(r, block, rows, light, materials.roughness[m])
     weight, spread = torch.from_numpy(light.weight), torch.from_numpy(light.spread)
     by_s, weight_by_s = (torch.from_numpy(slope) for slope in light.sharpness_slopes(materials.blur))
-    fit = torch.from_numpy((~block.held_out[rows]).astype(float))
     photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure)).double()
     end = first + 6 * p + len(light.log_exposure) - 1
     geometry, exposures, tones = np.arange(first, first + 3 * p), np.arange(first + 6 * p, end), np.arange(end, first + light.unknowns)
     for c in range(3):
         kd, ks = materials.diffuse[m, c], materials.specular[m, c]
-        basis = kd * r["diffuse"] + ks * r["specular"]
+        basis = _basis(some, materials, c)
         by_nz = (kd * r["diffuse_by_nz"] + ks * r["specular_by_nz"]) * weight[:, c]
         by_oz = ks * r["specular_by_oz"] * weight[:, c]
         columns = [by_nz * n + by_oz * o for n, o in by_tangent]
-        if turning is not None:
-            shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(turning.diffuse, turning.specular, strict=True)]
+        if some.turning is not None:
+            shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(some.turning.diffuse, some.turning.specular, strict=True)]
             columns = [column + also for column, also in zip(columns, shading, strict=True)]
         by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
         columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / spread]
         linear = basis @ weight[:, c]
-        predicted, rising, by_tone = _toned_with_slopes(linear, block, rows, light)
         own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]
-        jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * rising
-        jacobian = torch.cat([jacobian, photos * by_tone], 1) if len(light.log_tone) else jacobian
-        precision = torch.from_numpy(block.precision[rows, c])
-        difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
-        satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
-        residual = torch.where(satisfied, 0.0, difference)
-        root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
-        pull = (fit / root * ~satisfied).sqrt()
+        seen = _whitened(block, rows, c, linear, light, loss)
+        jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * seen.rising
+        jacobian = torch.cat([jacobian, photos * seen.by_tone], 1) if len(light.log_tone) else jacobian
         weights = np.arange(first + (3 + c) * p, first + (4 + c) * p)
         places = np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6], tones])
-        lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
-        yield Channel(places, jacobian * (precision * pull)[:, None], residual * pull, lost)
+        yield Channel(places, jacobian * seen.scale[:, None], seen.residual, seen.loss)
+
+
+def _basis(some: Responses, materials: Materials, c: int) -> Float[torch.Tensor, "n p"]:
+    """Responses of the material in one channel."""
+    return materials.diffuse[some.material, c] * some.parts["diffuse"] + materials.specular[some.material, c] * some.parts["specular"]
+
+
+class Whitened(msgspec.Struct, frozen=True):
+    """Residual and loss of one channel of n rows; scale: of a slope of radiance, to be one of the residual;
+    rising, by_tone: slopes of radiance by linear radiance and by the log exponents [n, 1]."""
+
+    residual: Float[torch.Tensor, "n"]
+    scale: Float[torch.Tensor, "n"]
+    rising: Float[torch.Tensor, "n 1"] | float
+    by_tone: Float[torch.Tensor, "n 1"] | float
+    loss: float
+
+
+def _whitened(block: Block, rows: slice, c: int, linear: Float[torch.Tensor, "n"], light: Light, loss: Loss) -> Whitened:
+    predicted, rising, by_tone = _toned_with_slopes(linear, block, rows, light)
+    fit = torch.from_numpy((~block.held_out[rows]).astype(float))
+    precision = torch.from_numpy(block.precision[rows, c])
+    difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
+    satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
+    residual = torch.where(satisfied, 0.0, difference)
+    root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
+    pull = (fit / root * ~satisfied).sqrt()
+    lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
+    return Whitened(residual * pull, precision * pull, rising, by_tone, lost)
 
 
 def _toned_with_slopes(linear: Float[torch.Tensor, "n"], block: Block, rows: slice, light: Light):
@@ -218,6 +270,17 @@ def _toned_with_slopes(linear: Float[torch.Tensor, "n"], block: Block, rows: sli
     x, exponent = linear.clamp(min=0).numpy()[:, None], exponents(light, block.photo[rows])
     shown, rising, by_tone = (torch.from_numpy(of(x, exponent)) for of in (curve, slope, by_log_exponent))
     return shown[:, 0], rising, by_tone
+
+
+def beforehand(block: Block, light: Light, loss: Loss) -> tuple[float, Float[np.ndarray, "l"], Float[np.ndarray, "l l"]]:
+    """Value, gradient and Hessian, by the light's unknowns, of all that the loss holds beside residuals."""
+    gradient, hessian = np.zeros(light.unknowns), np.zeros((light.unknowns, light.unknowns))
+    lobes = slice(2 * len(light), 6 * len(light))
+    value, gradient[lobes], hessian[lobes, lobes] = _prior(block, light, loss)
+    if loss.light_prior is None:
+        return value, gradient, hessian
+    known, by_unknown, curved = loss.light_prior(block, light)
+    return value + known, gradient + by_unknown, hessian + curved
 
 
 def _prior(block: Block, light: Light, loss: Loss):

@@ -148,6 +148,11 @@ def of_rows(block: Block, rows: np.ndarray) -> Block:
     return msgspec.structs.replace(block, **{name: getattr(block, name)[rows] for name in fields}, visibility=visibility)
 
 
+def not_held_out(block: Block) -> Block:
+    """What is there to be fitted."""
+    return of_rows(block, ~block.held_out) if block.held_out.any() else block
+
+
 def sampled(block: Block, count: int, seed: int) -> Block:
     """At most `count` fitted and `count`/3 held-out observations, each material with its share, order kept."""
     random = np.random.default_rng(seed)

@@ -3,9 +3,9 @@
     round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
             descend on everything (descent), look for a better roughness (roughness), prune, fix the gauge
             (all on a sample of the observations, which finds the lobes as well as all of them do)
-    stop:   when a round lowers the held-out loss by less than `least_gain` and does not halve the fitted one (few held-out
-            pixels are a noisy vote), at `lobes` lobes per light, or after `rounds`; the best round is that of the least
-            held-out loss.
+    best:   the last round that lowered the best one's held-out loss by `least_gain` of it, and by `LEAST_GAIN`
+    stop:   when `PATIENCE` rounds in a row are not the best and do not halve the fitted loss (few held-out pixels are a noisy
+            vote), at `lobes` lobes per light, or after `rounds`
 """
 
 from __future__ import annotations
@@ -17,22 +17,25 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
-from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.descent import Descent, Solution, descend, evaluated, fitted
 from factorlib.solve.gauge import in_gauge
 from factorlib.solve.held_out import held_out_loss
 from factorlib.solve.history import Event, Report, Snapshot, recorder, unwatched
-from factorlib.solve.insertion import blurred, lobes_inserted, pruned, sharpest_told
-from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, residuals
+from factorlib.solve.insertion import blurred, lobes_inserted, pruned
+from factorlib.solve.normal_equations import Loss, predicted_radiance, residuals
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, sampled
 from factorlib.solve.resume import Journal
 from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.unknowns import Light, Materials
-from factorlib.solve.weights import refitted_weights
 
 A_LOBE = 60  # observations for each lobe of a light, that it may not explain their noise
 FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
+ROBUST = 1.345  # Huber 1981: 95 % of the efficiency of least squares where errors are normal
+LEAST_SCALE = 0.02
+PATIENCE = 2  # rounds that may gain nothing
+LEAST_GAIN = 0.005  # σ² of the noise model: what explains less is the operator's error, not the light
 HALVED = 0.5  # a round that lowers the fitted loss to this share is not the last, whatever held-out observations say
 
 
@@ -60,7 +63,10 @@ def from_nothing(materials: int) -> Start:
 
 
 class Rounds(msgspec.Struct, frozen=True):
-    """How far the rounds are: where they stand, the best of them and its held-out loss, the last fitted loss and its function."""
+    """How far the rounds are: where they stand, the best of them and its held-out loss, the last fitted loss and its function.
+
+    idle: how many rounds in a row have gained nothing
+    """
 
     current: Solution
     best: Solution
@@ -68,6 +74,7 @@ class Rounds(msgspec.Struct, frozen=True):
     fitted: float
     loss: Loss
     history: list[Event]
+    idle: int = 0
     over: bool = False
 
 
@@ -148,14 +155,13 @@ def sampled_for(blocks: Sequence[Block], lights: Sequence[Light], bundle: Bundle
 def _before_rounds(blocks: Sequence[Block], start: Start, operator, bundle: Bundle, map_: Callable) -> Rounds:
     blocks = [sampled(block, bundle.sample, bundle.seed) for block in blocks]
     materials, lights = start.point(blocks, operator, bundle, map_)
-    current = evaluated(blocks, materials, lights, operator, bundle.loss, map_)
-    current = bare(refitted(blocks, current, operator, bundle.loss, map_))
+    current = bare(fitted(blocks, materials, lights, operator, bundle.loss, map_))
     if not start.rested:
         return Rounds(current, current, np.inf, np.inf, bundle.loss, [])
     loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
-    fitted = evaluated(blocks, current.materials, current.lights, operator, loss, map_).loss
+    reached = evaluated(blocks, current.materials, current.lights, operator, loss, map_).loss
     held_out = held_out_loss(blocks, current.materials, current.lights, operator, bundle.loss)
-    return Rounds(current, current, held_out, fitted, loss, [])
+    return Rounds(current, current, held_out, reached, loss, [])
 
 
 def _next_round(
@@ -177,28 +183,33 @@ def _next_round(
     current = descend(blocks, current, operator, loss, descent_of(bundle, bundle.iterations), map_, partial(record, number, "descent"))
     current = tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
     held = record(number, "round", -1, current)
-    gained, halved = rounds.held_out - held, history[-1].loss < HALVED * rounds.fitted
+    better = rounds.held_out - held >= max(bundle.least_gain * held, LEAST_GAIN)
+    halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
-    enough = (gained < bundle.least_gain * held and not halved) or _full(current.lights, bundle)
-    best = current if gained > 0 else rounds.best
+    idle = 0 if better or halved else rounds.idle + 1
+    enough = idle >= PATIENCE or _full(current.lights, bundle)
+    best, least = (current, held) if better else (rounds.best, rounds.held_out)
     over = outdone or enough or number + 1 == bundle.rounds
-    return Rounds(bare(current), bare(best), min(held, rounds.held_out), history[-1].loss, loss, history, bool(over))
+    return Rounds(bare(current), bare(best), least, history[-1].loss, loss, history, idle, bool(over))
 
 
 def robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
-    """Three robust standard deviations of the current residual, never below one σ of the noise model."""
+    """`ROBUST` robust standard deviations of the current residual, at least `LEAST_SCALE` of the noise model's σ.
+
+    What a light of few lobes cannot show stands out from the rest long before it exceeds the noise model, and bends the materials.
+    """
     absolute = [
         np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator)))
         for b, light in zip(blocks, solution.lights, strict=True)
     ]
-    return max(3 * 1.4826 * float(np.median(np.concatenate(absolute))), 1.0)
+    return max(ROBUST * 1.4826 * float(np.median(np.concatenate(absolute))), LEAST_SCALE)
 
 
 def with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:
     seeds = [bundle.seed + 1000 * number + k for k in range(len(blocks))]
     grown = partial(_grown, materials=current.materials, operator=operator, bundle=bundle)
     lights = list(map_(grown, list(zip(blocks, current.lights, seeds, strict=True))))
-    return refitted(blocks, evaluated(blocks, current.materials, lights, operator, loss, map_), operator, loss, map_)
+    return fitted(blocks, current.materials, lights, operator, loss, map_)
 
 
 def _grown(one: tuple[Block, Light, int], materials: Materials, operator, bundle: Bundle) -> Light:
@@ -217,36 +228,16 @@ def _out_of_valleys(blocks, current: Solution, operator, loss: Loss, map_: Calla
 
 
 def tidied(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
-    """Pruned, no sharper than the materials can tell, and in gauge."""
-    materials, lights = in_gauge(current.materials, [pruned(light) for light in _no_sharper(current)], blocks)
+    """Pruned, and in gauge."""
+    materials, lights = in_gauge(current.materials, [pruned(light) for light in current.lights], blocks)
     return evaluated(blocks, materials, lights, operator, loss, map_)
 
 
 def answer_of(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
-    """Tidied, the weights those that fit all observations best."""
-    at = evaluated(blocks, current.materials, _no_sharper(current), operator, loss, map_)
-    lights = [pruned(light) for light in _refitted_lights(blocks, at, operator, loss)]
-    return Solution(*in_gauge(at.materials, lights, blocks), [])
-
-
-def _no_sharper(current: Solution) -> list[Light]:
-    """The lights, no lobe of which is sharper than the materials can tell."""
-    sharpest = sharpest_told(current.materials)
-    return [blurred(light, sharpest) for light in current.lights]
-
-
-def refitted(blocks, current: Solution, operator, loss: Loss, map_: Callable) -> Solution:
-    """With the weights that lower the loss most."""
-    return evaluated(blocks, current.materials, _refitted_lights(blocks, current, operator, loss), operator, loss, map_)
-
-
-def _refitted_lights(blocks, current: Solution, operator, loss: Loss) -> list[Light]:
-    lights = []
-    for block, light, equations in zip(blocks, current.lights, current.systems, strict=True):
-        found = refitted_weights(light, equations)
-        better = fit_loss(block, found, current.materials, operator, loss) <= equations.loss
-        lights.append(found if better else light)
-    return lights
+    """Pruned, no lobe sharper than the materials can tell, in gauge, the weights those that fit all observations best."""
+    lights = [blurred(light, current.materials.sharpest) for light in current.lights]
+    at = fitted(blocks, current.materials, lights, operator, loss, map_)
+    return Solution(*in_gauge(at.materials, [pruned(light) for light in at.lights], blocks), [])
 
 
 def bare(solution: Solution) -> Solution:

@@ -39,17 +39,18 @@ def damped_step(
     materials: Materials,
     lights: Sequence[Light],
     damping: float,
-    matte: Bool[np.ndarray, "m"] | None = None,
+    held: Bool[np.ndarray, "7m"] | None = None,
 ) -> Step:
     """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation.
 
+    held: unknowns of the materials that stay as they are
     Solved again, at most `ROUNDS` times, while it takes a weight or a sharpness out of bounds (which is then held there) or a lobe
     farther than the quadratic model is good for (which is then damped more, that lobe alone).
     """
     gradient = np.sum([s.material_gradient for s in systems], axis=0)
     hessian = np.sum([s.material_hessian for s in systems], axis=0)
-    free = ~held_materials(materials, gradient, matte)
-    bounds = [Bounds(s, light, materials.blur) for s, light in zip(systems, lights, strict=True)]
+    free = ~held_materials(materials, gradient) & (True if held is None else ~held)
+    bounds = [Bounds(s, light, materials) for s, light in zip(systems, lights, strict=True)]
     for _ in range(ROUNDS):
         by_material, by_light = _solved(systems, gradient, hessian, free, bounds, damping)
         changed = [bound.tighten(step) for bound, step in zip(bounds, by_light, strict=True)]
@@ -64,14 +65,13 @@ def damped_step(
 class Bounds:
     """What a light's step must keep to: unknowns that are not free take `fixed`; `extra` is their own damping."""
 
-    def __init__(self, s: System, light: Light, blur: float):
+    def __init__(self, s: System, light: Light, materials: Materials):
         self.light, self.diagonal = light, np.diag(s.light_hessian)
-        self.free = ~held_unknowns(light, s.light_gradient)
+        self.free = ~held_unknowns(light, materials, s.light_gradient)
         self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
         p = len(light)
         self.low, self.high = np.full(len(self.free), -np.inf), np.full(len(self.free), np.inf)
-        self.low[3 * p : 6 * p] = -light.energy.T.reshape(-1)
-        s_now, s_low, s_high = (-np.log(1 / sharpness + blur) for sharpness in (light.sharpness, *SHARPNESS))
+        s_now, s_low, s_high = (-np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest))
         self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
 
     def tighten(self, step: Float[np.ndarray, "l"]) -> bool:
@@ -113,30 +113,31 @@ def schur_complement(systems: Sequence[System], materials: Materials, lights: Se
     """The information that the data hold about the materials once every light is solved for."""
     reduced = np.sum([s.material_hessian for s in systems], axis=0)
     for s, light in zip(systems, lights, strict=True):
-        loose = ~held_unknowns(light, s.light_gradient)
+        loose = ~held_unknowns(light, materials, s.light_gradient)
         factor = cho_factor(masked(damped(s.light_hessian, 1e-9), loose), check_finite=False)
         cross = s.cross_hessian * loose
         reduced = reduced - cross @ cho_solve(factor, cross.T, check_finite=False)
     return (reduced + reduced.T) / 2
 
 
-def held_materials(
-    materials: Materials, gradient: Float[np.ndarray, "7m"], matte: Bool[np.ndarray, "m"] | None = None
-) -> Bool[np.ndarray, "7m"]:
-    """Unknowns of the materials at a bound that the loss pushes beyond, and the specular ones of matte materials."""
+def held_materials(materials: Materials, gradient: Float[np.ndarray, "7m"]) -> Bool[np.ndarray, "7m"]:
+    """Unknowns of the materials at a bound that the loss pushes beyond, and those that the loss does not depend on."""
     values = materials.vector().reshape(-1, 7)
     low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
     high = np.column_stack([np.zeros_like(values[:, :6], bool), values[:, 6] >= ROUGHNESS[1]]).reshape(-1)
-    specular = np.zeros_like(values, bool)
-    specular[:, 3:] = False if matte is None else matte[:, None]
-    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0) | specular.reshape(-1)
+    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0)
 
 
-def held_unknowns(light: Light, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:
+def specular_unknowns(matte: Bool[np.ndarray, "m"]) -> Bool[np.ndarray, "7m"]:
+    """Which unknowns are specular ones of the materials that are `matte`."""
+    return np.outer(matte, [False] * 3 + [True] * 4).reshape(-1)
+
+
+def held_unknowns(light: Light, materials: Materials, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:
     """Unknowns of a light at a bound that the loss pushes beyond, and those of lobes without weight."""
     p = len(light)
     held = np.zeros(len(gradient), bool)
-    low, high = np.log(SHARPNESS)
+    low, high = np.log([SHARPNESS[0], materials.sharpest])
     by_sharpness = gradient[2 * p : 3 * p]
     held[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | ((light.log_sharpness >= high) & (by_sharpness < 0))
     held[3 * p : 6 * p] = (light.weight.T.reshape(-1) <= 0) & (gradient[3 * p : 6 * p] > 0)

@@ -53,7 +53,7 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     information = schur_complement(systems, materials, lights)
     widths = np.tile(WIDTHS, len(materials))
     inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
-    by_cell = [reduced_scores(s, light) for s, light in zip(systems, lights, strict=True)]
+    by_cell = [reduced_scores(s, light, materials) for s, light in zip(systems, lights, strict=True)]
     covariances = inverse, _sandwich(inverse, np.vstack(by_cell), sigma), _sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
     variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in covariances]
     errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
@@ -74,10 +74,10 @@ def clusters_of(block: Block) -> Int[np.ndarray, "n"]:
     return np.unique(mirror_cells(block.normal, block.view, CLUSTER), return_inverse=True)[1].reshape(-1)
 
 
-def reduced_scores(s: System, light: Light) -> Float[np.ndarray, "k 7m"]:
+def reduced_scores(s: System, light: Light, materials: Materials) -> Float[np.ndarray, "k 7m"]:
     """Scores with this light eliminated."""
     m = len(s.material_gradient)
-    loose = ~held_unknowns(light, s.light_gradient)
+    loose = ~held_unknowns(light, materials, s.light_gradient)
     factor = cho_factor(masked(damped(s.light_hessian, 1e-9), loose), check_finite=False)
     return s.scores[:, :m] - (s.scores[:, m:] * loose) @ cho_solve(factor, (s.cross_hessian * loose).T, check_finite=False)
 

@@ -19,6 +19,7 @@ from factorlib.light.lobes import lobe_integral
 
 ROUGHNESS = (0.1, 1.0)  # the operators' domain
 SHARPNESS = (0.1, 2000.0)  # from nearly constant to 1.3° wide, about a texel of the exported map
+RESOLVED = 16.0  # a lobe this many times as sharp as the sharpest reflection widens it by 3 %: nothing sharper can be told
 TONE = (0.6, 1.7)  # exponents of tone curves: what cameras do
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
@@ -42,12 +43,22 @@ class Materials(msgspec.Struct, frozen=True):
         """b: by how much the least rough material widens a lobe's variance, about."""
         return 2 * float(self.roughness.min()) ** 4
 
+    @property
+    def sharpest(self) -> float:
+        """The sharpness of lobes beyond which all reflect alike."""
+        return sharpest_told(self.blur)
+
     @staticmethod
     def of_vector(vector: Float[np.ndarray, "7m"]) -> Materials:
         """The nearest materials within bounds."""
         rows = vector.reshape(-1, 7)
         reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
         return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
+
+
+def sharpest_told(blur: float) -> float:
+    """The sharpness of lobes that widen a reflection of variance `blur` just so little that nothing sharper can be told."""
+    return min(RESOLVED / blur, SHARPNESS[1])
 
 
 class Light(msgspec.Struct, frozen=True):
@@ -99,7 +110,7 @@ class Light(msgspec.Struct, frozen=True):
         turn = np.clip(by[:2], -0.3, 0.3)
         axis = self.axis + turn[0][:, None] * first + turn[1][:, None] * second
         variance = (1 / self.sharpness + blur) * np.exp(-np.clip(by[2], -1, 1)) - blur
-        log_sharpness = -np.log(np.clip(variance, 1 / SHARPNESS[1], 1 / SHARPNESS[0]))
+        log_sharpness = -np.log(np.clip(variance, 1 / sharpest_told(blur), 1 / SHARPNESS[0]))
         by_exposure, by_tone = np.split(step[6 * p :], [len(self.log_exposure) - 1])
         return Light(
             axis / np.linalg.norm(axis, axis=1, keepdims=True),

@@ -23,18 +23,18 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from factorlib.solve.descent import Descent, Solution, descend, evaluated
+from factorlib.solve.descent import Descent, Solution, descend
 from factorlib.solve.earlier import Earlier
 from factorlib.solve.held_out import held_out_loss
-from factorlib.solve.insertion import blurred, pruned, sharpest_told
-from factorlib.solve.normal_equations import Loss, System, fit_loss, predicted_radiance
+from factorlib.solve.insertion import blurred, pruned
+from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.rounds import Start, from_nothing, robust_scale, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
-from factorlib.solve.weights import refitted_weights
+from factorlib.solve.weights import system_of_fitted
 from factorlib.stage import serial_map
 
 log = logging.getLogger("factorlib.solve")
@@ -177,14 +177,14 @@ class Spreading:
 def fitted_light(block: Block, materials: Materials, operator, bundle: Bundle) -> Light:
     """A light found by rounds of insertion and descent with the materials held, as long as they gain."""
     light, best, least = starting_light(block, materials), None, np.inf
+    every = np.ones(7 * len(materials), bool)
     bundle = msgspec.structs.replace(bundle, insert=AT_ONCE * bundle.insert)
     for number in range(bundle.rounds):
-        current = evaluated([block], materials, [light], operator, bundle.loss, materials_held)
+        current = Solution(materials, [light], [])
         loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale([block], current, operator, bundle.loss))
         current = with_new_lobes([block], current, operator, loss, bundle, number, serial_map)
-        current = evaluated([block], materials, current.lights, operator, loss, materials_held)
-        current = descend([block], current, operator, loss, Descent(bundle.iterations, bundle.tolerance), materials_held)
-        light = blurred(pruned(current.lights[0]), sharpest_told(materials))
+        current = descend([block], current, operator, loss, Descent(bundle.iterations, bundle.tolerance), serial_map, held=every)
+        light = blurred(pruned(current.lights[0]), materials.sharpest)
         held_out = held_out_loss([block], materials, [light], operator, bundle.loss)
         gained, least, best = least - held_out, min(least, held_out), light if held_out < least else best
         if gained < bundle.least_gain * held_out or len(light) >= bundle.lobes:
@@ -192,16 +192,9 @@ def fitted_light(block: Block, materials: Materials, operator, bundle: Bundle) -
     return best
 
 
-def materials_held(function: Callable, items) -> list[System]:
-    """A map that leaves no gradient in the materials: a damped step holds what has none."""
-    systems = serial_map(function, items)
-    return [msgspec.structs.replace(system, material_gradient=np.zeros_like(system.material_gradient)) for system in systems]
-
-
 def _fitted_weights(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> tuple[float, Light]:
-    current: Solution = evaluated([block], materials, [light], operator, loss, serial_map)
-    fitted = refitted_weights(light, current.systems[0])
-    return min((current.loss, light), (fit_loss(block, fitted, materials, operator, loss), fitted), key=lambda pair: pair[0])
+    found, of_found = system_of_fitted(block, light, materials, operator, loss)
+    return of_found.loss, found
 
 
 def with_exposures(light: Light, block: Block, materials: Materials, operator) -> Light:

@@ -6,25 +6,53 @@ channels that are already explained, and outliers, carry the weights of the curr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from factorlib.solve.normal_equations import System
-from factorlib.solve.unknowns import Light
+from factorlib.solve.normal_equations import Loss, Responses, System, energy_systems, responses, system
+from factorlib.solve.problem import Block, not_held_out
+from factorlib.solve.unknowns import Light, Materials
+
+HELD = 1 << 20  # responses of observations to lobes that are held; of more they are computed twice
 
 
-def refitted_weights(light: Light, equations: System) -> Light:
-    """The non-negative weights that minimise the quadratic model of `equations` with all else held."""
-    p = len(light)
+def system_of_fitted(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> tuple[Light, System]:
+    """The light with the weights that lower the loss most, all else held, and its system.
+
+    Observations that are clipped, outliers or toned make the loss one of more than least squares: a light whose fitted weights
+    would raise it keeps its own.
+    """
+    block = not_held_out(block)
+    shown: Iterable[Responses] = _Shown(block, light, materials, operator)
+    shown = list(shown) if len(block) * len(light) <= HELD else shown
+    before, gradients, hessians = energy_systems(block, light, materials, shown, loss)
+    found = with_fitted_weights(light, gradients, hessians)
+    of_found = system(block, found, materials, operator, loss, shown=shown)
+    return (found, of_found) if of_found.loss <= before else (light, system(block, light, materials, operator, loss, shown=shown))
+
+
+class _Shown(msgspec.Struct, frozen=True):
+    """The responses of a block to a light, computed whenever they are gone through."""
+
+    block: Block
+    light: Light
+    materials: Materials
+    operator: object
+
+    def __iter__(self):
+        return responses(self.block, self.light, self.materials, self.operator)
+
+
+def with_fitted_weights(light: Light, gradients: Float[np.ndarray, "3 p"], hessians: Float[np.ndarray, "3 p p"]) -> Light:
+    """The non-negative weights that minimise the quadratic model, by the energies of each channel, with all else held."""
     energy = light.energy
-    for c in range(3):
-        own = slice((3 + c) * p, (4 + c) * p)
-        hessian = equations.light_hessian[own, own]
-        target = hessian @ energy[:, c] - equations.light_gradient[own]
-        energy[:, c] = nonnegative_minimum(hessian, target)
+    for c, (gradient, hessian) in enumerate(zip(gradients, hessians, strict=True)):
+        energy[:, c] = nonnegative_minimum(hessian, hessian @ energy[:, c] - gradient)
     return msgspec.structs.replace(light, weight=energy / light.spread[:, None])
 
 

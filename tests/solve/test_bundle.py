@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from factorlib.reflection import reflection_operator
-from factorlib.solve import insertion
+from factorlib.solve import unknowns
 from factorlib.solve.bundle import solve
-from factorlib.solve.descent import Solution, evaluated
-from factorlib.solve.insertion import sharpest_told
+from factorlib.solve.descent import Solution, evaluated, fitted
 from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import connected_components
-from factorlib.solve.rounds import answer_of, refitted
+from factorlib.solve.rounds import answer_of
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
@@ -52,14 +51,14 @@ def test_resynthesises_what_it_was_shown(solved):
 
 
 def test_no_lobe_is_sharper_than_the_materials_can_tell_and_the_weights_fit_what_is_left(solved, monkeypatch):
-    monkeypatch.setattr(insertion, "RESOLVED", 0.3)  # so that lobes are blurred
+    monkeypatch.setattr(unknowns, "RESOLVED", 0.3)  # so that lobes are blurred
     blocks, materials, lights, _ = solved
     everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
     found = answer_of(everything, Solution(materials, lights, []), OPERATOR, Loss(), serial_map)
-    assert all((light.log_sharpness <= np.log(sharpest_told(materials)) + 1e-12).all() for light in found.lights)
-    assert any(light.log_sharpness.max() > np.log(sharpest_told(materials)) for light in lights)
+    assert all((light.log_sharpness <= np.log(materials.sharpest) + 1e-12).all() for light in found.lights)
+    assert any(light.log_sharpness.max() > np.log(materials.sharpest) for light in lights)
     again = evaluated(everything, found.materials, found.lights, OPERATOR, Loss(), serial_map)
-    better = refitted(everything, again, OPERATOR, Loss(), serial_map)
+    better = fitted(everything, found.materials, found.lights, OPERATOR, Loss(), serial_map)
     assert better.loss > 0.99 * again.loss
 
 

@@ -46,7 +46,7 @@ def test_scores_of_clusters_sum_to_the_gradient(solved):
     whole = system(data, light, MATERIALS, OPERATOR, Loss(prior=0.0), clusters_of(data))
     np.testing.assert_allclose(whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8)
     assert len(whole.scores) > 20
-    assert reduced_scores(whole, light).shape == (len(whole.scores), 21)
+    assert reduced_scores(whole, light, MATERIALS).shape == (len(whole.scores), 21)
 
 
 def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():

@@ -15,7 +15,7 @@ from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table, T
 from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
 from factorlib.solve.unknowns import Light, Materials
-from factorlib.solve.warm import Spreading, from_earlier, known_of, materials_held, with_exposures
+from factorlib.solve.warm import Spreading, from_earlier, known_of, with_exposures
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
@@ -180,8 +180,8 @@ def test_a_descent_with_the_materials_held_moves_the_light_alone():
     (data,), (light,) = truth(0)
     away = msgspec.structs.replace(light, log_sharpness=light.log_sharpness - 0.2)
     moved = msgspec.structs.replace(MATERIALS, roughness=MATERIALS.roughness + 0.03)
-    start = evaluated([data], moved, [away], OPERATOR, Loss(), materials_held)
-    found = descend([data], start, OPERATOR, Loss(), Descent(5), materials_held)
+    start = evaluated([data], moved, [away], OPERATOR, Loss(), serial_map)
+    found = descend([data], start, OPERATOR, Loss(), Descent(5), serial_map, held=np.ones(21, bool))
     np.testing.assert_array_equal(found.materials.vector(), moved.vector())
     assert found.loss < start.loss
 
