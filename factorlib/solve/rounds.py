@@ -32,7 +32,7 @@ from factorlib.solve.unknowns import Light, Materials
 
 A_LOBE = 60  # observations for each lobe of a light, that it may not explain their noise
 FAR_BEHIND = 1.25  # a model whose held-out loss is this many times a rival's at the same round is given up
-ROBUST = 1.345  # Huber 1981: 95 % of the efficiency of least squares where errors are normal
+ROBUST = 2.0  # standard deviations: beyond lies what a light of few lobes cannot show
 LEAST_SCALE = 0.02
 PATIENCE = 2  # rounds that may gain nothing
 LEAST_GAIN = 0.005  # σ² of the noise model: what explains less is the operator's error, not the light
