@@ -63,7 +63,7 @@ def from_nothing(materials: int) -> Start:
 
 
 class Rounds(msgspec.Struct, frozen=True):
-    """How far the rounds are: where they stand, the best of them and its held-out loss, the last fitted loss and its function.
+    """How far the rounds are: where they stand, the best of them and its held-out loss, and the last fitted loss.
 
     idle: how many rounds in a row have gained nothing
     """
@@ -72,14 +72,13 @@ class Rounds(msgspec.Struct, frozen=True):
     best: Solution
     held_out: float
     fitted: float
-    loss: Loss
     history: list[Event]
     idle: int = 0
     over: bool = False
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """The best round, its held-out loss, the loss function it was fitted by, and all events up to the last round."""
+    """The best round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
 
     solution: Solution
     held_out: float
@@ -113,7 +112,7 @@ def best_round(
     rounds = rounds or journal.keep(part, _before_rounds(blocks, start, operator, bundle, map_))
     while not rounds.over:
         rounds = journal.keep(part, _next_round(blocks, rounds, operator, bundle, map_, report, rivals, snapshot))
-    return Fit(rounds.best, rounds.held_out, rounds.loss, rounds.history)
+    return _fit(blocks, rounds, operator, bundle)
 
 
 def further_rounds(
@@ -131,11 +130,16 @@ def further_rounds(
     rounds = journal.kept("further rounds", Rounds)
     if not rounds:
         held_out = held_out_loss(sampled_for(blocks, start.lights, bundle), start.materials, start.lights, operator, bundle.loss)
-        rounds = Rounds(start, start, held_out, np.inf, fit.loss, fit.history)
+        rounds = Rounds(start, start, held_out, np.inf, fit.history)
         rounds = msgspec.structs.replace(rounds, over=_full(start.lights, bundle) or _rounds_done(rounds) >= bundle.rounds)
     while not rounds.over:
         rounds = journal.keep("further rounds", _next_round(blocks, rounds, operator, bundle, map_, report, (), snapshot))
-    return Fit(rounds.best, rounds.held_out, rounds.loss, rounds.history)
+    return _fit(blocks, rounds, operator, bundle)
+
+
+def _fit(blocks: Sequence[Block], rounds: Rounds, operator, bundle: Bundle) -> Fit:
+    loss = robust(sampled_for(blocks, rounds.best.lights, bundle), rounds.best, operator, bundle.loss)
+    return Fit(rounds.best, rounds.held_out, loss, rounds.history)
 
 
 def _full(lights: Sequence[Light], bundle: Bundle) -> bool:
@@ -157,11 +161,11 @@ def _before_rounds(blocks: Sequence[Block], start: Start, operator, bundle: Bund
     materials, lights = start.point(blocks, operator, bundle, map_)
     current = bare(fitted(blocks, materials, lights, operator, bundle.loss, map_))
     if not start.rested:
-        return Rounds(current, current, np.inf, np.inf, bundle.loss, [])
-    loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
+        return Rounds(current, current, np.inf, np.inf, [])
+    loss = robust(blocks, current, operator, bundle.loss)
     reached = evaluated(blocks, current.materials, current.lights, operator, loss, map_).loss
     held_out = held_out_loss(blocks, current.materials, current.lights, operator, bundle.loss)
-    return Rounds(current, current, held_out, reached, loss, [])
+    return Rounds(current, current, held_out, reached, [])
 
 
 def _next_round(
@@ -178,7 +182,7 @@ def _next_round(
     number = _rounds_done(rounds)
     blocks = sampled_for(blocks, current.lights, bundle, bundle.insert)
     record = recorder(blocks, history, operator, bundle.loss, report, snapshot)
-    loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale(blocks, current, operator, bundle.loss))
+    loss = robust(blocks, current, operator, bundle.loss)
     current = with_new_lobes(blocks, current, operator, loss, bundle, number, map_)
     current = descend(blocks, current, operator, loss, descent_of(bundle, bundle.iterations), map_, partial(record, number, "descent"))
     current = tidied(blocks, _out_of_valleys(blocks, current, operator, loss, map_), operator, loss, map_)
@@ -190,11 +194,11 @@ def _next_round(
     enough = idle >= PATIENCE or _full(current.lights, bundle)
     best, least = (current, held) if better else (rounds.best, rounds.held_out)
     over = outdone or enough or number + 1 == bundle.rounds
-    return Rounds(bare(current), bare(best), least, history[-1].loss, loss, history, idle, bool(over))
+    return Rounds(bare(current), bare(best), least, history[-1].loss, history, idle, bool(over))
 
 
-def robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> float:
-    """`ROBUST` robust standard deviations of the current residual, at least `LEAST_SCALE` of the noise model's σ.
+def robust(blocks: Sequence[Block], solution: Solution, operator, loss: Loss) -> Loss:
+    """The loss with `ROBUST` robust standard deviations of the current residual as its scale, at least `LEAST_SCALE` of the noise model's σ.
 
     What a light of few lobes cannot show stands out from the rest long before it exceeds the noise model, and bends the materials.
     """
@@ -202,7 +206,8 @@ def robust_scale(blocks: Sequence[Block], solution: Solution, operator, loss: Lo
         np.abs(residuals(b, predicted_radiance(b, light, solution.materials, operator)))
         for b, light in zip(blocks, solution.lights, strict=True)
     ]
-    return max(ROBUST * 1.4826 * float(np.median(np.concatenate(absolute))), LEAST_SCALE)
+    scale = max(ROBUST * 1.4826 * float(np.median(np.concatenate(absolute))), LEAST_SCALE)
+    return msgspec.structs.replace(loss, robust_scale=scale)
 
 
 def with_new_lobes(blocks, current: Solution, operator, loss: Loss, bundle: Bundle, number: int, map_: Callable) -> Solution:

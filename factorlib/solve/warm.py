@@ -31,7 +31,7 @@ from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.roughness import materials_out_of_valleys
-from factorlib.solve.rounds import Start, from_nothing, robust_scale, with_new_lobes
+from factorlib.solve.rounds import Start, from_nothing, robust, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
 from factorlib.solve.weights import system_of_fitted
@@ -181,7 +181,7 @@ def fitted_light(block: Block, materials: Materials, operator, bundle: Bundle) -
     bundle = msgspec.structs.replace(bundle, insert=AT_ONCE * bundle.insert)
     for number in range(bundle.rounds):
         current = Solution(materials, [light], [])
-        loss = msgspec.structs.replace(bundle.loss, robust_scale=robust_scale([block], current, operator, bundle.loss))
+        loss = robust([block], current, operator, bundle.loss)
         current = with_new_lobes([block], current, operator, loss, bundle, number, serial_map)
         current = descend([block], current, operator, loss, Descent(bundle.iterations, bundle.tolerance), serial_map, held=every)
         light = blurred(pruned(current.lights[0]), materials.sharpest)
