@@ -12,6 +12,10 @@ clusters.  One is what a light sends toward nearby mirror directions: a region o
 share.  The other is a whole light: with few lobes it is wrong everywhere in ways that lean together, and only other lights
 tell.  The largest of the three variances is taken, unknown by unknown.
 
+Scores are those of residuals up to the noise model's σ at least, where the answer was found with a narrower robust scale: what it set
+aside as an outlier is a part of the light that its lobes do not show, and by how much that would move the materials is what they are
+uncertain by.
+
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
 Here the sum of diffuse and specular reflectance over a component's materials is held in each channel: with g the
 direction of that factor and h the gradient of the held sum, covariances are projected by P = I − g hᵀ / (hᵀ g).
@@ -21,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
@@ -47,6 +52,7 @@ def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> 
     """
     materials, lights = solution.materials, solution.lights
     sigma = max(residual_deviation(blocks, materials, lights, operator), LEAST_DEVIATION)
+    loss = msgspec.structs.replace(loss, robust_scale=max(loss.robust_scale, 1.0))
     systems = [
         system(block, light, materials, operator, loss, clusters_of(block)) for block, light in zip(blocks, lights, strict=True)
     ]

@@ -67,7 +67,7 @@ def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standar
 
 
 def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within_the_errors():
-    """No noise: all error is the lobes' own bias.  Without whole lights as clusters about .4 lie within, without any .2."""
+    """No noise: all error is the lobes' own bias.  Of narrow residuals about .46 lie within."""
     inside = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
         factor = factor_between(found, MATERIALS)
         true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
         inside += (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
-    assert 0.52 < np.mean(inside) < 0.85, np.mean(inside)
+    assert 0.58 < np.mean(inside) < 0.82, np.mean(inside)
 
 
 def test_noise_twice_as_large_doubles_the_errors(solved):
