@@ -39,14 +39,14 @@ class Row(msgspec.Struct, frozen=True):
 
 SYNTHETIC = (
     Bound("materials.worst_roughness", "≤", 0.025, "", "roughness, worst material"),
-    Bound("materials.worst_diffuse", "≤", 0.05, "", "diffuse, worst material and channel, relative"),
-    Bound("materials.worst_specular", "≤", 0.035, "", "specular, worst material and channel, relative"),
+    Bound("materials.worst_diffuse", "≤", 0.03, "", "diffuse, worst material and channel, relative"),
+    Bound("materials.worst_specular", "≤", 0.02, "", "specular, worst material and channel, relative"),
     Bound("resynthesis.worst_psnr_linear_db", "≥", 38.0, "dB", "re-synthesis, worst photo, no gauge, linear"),
     Bound("resynthesis.worst_psnr_tonemapped_db", "≥", 42.0, "dB", "re-synthesis, worst photo, no gauge, tone-mapped"),
     Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 39.5, "dB", "relit balls, one scalar per set"),
     Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.24, "", "mirror sphere, of the truth's RMS"),
     Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.06, "", "glossy sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.0055, "", "matte sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.0045, "", "matte sphere, of the truth's RMS"),
 )
 
 
