@@ -6,7 +6,7 @@ With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i per illum
 
 with 7 unknowns a material.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on
 the units of an unknown.  An unknown at a bound that the gradient pushes outward is held (its row becomes identity);
-the others are clipped after the step.
+the others are clipped after the step, but for the weights, which are fitted anew where it leads (descent).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def damped_step(
     """The step of all unknowns at the given Levenberg–Marquardt `damping`; order of `systems` is order of summation.
 
     held: unknowns of the materials that stay as they are
-    Solved again, at most `ROUNDS` times, while it takes a weight or a sharpness out of bounds (which is then held there) or a lobe
+    Solved again, at most `ROUNDS` times, while it takes a sharpness out of bounds (which is then held there) or a lobe
     farther than the quadratic model is good for (which is then damped more, that lobe alone).
     """
     gradient = np.sum([s.material_gradient for s in systems], axis=0)

@@ -6,15 +6,13 @@ channels that are already explained, and outliers, carry the weights of the curr
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from factorlib.solve.normal_equations import Loss, Responses, System, energy_systems, responses, system
+from factorlib.solve.normal_equations import Loss, System, energy_systems, responses, system
 from factorlib.solve.problem import Block, not_held_out
 from factorlib.solve.unknowns import Light, Materials
 
@@ -28,24 +26,12 @@ def system_of_fitted(block: Block, light: Light, materials: Materials, operator,
     would raise it keeps its own.
     """
     block = not_held_out(block)
-    shown: Iterable[Responses] = _Shown(block, light, materials, operator)
-    shown = list(shown) if len(block) * len(light) <= HELD else shown
-    before, gradients, hessians = energy_systems(block, light, materials, shown, loss)
+    shown = responses(block, light, materials, operator)
+    held = list(shown) if len(block) * len(light) <= HELD else None
+    before, gradients, hessians = energy_systems(block, light, materials, shown if held is None else held, loss)
     found = with_fitted_weights(light, gradients, hessians)
-    of_found = system(block, found, materials, operator, loss, shown=shown)
-    return (found, of_found) if of_found.loss <= before else (light, system(block, light, materials, operator, loss, shown=shown))
-
-
-class _Shown(msgspec.Struct, frozen=True):
-    """The responses of a block to a light, computed whenever they are gone through."""
-
-    block: Block
-    light: Light
-    materials: Materials
-    operator: object
-
-    def __iter__(self):
-        return responses(self.block, self.light, self.materials, self.operator)
+    of_found = system(block, found, materials, operator, loss, shown=held)
+    return (found, of_found) if of_found.loss <= before else (light, system(block, light, materials, operator, loss, shown=held))
 
 
 def with_fitted_weights(light: Light, gradients: Float[np.ndarray, "3 p"], hessians: Float[np.ndarray, "3 p p"]) -> Light:
