@@ -8,7 +8,7 @@ OPTIONS_NOT_FORCED = $(if $(DATASET),--dataset "$(DATASET)") $(if $(SET),--set "
 MAKEFLAGS += --no-print-directory
 unexport DATASET SET FORCE
 
-.PHONY: all plan why status graph validate clean gc setup test data help $(STAGES)
+.PHONY: all plan why status graph validate clean gc setup test test-long data help $(STAGES)
 
 all plan why $(STAGES): .venv/ready
 	@$(PY) -m factorlib $@ $(OPTIONS)
@@ -35,6 +35,9 @@ test: .venv/ready
 	@.venv/bin/lint-imports --no-cache
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
 
+test-long: .venv/ready
+	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
+
 bench-%: .venv/ready
 	@OMP_NUM_THREADS=1 $(PY) -m benchmarks.$*
 
@@ -53,6 +56,7 @@ help:
 	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'
+	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'
 	@echo 'make bench-solve                     the joint solve: speed against error, to build/bench/solve'
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
