@@ -9,14 +9,14 @@ import torch
 
 from factorlib.errors import InputError
 from factorlib.reflection import Operator, reflection_operator
-from factorlib.reflection.operator import MODULES
+from factorlib.reflection.operator import NAMES
 
 REFERENCE = "reference"
 
 
 def fast_names() -> list[str]:
     """Names of all operators but the reference."""
-    return [name for name in MODULES if name != REFERENCE]
+    return [name for name in NAMES if name != REFERENCE]
 
 
 def made(name: str, dtype: str, *, compiled: bool = True) -> Operator | None:

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from factorlib.errors import InputError
 from factorlib.reflection.diffuse import diffuse_of_moments
 from factorlib.reflection.filtering import filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
@@ -33,6 +34,8 @@ from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value
 
 log = logging.getLogger("factorlib.reflection")
+ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
+PROGRAMS = {"CC": "cc"}
 FLAGS = "-std=gnu11 -O3 -march=native -fPIC -shared -fno-math-errno -fno-trapping-math -fno-signed-zeros -ffinite-math-only -fassociative-math -freciprocal-math"
 MOMENTS = ("sharpness", "lam", "mean", "along", "across")  # of a lobe; all but the first are functions of it
 PLACES = {name: f"lobe[{k}][l]" for k, name in enumerate([*MOMENTS, *(f"d{m}" for m in MOMENTS)])}
@@ -175,7 +178,7 @@ def _cache() -> Path:
 
 
 def fused(part: str, layers: Layers) -> Fused | None:
-    """The compiled network, or None, with a message, where there is no compiler."""
+    """The compiled network, or None, with a message, where there is no compiler; InputError where it fails."""
     if os.environ.get("FACTORLIB_FUSED") == "0" or layers.weights[0].shape[0] % 4 or layers.weights[0].shape[1] % 4:
         return None
     if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]) is None:
@@ -184,8 +187,10 @@ def fused(part: str, layers: Layers) -> Fused | None:
     try:
         return Fused(part, layers)
     except (OSError, subprocess.SubprocessError) as error:
-        log.warning(
-            "the reflection network runs in torch, about ten times slower, since its C code did not compile: %s",
-            getattr(error, "stderr", error),
-        )
-        return None
+        # not torch instead: which form runs is in the keys of steps, and nothing there knows that this one failed
+        said = " ".join((getattr(error, "stderr", None) or str(error)).split())
+        raise InputError(
+            f"the C code of the reflection network did not compile ({said})",
+            key="CC",
+            cure="mend the compiler, name another (CC=gcc), or take torch, about ten times slower: FACTORLIB_FUSED=0",
+        ) from error

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 import torch
@@ -15,12 +14,7 @@ from factorlib.errors import InputError, did_you_mean
 
 Name = Literal["reference", "closed_form", "network", "paper_network"]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-MODULES = {
-    "reference": ("reference", "Reference"),
-    "closed_form": ("closed_form", "ClosedForm"),
-    "network": ("network", "Network"),
-    "paper_network": ("paper_network", "PaperNetwork"),
-}
+NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
 CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
 
@@ -107,12 +101,24 @@ def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype:
     weights: folder with diffuse.safetensors and specular.safetensors, for the networks; None takes the shipped ones
     dtype:   float32 or float64; None takes the operator's own (float64 for the reference, float32 for the others)
     """
-    if name not in MODULES:
-        raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, MODULES))
+    if name not in NAMES:
+        raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, NAMES))
     if dtype is not None and dtype not in DTYPES:
         raise InputError(f"no dtype '{dtype}'", cure=did_you_mean(dtype, DTYPES))
-    module, kind = MODULES[name]
     options = {"dtype": DTYPES[dtype]} if dtype else {}
     if name == "network" and weights is not None:
         options["weights"] = weights
-    return getattr(import_module(f"factorlib.reflection.{module}"), kind)(**options)
+    return _kind(name)(**options)
+
+
+def _kind(name: Name) -> type[Operator]:
+    """Each is imported when it is asked for, and by a statement: what a step runs is found by reading the imports."""
+    if name == "reference":
+        from factorlib.reflection.reference import Reference as Kind
+    elif name == "closed_form":
+        from factorlib.reflection.closed_form import ClosedForm as Kind
+    elif name == "network":
+        from factorlib.reflection.network import Network as Kind
+    else:
+        from factorlib.reflection.paper_network import PaperNetwork as Kind
+    return Kind

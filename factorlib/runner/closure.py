@@ -2,50 +2,103 @@
 
 Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports are
 found anywhere in a module, inside functions too; modules named only at run time (`import_module(name)`) are not seen.
+
+Package data counts by one rule: every file that lies beside an imported module, or in a folder beside it that is no
+package, and is not Python, but for what Python and editors leave there (`left_over`).
+
+What else a module's numbers depend on it declares in constants, which are read from its syntax tree:
+
+    ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
+    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and what stands in for it; whether
+                                          there is such a program counts, and its name, not where it lies
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import os
+import shlex
+import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes
 
-DATA = {".safetensors", ".html", ".j2", ".css", ".js"}  # package data that counts as source
+KINDS = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
 
 
 class Source(msgspec.Struct, frozen=True):
     """What one module's text says.
 
     digest:  of its syntax tree;  imports: dotted names as imported;  params: fields of its class Params, if it has one
+    environment, programs: what it declares its numbers to depend on
     """
 
     digest: str
     imports: list[str]
     params: list[str] | None
+    environment: list[str]
+    programs: dict[str, str]
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """modules: dotted name -> digest;  data: path in its package -> digest;  external: top-level names outside the project."""
+    """modules: dotted name -> digest;  data: path in its package -> digest;  external: top-level names outside the project;
+    environment, programs: as the modules declare them;  files: where each module and each piece of data lies."""
 
     modules: dict[str, str]
     data: dict[str, str]
     external: list[str]
+    environment: list[str]
+    programs: dict[str, str]
+    files: dict[str, Path]
+
+    def record(self) -> dict[str, str]:
+        """The part of a step's record that is its code, and what the code is told by the environment now."""
+        record = {f"source:{module}": digest for module, digest in self.modules.items()}
+        record |= {f"data:{file}": digest for file, digest in self.data.items()}
+        record |= {f"environment:{name}": os.environ[name] for name in self.environment if name in os.environ}
+        return record | {f"program:{name}": found for name, default in self.programs.items() if (found := _program(name, default))}
+
+    def changes(self, record: Mapping[str, Any]) -> list[str]:
+        """The names of what is not as it is in `record`."""
+        now = self.record()
+        before = {name: value for name, value in record.items() if name.startswith(KINDS)}
+        return [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+
+
+def _program(name: str, default: str) -> str | None:
+    """The words that name a program, without the folder it lies in; None where there is no such program."""
+    words = shlex.split(os.environ.get(name, default)) or [""]
+    return " ".join([Path(words[0]).name, *words[1:]]) if shutil.which(words[0]) else None
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
-    """Raises SyntaxError."""
+    """Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
     imports = sorted({name for node in ast.walk(tree) for name in _imported(node, module, is_package)})
     params = _params_of(tree)
+    environment, programs = _declared(tree, "ENVIRONMENT", list[str], []), _declared(tree, "PROGRAMS", dict[str, str], {})
     for node in ast.walk(tree):
         _drop_docstring(node)
-    return Source(hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32], imports, params)
+    return Source(hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32], imports, params, environment, programs)
+
+
+def _declared(tree: ast.Module, name: str, type_: Any, default: Any) -> Any:
+    """The value of the constant `name` of a module, without running it."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and any(isinstance(target, ast.Name) and target.id == name for target in node.targets):
+            try:
+                return msgspec.convert(ast.literal_eval(node.value), type_)
+            except (ValueError, msgspec.ValidationError):
+                cure = "write names as they stand: " + ('{"CC": "cc"}' if type_ == dict[str, str] else '("A_VARIABLE",)')
+                raise InputError(f"line {node.lineno}: {name} is read without running the module", key=name, cure=cure) from None
+    return default
 
 
 def _imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
@@ -105,8 +158,16 @@ class Sources:
                     break
                 seen[part] = file
                 stack += self._source(part, file).imports
-        modules = {name: self._source(name, file).digest for name, file in sorted(seen.items()) if file.name.endswith(".py")}
-        return Closure(modules, self._data(seen), sorted(external - sys.stdlib_module_names - {""}))
+        sources = {name: self._source(name, file) for name, file in sorted(seen.items()) if file.name.endswith(".py")}
+        data = self._data(seen)
+        return Closure(
+            modules={name: source.digest for name, source in sources.items()},
+            data={name: self.hashes.content(path) for name, path in data.items()},
+            external=sorted(external - sys.stdlib_module_names - {""}),
+            environment=sorted({name for source in sources.values() for name in source.environment}),
+            programs={name: program for source in sources.values() for name, program in source.programs.items()},
+            files={f"source:{name}": seen[name] for name in sources} | {f"data:{name}": path for name, path in data.items()},
+        )
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
@@ -144,7 +205,7 @@ class Sources:
 
     def _source(self, name: str, file: Path) -> Source:
         if file.is_dir():
-            return Source("", [], None)
+            return Source("", [], None, [], {})
         return self.hashes.source(file, lambda: self._parse(name, file))
 
     @staticmethod
@@ -153,16 +214,18 @@ class Sources:
             return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
         except SyntaxError as error:
             raise InputError(f"not Python: {error.msg}", file=f"{file}:{error.lineno}", cure="mend that line") from error
+        except InputError as error:
+            raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
 
-    def _data(self, modules: dict[str, Path]) -> dict[str, str]:
-        """Weights and templates beside the modules, or in folders beside them that are no packages."""
+    def _data(self, modules: dict[str, Path]) -> dict[str, Path]:
+        """Whatever is no Python beside the modules, or in folders beside them that are no packages."""
         packages = {
             name.rpartition(".")[0]: file.parent for name, file in modules.items() if not file.is_dir() and file.name != "__init__.py"
         }
         packages |= {name: file.parent for name, file in modules.items() if file.name == "__init__.py"}
         packages.pop("", None)  # beside a module that is in no package lies anything
         files = {f"{name}:{path.relative_to(folder).as_posix()}": path for name, folder in packages.items() for path in _data_files(folder)}
-        return {name: self.hashes.content(path) for name, path in sorted(files.items())}
+        return dict(sorted(files.items()))
 
 
 def _with_parents(name: str) -> list[str]:
@@ -172,9 +235,18 @@ def _with_parents(name: str) -> list[str]:
 
 def _data_files(folder: Path) -> list[Path]:
     files = []
-    for path in sorted(folder.iterdir()):
-        if path.suffix in DATA and path.is_file():
+    for path in sorted(path for path in folder.iterdir() if not left_over(path.name)):
+        if path.is_dir():
+            files += _data_files(path) if not (path / "__init__.py").exists() else []
+        elif path.is_file() and path.suffix != ".py":
             files.append(path)
-        elif path.is_dir() and path.name != "__pycache__" and not (path / "__init__.py").exists():
-            files += _data_files(path)
     return files
+
+
+def left_over(name: str) -> bool:
+    """Whether Python or an editor left a file or folder of that name: hidden, a backup, or compiled Python.
+
+    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
+    [True, True, True, True, True, False]
+    """
+    return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"

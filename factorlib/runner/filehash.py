@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from factorlib.runner.closure import Source
 
 Signature = tuple[int, int, int, int]
+FORMAT = 2  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
 
 
@@ -58,7 +59,7 @@ class FileHashes:
     def _read(self) -> tuple[dict, dict]:
         try:
             tables = msgspec.json.decode(self.cache.read_bytes())
-            return tables["contents"], tables["sources"]
+            return (tables["contents"], tables["sources"]) if tables["format"] == FORMAT else ({}, {})
         except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError):
             return {}, {}
 
@@ -67,6 +68,6 @@ class FileHashes:
             return
         self.cache.parent.mkdir(parents=True, exist_ok=True)
         draft = self.cache.with_name(f"{self.cache.name}.{os.getpid()}")
-        draft.write_bytes(msgspec.json.encode({"contents": self._contents, "sources": self._sources}))
+        draft.write_bytes(msgspec.json.encode({"format": FORMAT, "contents": self._contents, "sources": self._sources}))
         os.replace(draft, self.cache)
         self._changed = False

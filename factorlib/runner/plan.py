@@ -133,6 +133,8 @@ _KIND = {
     "input": "result of {}",
     "gathered": "gathered file of {}",
     "data": "package data {}",
+    "environment": "environment variable {}",
+    "program": "program {}",
     "package": "package {}",
 }
 

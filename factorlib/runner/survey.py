@@ -92,9 +92,7 @@ def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Pac
     stage = pipeline.stages[name]
     record = {"stage": name, "threads": stage.threads, "python": f"{sys.version_info[0]}.{sys.version_info[1]}", "makes": stage.makes}
     record |= {f"param:{key}": value for key, value in stage.values.items()}
-    record |= {f"source:{module}": digest for module, digest in closure.modules.items()}
-    record |= {f"data:{file}": digest for file, digest in closure.data.items()}
-    return record | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+    return record | closure.record() | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
 
 
 def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) -> Record:

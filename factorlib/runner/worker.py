@@ -22,8 +22,11 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError
+from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
-from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.filehash import FileHashes, hash_of_file
+from factorlib.runner.plan import difference
+from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import Store
 from factorlib.stage import Inputs
 from factorlib.yamlfile import convert
@@ -126,9 +129,12 @@ def _made(task: Task, events: Events) -> str:
     task.temporary.mkdir(parents=True)
     store = Store(task.store)
     unfinished = store.unfinished / task.key
+    hashes = FileHashes(store.cache / "files.json")
+    _check_code_still(task, hashes)
     inputs = Inputs(folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=unfinished)
     module.main(params, inputs, task.temporary, events.progress)
     _check_files_still(task)
+    _check_code_still(task, hashes)
     _check_made(task)
     output = store.commit(task.key, task.record, task.temporary).output
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -139,6 +145,20 @@ def _check_files_still(task: Task) -> None:
     for name, before in task.hashes.items():
         if not task.files[name].is_file() or hash_of_file(task.files[name]) != before:
             raise InputError("the file changed while it was being read", file=task.files[name], cure="run again")
+
+
+def _check_code_still(task: Task, hashes: FileHashes) -> None:
+    """The code that the key was made from is the code there is: the source of every module, and the package data."""
+    code = task.code
+    closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
+    if changes := closure.changes(task.record):
+        files = [closure.files[name] for name in changes if name in closure.files]
+        found = "; ".join(
+            difference(
+                {k: task.record[k] for k in changes if k in task.record}, {k: v for k, v in closure.record().items() if k in changes}
+            )
+        )
+        raise InputError(f"the code changed while the run went on ({found})", file=", ".join(map(str, files)) or None, cure="run again")
 
 
 def _check_made(task: Task) -> None:

@@ -6,7 +6,9 @@ import shutil
 import pytest
 import torch
 
+from factorlib.errors import InputError
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.fused import compiled
 from factorlib.reflection.operator import Operator
 from factorlib.reflection.tape import Tape
 from tests.reflection.test_operators import grid
@@ -50,6 +52,20 @@ def test_without_a_compiler_torch_computes_the_same(monkeypatch):
     operator = reflection_operator("network")
     assert not any(operator.fused.values())
     assert operator.response(*grid(0.5, torch.float32)).specular.isfinite().all()
+
+
+def test_a_compiler_that_fails_is_said_and_torch_is_not_taken_instead(monkeypatch, tmp_path):
+    """Which form runs is in the keys of steps: a form that nobody asked for would be kept as the other."""
+    compiler = tmp_path / "cc"
+    compiler.write_text("#!/bin/sh\ntest \"$1\" = --version || { echo out of order >&2; exit 1; }\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compiled.cache_clear()
+    with pytest.raises(InputError, match="out of order") as caught:
+        reflection_operator("network")
+    assert "FACTORLIB_FUSED=0" in caught.value.cure
+    compiled.cache_clear()
 
 
 def formula(x, y):
