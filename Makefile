@@ -8,7 +8,7 @@ OPTIONS_NOT_FORCED = $(if $(DATASET),--dataset "$(DATASET)") $(if $(SET),--set "
 MAKEFLAGS += --no-print-directory
 unexport DATASET SET FORCE
 
-.PHONY: all plan why status graph validate clean gc setup test test-long data help $(STAGES)
+.PHONY: all plan why status graph validate verify clean gc setup test test-long data help $(STAGES)
 
 all plan why $(STAGES): .venv/ready
 	@$(PY) -m factorlib $@ $(OPTIONS)
@@ -19,8 +19,8 @@ status validate: .venv/ready
 graph gc: .venv/ready
 	@$(PY) -m factorlib $@
 
-clean: .venv/ready
-	@$(PY) -m factorlib clean $(if $(DATASET),--dataset "$(DATASET)")
+clean verify: .venv/ready
+	@$(PY) -m factorlib $@ $(if $(DATASET),--dataset "$(DATASET)")
 
 setup: .venv/ready
 	@:
@@ -53,6 +53,7 @@ help:
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make validate DATASET=…              check a dataset without running anything'
 	@echo 'make graph                           the stages and what they take'
+	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'

@@ -1,4 +1,4 @@
-"""The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|clean|gc --dataset eames`."""
+"""The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`."""
 
 from __future__ import annotations
 
@@ -80,6 +80,12 @@ def graph(mermaid: Annotated[bool, typer.Option("--mermaid", help="as a Mermaid 
 def validate(dataset: Dataset, settings: Settings = None) -> None:
     """Check pipeline.yaml, settings and dataset without running anything."""
     raise typer.Exit(verbs.validate(project(), dataset, settings or []))
+
+
+@app.command()
+def verify(dataset: MaybeDataset = None) -> None:
+    """Read every kept result and name what is damaged."""
+    raise typer.Exit(verbs.verify(project(), dataset))
 
 
 @app.command()

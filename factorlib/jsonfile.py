@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError
+from factorlib.wholefile import write_text
 
 
 def json_text(value: Any) -> str:
@@ -21,7 +22,7 @@ def json_text(value: Any) -> str:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    Path(path).write_text(json_text(value), encoding="utf-8")
+    write_text(path, json_text(value))
 
 
 def read_json(path: str | Path) -> Any:

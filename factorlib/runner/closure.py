@@ -29,6 +29,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes
+from factorlib.runner.leftover import left_over
 
 KINDS = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
 
@@ -241,12 +242,3 @@ def _data_files(folder: Path) -> list[Path]:
         elif path.is_file() and path.suffix != ".py":
             files.append(path)
     return files
-
-
-def left_over(name: str) -> bool:
-    """Whether Python or an editor left a file or folder of that name: hidden, a backup, or compiled Python.
-
-    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
-    [True, True, True, True, True, False]
-    """
-    return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from factorlib.runner.plan import Planned
+from factorlib.runner.plan import Planned, Step
 from factorlib.runner.project import claim
-from factorlib.runner.store import point, view_of
 from factorlib.runner.survey import Survey
+from factorlib.runner.views import point, view_of
 
 
 def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
@@ -23,6 +23,7 @@ def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
         survey.home.write_keys(keys)
     if more is None:
         show(survey, planned)
+        survey.outputs.inspector.save()
 
 
 def show(survey: Survey, planned: list[Planned]) -> None:
@@ -34,11 +35,29 @@ def show(survey: Survey, planned: list[Planned]) -> None:
     for link in survey.home.folder.glob("*"):
         if link.is_symlink() and link.name not in survey.spec.pipeline.stages:
             link.unlink()
+    _drop_errors(survey, planned)
+
+
+def _drop_errors(survey: Survey, planned: list[Planned]) -> None:
+    """What is written of a step's failure goes once it has succeeded, or is no more."""
+    there = {label(step) for stage in survey.spec.pipeline.stages for step in survey.spec.steps_of(stage)}
+    good = {label(p.step) for p in planned if p.status == "current"}
+    folder = survey.home.folder / "errors"
+    for path in folder.glob("*.txt"):
+        if path.stem in good or path.stem not in there:
+            path.unlink()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def label(step: Step) -> str:
+    """The name of a step's own files."""
+    return str(step).replace("/", "-")
 
 
 def folder_of(survey: Survey, stage: str, outputs: dict[str | None, str]) -> Path:
     spec = survey.spec.pipeline.stages[stage]
-    return view_of(survey.store, outputs, spec.gather) if spec.over else survey.store.tree(outputs[None])
+    return view_of(survey.store, survey.outputs.inspector, outputs, spec.gather) if spec.over else survey.store.tree(outputs[None])
 
 
 def results(survey: Survey) -> list[tuple[str, Path]]:

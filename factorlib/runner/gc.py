@@ -27,8 +27,13 @@ def collect(project: Project) -> Freed:
         views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
         unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
         dead = [p for p in store.trees.glob("*") if p.name not in trees] + [p for p in store.views.glob("*") if p.name not in views]
-        rest = [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"] + list(store.locks.glob("*")) + list(store.unfinished.glob("*"))
-        freed = sum(_size(path) for path in dead if path.parent == store.trees)  # views only link to trees
+        rest = (
+            [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
+            + list(store.locks.glob("*"))
+            + list(store.unfinished.glob("*"))
+        )
+        dead += list(store.damaged.glob("*"))
+        freed = sum(_size(path) for path in dead if path.parent in (store.trees, store.damaged))  # views only link to trees
         for path in unused + dead + rest:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     return Freed(len(unused), freed)

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from factorlib.runner.integrity import in_short
 from factorlib.runner.pipeline import Pipeline
 
 Record = dict[str, Any]
@@ -52,10 +53,14 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """What the store holds: output hash by key; and the record each step had when it last was current here."""
+    """What the store holds: output hash by key; and the record each step had when it last was current here.
+
+    damaged: by key, what is wrong with a result that is not as it was kept, and so has no output
+    """
 
     outputs: Mapping[str, str]
     previous: Mapping[str, Record]
+    damaged: Mapping[str, list[str]] = {}
 
 
 class Planned(msgspec.Struct, frozen=True):
@@ -90,6 +95,8 @@ def _planned(step: Step, spec: Spec, own: Record, listing: Listing, planned: Map
         return Planned(step, "to run", ["forced"], record, key)
     if output is not None:
         return Planned(step, "current", [], record, key, output)
+    if key in listing.damaged:
+        return Planned(step, "to run", [f"its result is damaged: {in_short(listing.damaged[key])}"], record, key)
     reasons = difference(before, record) if before is not None else ["not made yet"]
     return Planned(step, "to run", reasons or ["its result is gone"], record, key)
 

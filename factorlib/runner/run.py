@@ -17,13 +17,13 @@ from filelock import FileLock, Timeout
 
 from factorlib.runner.display import Display
 from factorlib.runner.executors import Pools
-from factorlib.runner.finish import remember
+from factorlib.runner.finish import label, remember
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.project import claim
-from factorlib.runner.store import view_of
 from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
+from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
 
 POLL = 0.1  # seconds between two looks at what the workers say
@@ -77,6 +77,7 @@ class Run:
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()
+        self.made: set[str] = set()
         self.tally = Tally()
         self.planned: list[Planned] = []
 
@@ -124,6 +125,13 @@ class Run:
                 self._start(planned)
 
     def _start(self, planned: Planned) -> None:
+        if planned.key in self.made:
+            self._fail(planned.step, Outcome(error=f"{planned.reasons[0]}, and was made just now: is the disk failing?"))
+            return
+        if not self.survey.outputs.still(self._keys_above(planned.step)):  # a run takes hours, and they are used only now
+            self.waiting.add(planned.step)
+            self._plan()
+            return
         lock = FileLock(self.survey.store.locks / f"{planned.key}.lock")
         try:
             lock.acquire(timeout=0)
@@ -142,6 +150,10 @@ class Run:
         self.display.start(planned.step)
         work.future = self.pools.submit(work.task.code.threads, run_step, work.task)
 
+    def _keys_above(self, step: Step) -> list[str]:
+        above = set(self.survey.spec.above(step))
+        return [found.key for found in self.planned if found.step in above]
+
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
         return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads)
@@ -153,7 +165,6 @@ class Run:
         files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}
         given = {param: given_folder(stage, param) for param in stage.folders}
         read = {f"given:{param}/{file}": folder / file for param, folder in given.items() for file in stage.given[param]}
-        label = str(step).replace("/", "-")
         return Task(
             code=self._code(step.stage),
             photo=step.photo,
@@ -163,12 +174,12 @@ class Run:
             facts={DATASET + name: slice_.facts for name, slice_ in slices.items()},
             files=files | read,
             hashes={file: planned.record[f"file:{file}"] for file in files} | {file: planned.record[file] for file in read},
-            log=self._log_above(step, self.folder / f"{label}.log.jsonl") if stage.logs else None,
+            log=self._log_above(step, self.folder / f"{label(step)}.log.jsonl") if stage.logs else None,
             store=self.survey.store.root,
             key=planned.key,
             record=planned.record,
-            temporary=self.folder / label,
-            events=self.folder / f"{label}.events.jsonl",
+            temporary=self.folder / label(step),
+            events=self.folder / f"{label(step)}.events.jsonl",
         )
 
     def _folder(self, step: Step, name: str) -> Path:
@@ -179,7 +190,9 @@ class Run:
             return store.tree(outputs[Step(name)])
         if step.photo is not None:
             return store.tree(outputs[Step(name, step.photo)])
-        return view_of(store, {found.photo: outputs[found] for found in self.survey.spec.steps_of(name)}, stage.gather)
+        return view_of(
+            store, self.survey.outputs.inspector, {found.photo: outputs[found] for found in self.survey.spec.steps_of(name)}, stage.gather
+        )
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""
@@ -237,6 +250,11 @@ class Run:
         if before is not None and before != outcome.output:
             self.display.warn(step, "made again from the same inputs, it came out different")
         self.survey.outputs.forget(work.task.key)
+        self.made.add(work.task.key)
+        if outcome.damaged:
+            self.display.warn(
+                step, f"its kept result was damaged and is replaced; what was there: {self.survey.project.shown(outcome.damaged)}"
+            )
         self.survey.previous[str(step)] = work.task.record
         self.tally.ran.append(step)
         self._log(self.survey.store.log(work.task.key).read_text(encoding="utf-8"))
@@ -248,7 +266,7 @@ class Run:
         self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
         where = None
         if outcome.traceback:
-            path = self.survey.home.folder / "errors" / f"{str(step).replace('/', '-')}.txt"
+            path = self.survey.home.folder / "errors" / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(outcome.traceback, encoding="utf-8")
             where = self.survey.project.shown(path)

@@ -5,6 +5,7 @@
     build/store/logs/<key>.jsonl  what making it cost and said (times and machine facts are only here)
     build/store/views/<hash>/     the results of all photos of a stage in one folder
     build/store/unfinished/<key>/ what lets a step that was killed go on
+    build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
     build/store/locks, tmp, cache
 
 A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.
@@ -12,18 +13,21 @@ A tree and a key appear by one rename each, the tree first; nothing half-written
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.jsonfile import read_json, write_json
-from factorlib.runner.filehash import hash_of_file
+from factorlib.jsonfile import json_text
+from factorlib.runner.integrity import Inspector, hashes_of_tree
+from factorlib.wholefile import replace_file, sync
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -39,17 +43,17 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs, self.views, self.locks, self.tmp, self.cache, self.unfinished = (
-            root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache", "unfinished")
+        self.trees, self.keys, self.logs, self.views, self.locks, self.tmp, self.cache, self.unfinished, self.damaged = (
+            root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache", "unfinished", "damaged")
         )
 
     def entry(self, key: str) -> Entry | None:
-        """The result of a key, None where it was never made or its tree is gone."""
+        """What is written of a key, None where it was never made; whether its tree is there and right an Inspector says."""
         try:
             entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
         except (FileNotFoundError, msgspec.DecodeError):
             return None
-        return entry if self.tree(entry.output).is_dir() else None
+        return entry if output_of(entry.files) == entry.output else None
 
     def tree(self, output: str) -> Path:
         return self.trees / output
@@ -57,29 +61,60 @@ class Store:
     def log(self, key: str) -> Path:
         return self.logs / f"{key}.jsonl"
 
-    def commit(self, key: str, record: dict, folder: Path) -> Entry:
-        """Take the files of `folder` in as the result of `key`; the folder is gone afterwards."""
+    def take_in(self, record: dict, folder: Path) -> tuple[Entry, Path | None]:
+        """Take the files of `folder` in, as what `record` gave; the folder is gone afterwards.
+
+        Where the same tree stands already it stays if it is right, every content read; else it is set aside, and second
+        comes where it is now.
+        """
         files = hashes_of_tree(folder)
         entry = Entry(output_of(files), record, files)
         for name in files:
-            _settle(folder / name)
-        self.trees.mkdir(parents=True, exist_ok=True)
-        _move(folder, self.tree(entry.output))
-        self._write(self.keys / f"{key}.json", entry)
-        return entry
+            sync(folder / name)
+            (folder / name).chmod(0o444)
+        for path in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+            sync(path)
+        return entry, self.put(folder, self.tree(entry.output), lambda: _holds(self.tree(entry.output), files))
 
-    def _write(self, path: Path, value) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
-        write_json(draft, value)
-        os.replace(draft, path)
+    def keep(self, key: str, entry: Entry) -> None:
+        """From now on `key` has that result."""
+        self.keys.mkdir(parents=True, exist_ok=True)
+        replace_file(self.keys / f"{key}.json", json_text(entry).encode())
+
+    def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
+        """Make `folder` the folder `target` by one rename, unless what stands there is right; where that is now, if not."""
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = None
+        while True:
+            try:
+                os.rename(folder, target)
+                sync(target.parent)
+                return aside
+            except OSError:
+                if not os.path.lexists(target):
+                    raise
+            if is_right():
+                shutil.rmtree(folder)
+                return aside
+            aside = self._set_aside(target)
+
+    def _set_aside(self, target: Path) -> Path:
+        self.damaged.mkdir(parents=True, exist_ok=True)
+        aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
+        with contextlib.suppress(FileNotFoundError):  # another run was quicker
+            os.rename(target, aside)
+        return aside
 
 
 class Outputs(Mapping):
-    """Output hash by key, each looked up once."""
+    """Output hash by key, each looked up once; none of a key whose tree is not as it was kept.
+
+    damaged: by key, what is wrong with its tree
+    """
 
     def __init__(self, store: Store):
-        self.store = store
+        self.store, self.inspector = store, Inspector(store.root)
+        self.damaged: dict[str, list[str]] = {}
         self._known: dict[str, str] = {}
 
     def get(self, key, default=None):
@@ -87,11 +122,20 @@ class Outputs(Mapping):
             entry = self.store.entry(key)
             if entry is None:
                 return default
+            self.damaged.pop(key, None)
+            if damage := self.inspector.damage(entry.output, entry.files):
+                self.damaged[key] = damage
+                return default
             self._known[key] = entry.output
         return self._known[key]
 
     def forget(self, key: str) -> None:
         self._known.pop(key, None)
+
+    def still(self, keys: Iterable[str]) -> bool:
+        """Whether those keys have the outputs they had, looked up again."""
+        before = {key: self._known.pop(key, None) for key in keys}
+        return all([self.get(key) == output for key, output in before.items()])  # noqa: C419  each is to be looked up
 
     def __getitem__(self, key):
         found = self.get(key)
@@ -99,22 +143,11 @@ class Outputs(Mapping):
             raise KeyError(key)
         return found
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[str]:
         return (path.stem for path in self.store.keys.glob("*.json"))
 
     def __len__(self):
         return sum(1 for _ in self)
-
-
-def hashes_of_tree(folder: Path) -> dict[str, str]:
-    """{relative path: content hash} of every file below a folder, sorted; refuses links, which would lead out of it."""
-    files = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_symlink():
-            raise InputError(f"a stage left the link {path.name!r}", file=path, cure="write a file")
-        if path.is_file():
-            files[path.relative_to(folder).as_posix()] = hash_of_file(path)
-    return files
 
 
 def output_of(files: dict[str, str]) -> str:
@@ -122,75 +155,8 @@ def output_of(files: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _settle(path: Path) -> None:
-    """On disk and read-only."""
-    descriptor = os.open(path, os.O_RDONLY)
+def _holds(tree: Path, files: dict[str, str]) -> bool:
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    path.chmod(0o444)
-
-
-def _move(folder: Path, target: Path) -> None:
-    """One rename; where the same tree is there already, that one stays."""
-    if not target.is_dir():
-        try:
-            os.rename(folder, target)
-            return
-        except OSError:
-            if not target.is_dir():
-                raise
-    shutil.rmtree(folder)
-
-
-# ── views: what build/<dataset>/<stage> names ────────────────────────────────────────────────────────────────────────
-
-
-def view_of(store: Store, outputs: dict[str, str], gather: str | None) -> Path:
-    """One folder with the files of all photos ({photo: output}), and `<photo>.json` of each gathered into `gather`."""
-    target = store.views / hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
-    if not target.is_dir():
-        store.tmp.mkdir(parents=True, exist_ok=True)
-        store.views.mkdir(parents=True, exist_ok=True)
-        draft = store.tmp / f"view-{os.getpid()}-{target.name}"
-        shutil.rmtree(draft, ignore_errors=True)
-        _fill_view(draft, store, outputs, gather)
-        _move(draft, target)
-    return target
-
-
-def _fill_view(draft: Path, store: Store, outputs: dict[str, str], gather: str | None) -> None:
-    draft.mkdir()
-    for photo, output in sorted(outputs.items()):
-        tree = store.tree(output)
-        for file in sorted(path for path in tree.rglob("*") if path.is_file()):
-            target = draft / file.relative_to(tree)
-            if target.exists():
-                raise InputError(f"two photos write the same file {target.name!r}", key=photo, cure="put the photo's name into it")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            _link(file, target)
-    if gather:
-        write_json(draft / gather, {photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
-        (draft / gather).chmod(0o444)
-
-
-def _link(file: Path, target: Path) -> None:
-    try:
-        os.link(file, target)
-    except OSError:  # no hard links on this file system
-        shutil.copy2(file, target)
-
-
-def point(link: Path, target: Path) -> None:
-    """Make `link` name the folder `target` from one moment to the next; relative, so that build/ can be moved."""
-    words = os.path.relpath(target, link.parent)
-    if link.is_symlink() and os.readlink(link) == words:
-        return
-    link.parent.mkdir(parents=True, exist_ok=True)
-    draft = link.with_name(f".{link.name}.{os.getpid()}")
-    draft.unlink(missing_ok=True)
-    os.symlink(words, draft, target_is_directory=True)
-    if link.is_dir() and not link.is_symlink():
-        raise InputError("is a folder of its own, where the runner puts a link", file=link, cure="move it elsewhere")
-    os.replace(draft, link)
+        return hashes_of_tree(tree) == files
+    except (OSError, InputError):
+        return False

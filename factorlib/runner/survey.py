@@ -39,7 +39,7 @@ class Survey:
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
-        return plan(spec, self.records, Listing(self.outputs, self.previous))
+        return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
 
 
 def survey(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False) -> Survey:

@@ -12,6 +12,7 @@ from factorlib.runner.finish import remember, results
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project, home_of
+from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 
 
@@ -149,3 +150,16 @@ def collect(project: Project) -> int:
     freed = delete_unused(project)
     print(f"deleted {freed.results} results that nothing names any more, {freed.bytes / 1e6:.1f} MB")
     return 0
+
+
+def verify(project: Project, dataset: str | None) -> int:
+    """Read every result, of a dataset or of all; 1 where any is not as it was kept."""
+    from factorlib.runner.project import Home
+    from factorlib.runner.verify import verify as read_all
+
+    store = Store(project.build / "store")
+    homes = [home_of_name(project, dataset)] if dataset else [Home(p.parent) for p in sorted(project.build.glob("*/current.json"))]
+    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
+    verdict = read_all(store, homes, pipeline, everything=dataset is None)
+    print("\n".join(words.damage_lines(verdict, project.shown)))
+    return 1 if verdict.damaged else 0

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from msgspec import structs
 
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
+from factorlib.runner.verify import Verdict
 
 SHOWN = 8  # reasons of one step that are written out
 
@@ -40,6 +42,16 @@ def status_lines(planned: list[Planned], running: Callable[[Planned], bool], war
         lines.append(f"{stage:<10} {counts}")
     said = dict.fromkeys(f"warning: {p.step}: {text}" for p in planned if p.status == "current" for text in warnings(p))
     return lines + list(said)
+
+
+def damage_lines(verdict: Verdict, shown: Callable[[Path], str]) -> list[str]:
+    """What is damaged, where, whose result it is, and what to do."""
+    lines = []
+    for damage in verdict.damaged:
+        lines += [f"{', '.join(damage.steps) or 'a result'}: {shown(damage.where)}", *(f"    {line}" for line in damage.what)]
+    if not lines:
+        return [f"{verdict.results} results read: all are as they were kept"]
+    return [*lines, f"{verdict.results} results read: {len(verdict.damaged)} damaged; the next run that needs one makes it again"]
 
 
 def graph_lines(pipeline: Pipeline) -> list[str]:

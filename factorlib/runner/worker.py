@@ -25,10 +25,12 @@ from factorlib.errors import InputError
 from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
+from factorlib.runner.integrity import Stamp, stamps_of
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.store import Store
+from factorlib.runner.store import Entry, Store
 from factorlib.stage import Inputs
+from factorlib.wholefile import replace_file
 from factorlib.yamlfile import convert
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -66,9 +68,11 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it."""
+    """output: hash of what was made;  damaged: where that lies now which stood in its place and was not as it had been kept;
+    error: what went wrong;  traceback: of a defect, None where a user can mend it."""
 
     output: str | None = None
+    damaged: Path | None = None
     error: str | None = None
     traceback: str | None = None
     seconds: float = 0.0
@@ -78,10 +82,11 @@ def run_step(task: Task) -> Outcome:
     meter = Meter()
     with Events(task) as events:
         try:
-            output = _made(task, events)
+            entry, damaged = _made(task, events)
             cost = meter.read(task.code.threads)
             _write_log(task, events, cost)
-            return Outcome(output=output, seconds=cost["seconds"])
+            _keep(task, entry)
+            return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except InputError as error:
             return Outcome(error=str(error), seconds=meter.read(task.code.threads)["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
@@ -123,28 +128,45 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, events: Events) -> str:
+def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
+    """Run the step; its tree is in the store afterwards, its key is not."""
     module = load_stage(task.code)
     params = params_of(module, task.code)
     task.temporary.mkdir(parents=True)
     store = Store(task.store)
-    unfinished = store.unfinished / task.key
     hashes = FileHashes(store.cache / "files.json")
     _check_code_still(task, hashes)
-    inputs = Inputs(folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=unfinished)
+    results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
+    inputs = Inputs(
+        folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=store.unfinished / task.key
+    )
     module.main(params, inputs, task.temporary, events.progress)
     _check_files_still(task)
+    _check_results_still(results)
     _check_code_still(task, hashes)
     _check_made(task)
-    output = store.commit(task.key, task.record, task.temporary).output
-    shutil.rmtree(unfinished, ignore_errors=True)
-    return output
+    return store.take_in(task.record, task.temporary)
+
+
+def _keep(task: Task, entry: Entry) -> None:
+    store = Store(task.store)
+    store.keep(task.key, entry)
+    shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
 
 
 def _check_files_still(task: Task) -> None:
     for name, before in task.hashes.items():
         if not task.files[name].is_file() or hash_of_file(task.files[name]) != before:
             raise InputError("the file changed while it was being read", file=task.files[name], cure="run again")
+
+
+def _check_results_still(results: dict[Path, dict[str, Stamp]]) -> None:
+    """Somebody may open a file of build/<dataset>/ in an editor while it is read."""
+    for folder, before in results.items():
+        now = stamps_of(folder)
+        for name in sorted(before.keys() | now.keys()):
+            if before.get(name) != now.get(name):
+                raise InputError("the file changed while it was being read", file=folder / name, cure="run again: it is made again")
 
 
 def _check_code_still(task: Task, hashes: FileHashes) -> None:
@@ -177,9 +199,7 @@ def _write_log(task: Task, events: Events, cost: dict) -> None:
     lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [{"event": "done", **where, **cost}]
     path = Store(task.store).log(task.key)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
-    draft.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in lines), encoding="utf-8")
-    os.replace(draft, path)
+    replace_file(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines).encode())
 
 
 class Events(logging.Handler):
