@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from factorlib.elementary import square_root
+
 FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
 LEAST = 1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
 
@@ -59,7 +61,7 @@ def highlight_weights(
     nd = nd.clamp_min(1e-6)
     nh2 = ((nd + no) ** 2 / (2 + 2 * od).clamp_min(1e-6)).clamp(0, 1)
     spread = nh2 * (square - 1) + 1
-    root = torch.sqrt(square + (1 - square) * nd * nd)
+    root = square_root(square + (1 - square) * nd * nd)
     weight = upper * square / spread**2 * nd / (nd + root)
     weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
     by_square = weight * (1 / square - 2 * nh2 / spread - (1 - nd * nd) / (2 * root * (nd + root)))

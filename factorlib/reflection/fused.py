@@ -36,7 +36,8 @@ from factorlib.reflection.tape import Tape, Value
 log = logging.getLogger("factorlib.reflection")
 ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
 PROGRAMS = {"CC": "cc"}
-FLAGS = "-std=gnu11 -O3 -march=native -fPIC -shared -fno-math-errno -fno-trapping-math -fno-signed-zeros -ffinite-math-only -fassociative-math -freciprocal-math"
+# Every flag leaves the bits as they are: no operation is contracted, reordered or replaced, errno and traps are nobody's.
+FLAGS = "-std=gnu11 -O3 -march=native -ffp-contract=off -ffinite-math-only -fno-signed-zeros -fno-math-errno -fno-trapping-math -fPIC -shared"
 MOMENTS = ("sharpness", "lam", "mean", "along", "across")  # of a lobe; all but the first are functions of it
 PLACES = {name: f"lobe[{k}][l]" for k, name in enumerate([*MOMENTS, *(f"d{m}" for m in MOMENTS)])}
 PLACES |= {name: f"{name}[l]" for name in ("no", "nz", "oz", "net")} | {"alpha": "alpha"}

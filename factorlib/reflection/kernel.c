@@ -8,14 +8,22 @@
 #include <math.h>
 #include <string.h>
 
+/* The same bits on every machine: every operation is one of IEEE 754 that rounds to nearest, in the order written here.  The compiler
+   may not reorder sums, contract products or replace divisions (see FLAGS in fused.py), and spreads lanes alone over vectors. */
+#define FMA __builtin_fmaf /* a b + c, rounded once */
+
 #define LANES 32
 typedef float lanes[LANES];
 
+static inline float min_(float a, float b) { return a < b ? a : b; }
+static inline float max_(float a, float b) { return a > b ? a : b; }
+
 static inline float exp_(float x) {  /* within 2e-7 */
-  x = fminf(fmaxf(x, -80.0f), 80.0f);
-  int n = (int)(x * 1.44269504f + (x < 0.0f ? -0.5f : 0.5f));
-  float f = (x - (float)n * 0.693145752f) - (float)n * 1.42860677e-6f;
-  float p = 1.0f + f * (1.0f + f * (0.5f + f * (1.66666667e-1f + f * (4.16666667e-2f + f * (8.33333333e-3f + f * 1.38888889e-3f)))));
+  x = min_(max_(x, -80.0f), 80.0f);
+  int n = (int)FMA(x, 1.44269504f, x < 0.0f ? -0.5f : 0.5f);
+  float f = FMA(-(float)n, 1.42860677e-6f, FMA(-(float)n, 0.693145752f, x));
+  float p = FMA(f, 1.38888889e-3f, 8.33333333e-3f);
+  p = FMA(f, p, 4.16666667e-2f), p = FMA(f, p, 1.66666667e-1f), p = FMA(f, p, 0.5f), p = FMA(f, p, 1.0f), p = FMA(f, p, 1.0f);
   int bits = (n + 127) << 23;
   float scale;
   memcpy(&scale, &bits, 4);
@@ -29,19 +37,21 @@ static inline float log_(float x) {  /* of normal positive numbers */
   bits -= e << 23;
   float m;
   memcpy(&m, &bits, 4);  /* in [√½, √2) */
-  float s = (m - 1.0f) / (m + 1.0f), q = s * s;
-  return (float)e * 0.693147181f + 2.0f * s * (1.0f + q * (3.33333333e-1f + q * (0.2f + q * (1.42857143e-1f + q * 1.11111111e-1f))));
+  float s = (m - 1.0f) / (m + 1.0f), q = s * s, p = FMA(q, 1.11111111e-1f, 1.42857143e-1f);
+  p = FMA(q, p, 0.2f), p = FMA(q, p, 3.33333333e-1f), p = FMA(q, p, 1.0f);
+  return FMA((float)e, 0.693147181f, 2.0f * s * p);
 }
 
 static inline float log1p_(float x) {  /* of what is not negative */
   float s = x / (2.0f + x), q = s * s;
-  float near = 2.0f * s * (1.0f + q * (3.33333333e-1f + q * (0.2f + q * 1.42857143e-1f)));
+  float near = 2.0f * s * FMA(q, FMA(q, FMA(q, 1.42857143e-1f, 0.2f), 3.33333333e-1f), 1.0f);
   return x < 0.3f ? near : log_(1.0f + x);
 }
 
 static inline float erfc_(float x) {  /* within 2e-7; Abramowitz and Stegun 1964, 7.1.26 */
   float y = fabsf(x), t = 1.0f / (1.0f + 0.3275911f * y);
-  float tail = t * (0.254829592f + t * (-0.284496736f + t * (1.421413741f + t * (-1.453152027f + t * 1.061405429f)))) * exp_(-y * y);
+  float p = FMA(t, FMA(t, FMA(t, FMA(t, 1.061405429f, -1.453152027f), 1.421413741f), -0.284496736f), 0.254829592f);
+  float tail = t * p * exp_(-y * y);
   return x < 0.0f ? 2.0f - tail : tail;
 }
 
@@ -52,7 +62,10 @@ static inline void linear(int outs, int ins, const float *restrict w, const floa
     for (int l = 0; l < LANES; l++) a[l] = bias[j], b[l] = bias[j + 1], c[l] = bias[j + 2], d[l] = bias[j + 3];
     for (int i = 0; i < ins; i++) {
       const float wa = w[j * ins + i], wb = w[(j + 1) * ins + i], wc = w[(j + 2) * ins + i], wd = w[(j + 3) * ins + i];
-      for (int l = 0; l < LANES; l++) a[l] += wa * in[i][l], b[l] += wb * in[i][l], c[l] += wc * in[i][l], d[l] += wd * in[i][l];
+      for (int l = 0; l < LANES; l++) {
+        a[l] = FMA(wa, in[i][l], a[l]), b[l] = FMA(wb, in[i][l], b[l]);
+        c[l] = FMA(wc, in[i][l], c[l]), d[l] = FMA(wd, in[i][l], d[l]);
+      }
     }
     memcpy(out[j], a, sizeof a), memcpy(out[j + 1], b, sizeof b), memcpy(out[j + 2], c, sizeof c), memcpy(out[j + 3], d, sizeof d);
   }
@@ -82,7 +95,7 @@ static inline void network(const float *w, const float *b, const float *wt, lane
   lanes *last = x[(DEPTH + 1) % 2], *back = x[DEPTH % 2];
   for (int l = 0; l < LANES; l++) result[l] = b[0];
   for (int j = 0; j < WIDTH; j++)
-    for (int l = 0; l < LANES; l++) result[l] += w[j] * last[j][l], back[j][l] = w[j];
+    for (int l = 0; l < LANES; l++) result[l] = FMA(w[j], last[j][l], result[l]), back[j][l] = w[j];
   if (!slope) return;
   for (int k = DEPTH - 1; k >= 0; k--) {
     for (int j = 0; j < WIDTH; j++)

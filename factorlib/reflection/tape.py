@@ -15,7 +15,7 @@ import torch
 # operation -> C, {0} and {1} its arguments
 C = {
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "sqrt": "sqrtf({0})", "exp": "expf({0})", "log": "logf({0})",
-    "log1p": "log1pf({0})", "max": "fmaxf({0}, {1})", "min": "fminf({0}, {1})", "above": "({0} > {1} ? 1.0f : 0.0f)", "erfc": "erfcf({0})",
+    "log1p": "log1pf({0})", "max": "max_({0}, {1})", "min": "min_({0}, {1})", "above": "({0} > {1} ? 1.0f : 0.0f)", "erfc": "erfcf({0})",
 }  # fmt: skip
 
 

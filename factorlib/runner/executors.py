@@ -14,7 +14,9 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from typing import ClassVar
 
+from factorlib.arithmetic import ENVIRONMENT
 from factorlib.runner.worker import limit_threads
 
 
@@ -42,7 +44,7 @@ class Pools:
         if threads not in self._pools:
             self._pools[threads] = _pool(max(1, self.cores // threads), threads)
         try:
-            with _FixedHashes():
+            with _OfWorkers():
                 return self._pools[threads].submit(function, *arguments)
         except BrokenProcessPool:  # a worker was killed earlier: its step has failed, the others get a new pool
             self._pools.pop(threads).shutdown(wait=False)
@@ -68,17 +70,21 @@ def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
     )
 
 
-class _FixedHashes:
-    """Workers that start meanwhile walk their sets in the same order every time."""
+class _OfWorkers:
+    """The environment of workers that start meanwhile: they walk their sets in the same order, and compute the same bits, every time."""
+
+    VARIABLES: ClassVar = {"PYTHONHASHSEED": "0", **ENVIRONMENT}
 
     def __enter__(self) -> None:
-        self.before = os.environ.get("PYTHONHASHSEED")
-        os.environ["PYTHONHASHSEED"] = "0"
+        self.before = {name: os.environ.get(name) for name in self.VARIABLES}
+        os.environ.update(self.VARIABLES)
 
     def __exit__(self, *exception) -> None:
-        del os.environ["PYTHONHASHSEED"]
-        if self.before is not None:
-            os.environ["PYTHONHASHSEED"] = self.before
+        for name, value in self.before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _start(threads: int, parent: int) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from factorlib.elementary import square_root
 from factorlib.images.tone import by_log_exponent, curve, slope
 from factorlib.solve.problem import Block, not_held_out
 from factorlib.solve.shadowing import Turning, shadowed, shadowed_response
@@ -257,8 +258,8 @@ def _whitened(block: Block, rows: slice, c: int, linear: Float[torch.Tensor, "n"
     difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
     satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
     residual = torch.where(satisfied, 0.0, difference)
-    root = torch.sqrt(1 + (residual / loss.robust_scale) ** 2)
-    pull = (fit / root * ~satisfied).sqrt()
+    root = square_root(1 + (residual / loss.robust_scale) ** 2)
+    pull = square_root(fit / root * ~satisfied)
     lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
     return Whitened(residual * pull, precision * pull, rising, by_tone, lost)
 
