@@ -16,7 +16,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ClassVar
 
-from factorlib.arithmetic import ENVIRONMENT
+from factorlib import arithmetic
 from factorlib.runner.worker import limit_threads
 
 
@@ -73,7 +73,7 @@ def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
 class _OfWorkers:
     """The environment of workers that start meanwhile: they walk their sets in the same order, and compute the same bits, every time."""
 
-    VARIABLES: ClassVar = {"PYTHONHASHSEED": "0", **ENVIRONMENT}
+    VARIABLES: ClassVar = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES}
 
     def __enter__(self) -> None:
         self.before = {name: os.environ.get(name) for name in self.VARIABLES}

@@ -1,0 +1,59 @@
+"""A solve is the same bits whatever the processor: libraries held to one instruction set, checked on processors that are emulated."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from factorlib.arithmetic import VARIABLES
+from factorlib.elementary import square_root
+
+ROOT = Path(__file__).resolve().parents[1]
+EMULATOR = shutil.which("qemu-x86_64")
+WIDEST = {"OPENBLAS_CORETYPE": "", "ATEN_CPU_CAPABILITY": "", "MKL_CBWR": "", "NPY_DISABLE_CPU_FEATURES": ""}  # what this processor has
+SOLVE = """
+import sys
+if sys.argv[1] == "fixed":
+    from factorlib.arithmetic import fix
+    fix()
+import hashlib, msgspec, torch
+torch.set_num_threads(1)
+from factorlib.reflection import fused
+fused.FLAGS = fused.FLAGS.replace("-march=native", "-march=x86-64-v3")  # an emulated processor's compiler is this one's
+from tests.solve.hard_cases import CASES, QUICK, answered
+brief = msgspec.structs.replace(QUICK, rounds=1, iterations=3, polish=2, lobes=4, insert=4)
+solution = answered(CASES["1 material × 1 light"](0), brief).joint.solution
+parts = [solution.materials.vector(), *(part for light in solution.lights for part in (light.axis, light.log_sharpness, light.weight))]
+print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
+"""
+
+
+def solved(how: str, *emulator: str, **environment: str) -> str:
+    """The hash of a brief solve in a process of its own."""
+    set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES} | {"OMP_NUM_THREADS": "1"}
+    set_ |= {name: value for name, value in environment.items() if value}
+    done = subprocess.run([*emulator, sys.executable, "-c", SOLVE, how], cwd=ROOT, env=set_, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_solve_is_the_same_bits_whatever_the_variables_were():
+    assert solved("fixed", **WIDEST) == solved("fixed", OPENBLAS_CORETYPE="Nehalem", ATEN_CPU_CAPABILITY="default")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(EMULATOR is None, reason="qemu-x86_64 is not installed (Debian: qemu-user)")
+@pytest.mark.parametrize("processor", ["EPYC-Rome", "Haswell-noTSX"])
+def test_a_solve_is_the_same_bits_on_an_emulated_processor(processor):
+    assert solved("fixed", EMULATOR, "-cpu", processor) == solved("fixed")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_square_roots_are_those_of_ieee_754(dtype):
+    x = np.random.default_rng(0).random(100_003).astype(dtype) * 7
+    assert square_root(torch.from_numpy(x)).numpy().tobytes() == np.sqrt(x).tobytes()
