@@ -100,6 +100,12 @@ def gc() -> None:
     raise typer.Exit(verbs.collect(project()))
 
 
+@app.command()
+def ship(stage: str, dataset: Dataset) -> None:
+    """Put a stage's current result into the package (for those who change the stage)."""
+    raise typer.Exit(verbs.ship(project(), stage, dataset))
+
+
 def main() -> None:
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
     try:

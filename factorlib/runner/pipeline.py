@@ -28,6 +28,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     optional: run it only where it is asked for, or something that is asked for takes its results
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
              the folder among its inputs, and the key has the files' contents, not where they lie
+    shipped: a folder of the package with the stage's result, taken where it was made from the same sources and parameters
     """
 
     inputs: list[str] = []
@@ -38,6 +39,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     logs: bool = False
     optional: bool = False
     given: dict[str, list[str]] = {}
+    shipped: str | None = None
     params: dict[str, Any] = {}
 
     @property

@@ -180,6 +180,7 @@ class Run:
             record=planned.record,
             temporary=self.folder / label(step),
             events=self.folder / f"{label(step)}.events.jsonl",
+            shipped=None if "forced" in planned.reasons else stage.shipped,
         )
 
     def _folder(self, step: Step, name: str) -> Path:

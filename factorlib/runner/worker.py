@@ -28,6 +28,7 @@ from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.integrity import Stamp, stamps_of
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.shipped import copy_shipped, shipped_folder
 from factorlib.runner.store import Entry, Store
 from factorlib.stage import Inputs
 from factorlib.wholefile import replace_file
@@ -49,7 +50,11 @@ class Code(msgspec.Struct, frozen=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """All a worker is told.  hashes: of the dataset's files, as they were when the key was made."""
+    """All a worker is told.
+
+    hashes:  of the dataset's files, as they were when the key was made
+    shipped: the folder of the package that may have the result already; None where it is to be made in any case
+    """
 
     code: Code
     photo: str | None
@@ -65,6 +70,7 @@ class Task(msgspec.Struct, frozen=True):
     record: dict[str, Any]
     temporary: Path
     events: Path
+    shipped: str | None = None
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -140,7 +146,10 @@ def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
     inputs = Inputs(
         folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=store.unfinished / task.key
     )
-    module.main(params, inputs, task.temporary, events.progress)
+    if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
+        copy_shipped(folder, task.temporary)
+    else:
+        module.main(params, inputs, task.temporary, events.progress)
     _check_files_still(task)
     _check_results_still(results)
     _check_code_still(task, hashes)
