@@ -70,9 +70,12 @@ def test_channels_say_what_photo_and_mask_say(folder):
     assert summary == {
         "width": W,
         "height": H,
+        "factor": 1,
+        "original_size": [W, H],
         "focal_px": None,
         "focal_source": None,
         "encoding": "linear",
+        "exposure": None,
         "illumination": "kitchen",
         "pixels": {"red": 56, "wood": 96},
         "clipped_fraction": 0.0,
