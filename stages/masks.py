@@ -28,7 +28,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     pixels: Annotated[int, msgspec.Meta(ge=100)] = 1_000_000
-    frame: Annotated[int, msgspec.Meta(ge=100)] = 6_000_000
+    frame: Annotated[int, msgspec.Meta(ge=100)] = 4_000_000
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:

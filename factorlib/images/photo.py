@@ -78,7 +78,7 @@ def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(stored, factor):
         linear = _decoded(codes, stored.white, encoding)
-        numbers = np.isfinite(linear).all(axis=-1)
+        numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
         if factor == 1:
             radiance[rows], finite[rows], clipped[rows] = linear, numbers, cut
