@@ -50,6 +50,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         illumination=light["illumination"],
         materials=inputs.facts["dataset.materials"],
         least_confidence=params.least_confidence,
+        exposure=read_json(inputs["masks"] / f"{name}.json")["exposure"],
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)

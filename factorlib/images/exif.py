@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -47,7 +49,8 @@ def exif_of_bytes(data: bytes | None) -> dict[str, float | int]:
     """Of a block as HEIF keeps it ("Exif", two zeros, a TIFF); what is damaged says nothing."""
     try:
         exif = Image.Exif()
-        exif.load(data or b"")
+        with _unwarned():
+            exif.load(data or b"")
         return _named(exif)
     except DAMAGED:
         return {}
@@ -73,12 +76,22 @@ def is_dng(path: str | Path) -> bool:
 
 def _tags(stream: BinaryIO) -> Image.Exif:
     exif = Image.Exif()
-    exif.load_from_fp(stream)
+    with _unwarned():
+        exif.load_from_fp(stream)
     return exif
 
 
+@contextmanager
+def _unwarned() -> Iterator[None]:
+    """Pillow warns of tags that are damaged, in its own source's lines: such tags say nothing here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def _named(exif: Image.Exif) -> dict[str, float | int]:
-    tags = exif.get_ifd(EXIF_IFD)
+    with _unwarned():
+        tags = exif.get_ifd(EXIF_IFD)
     found = {tag: _number(tags[tag]) for tag in NAMES if tag in tags}
     return {NAMES[tag]: round(value) if tag in WHOLE else value for tag, value in found.items() if value is not None}
 

@@ -63,7 +63,7 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
         radiance=mean(observations.radiance).astype("f4"),
         weight=total.astype("f4"),
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
-        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations")},
+        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
         visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
     )
 

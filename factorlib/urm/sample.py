@@ -26,8 +26,7 @@ def sample(observations: Observations, most: int) -> Observations:
     if len(observations) <= most:
         return observations
     group = strata(observations, most)
-    size = np.bincount(group)
-    kept = evenly_spread(group, np.minimum(size, level(size, most)))
+    kept = evenly_spread(group, shared_out(np.bincount(group), most))
     part = observations.take(kept)
     share = np.bincount(group, observations.weight) / np.bincount(group[kept], part.weight)
     return msgspec.structs.replace(part, weight=(part.weight * share[group[kept]]).astype(np.float32))
@@ -44,17 +43,22 @@ def strata(observations: Observations, most: int) -> Int[np.ndarray, "n"]:
         cell *= 2
 
 
-def level(size: Int[np.ndarray, "g"], most: int) -> int:
-    """The largest c, 1 at least, with Σ min(size, c) ≤ most.
+def shared_out(size: Int[np.ndarray, "g"], most: int) -> Int[np.ndarray, "g"]:
+    """How many each stratum keeps: what it has, up to a number that is the same for all but for one; `most` in all.
 
-    >>> level(np.array([1, 5, 100]), 26)
-    20
+    >>> shared_out(np.array([1, 5, 100, 80]), 27).tolist()
+    [1, 5, 11, 10]
     """
     ascending = np.sort(size)
     before = np.concatenate([[0], np.cumsum(ascending)[:-1]])
     room = (most - before) // np.arange(len(size), 0, -1)  # for each stratum from here on, were those before kept whole
     cut = np.flatnonzero(room < ascending)
-    return max(int(room[cut[0]]), 1) if len(cut) else int(ascending[-1])
+    if not len(cut):
+        return size
+    count = np.minimum(size, room[cut[0]])
+    more = np.flatnonzero(size > count)[: most - count.sum()]
+    count[more] += 1
+    return count
 
 
 def evenly_spread(group: Int[np.ndarray, "n"], count: Int[np.ndarray, "g"]) -> Int[np.ndarray, "m"]:
