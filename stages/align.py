@@ -46,8 +46,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
     earlier = read_earlier(inputs["poses"]).get(name) if "poses" in inputs.folders else None
-    things = things_of(slice_, channels, inputs, params, earlier)
-    result = placed(things, *camera_of(slice_, facts, name), name, params.search, earlier.focal if earlier else None)
+    things = things_of(slice_, channels, inputs, params, facts["factor"], earlier)
+    result = placed(things, *camera_of(slice_, facts, name), name, params.search, earlier.focal(facts["factor"]) if earlier else None)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
@@ -58,14 +58,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         complain(name, thing_name, facts_of_it, params.strict)
     left_out = np.isin(maps.object, [k for k, facts_of_it in enumerate(objects.values(), start=1) if facts_of_it["left_out"]])
     write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
-    write_json(out / f"{name}.json", {"camera": camera_entry(result), "objects": objects})
+    write_json(out / f"{name}.json", {"camera": camera_entry(result, facts["factor"]), "objects": objects})
 
 
 def things_of(
-    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, earlier: EarlierPhoto | None = None
+    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: EarlierPhoto | None = None
 ) -> list[Thing]:
-    """Every object of the photo; poses that dataset.yaml or its source of cameras gives go before those found earlier,
-    these before keypoints."""
+    """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
+    before those found earlier, these before keypoints."""
     things = []
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
@@ -76,7 +76,7 @@ def things_of(
         caster = Caster(scaled(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         found = before.as_found() if before else None
-        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing), found, scale))
+        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
     return things
 
 
@@ -86,33 +86,38 @@ def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:
     return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
 
 
-def keypoints_of(thing: schema.ObjectEntry) -> Keypoints | None:
+def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
+    """In pixels of the photo averaged down by `factor`."""
     if not thing.keypoints:
         return None
-    return Keypoints(np.array([k.pixel for k in thing.keypoints]), np.array([k.point for k in thing.keypoints]))
+    return Keypoints(np.array([k.pixel for k in thing.keypoints]) / factor, np.array([k.point for k in thing.keypoints]))
 
 
 def camera_of(slice_: schema.ObjectsSlice, facts: dict, photo: str) -> tuple[Camera, float | None, str | None]:
     """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
 
     What dataset.yaml gives goes before what its source of cameras tells, and that before EXIF and the middle of the photo.
+    Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
     """
-    width, height = facts["width"], facts["height"]
+    factor, (width, height) = facts["factor"], facts["original_size"]
     focal, source, centre = facts["focal_px"], facts["focal_source"], (width / 2, height / 2)
     if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
         told_focal, centre = camera_told(slice_.told, width, height, photo)
         if source != "dataset":
-            focal, source = told_focal, slice_.told.source
-    return Camera(width, height, 1.0, tuple(slice_.camera.principal_point or centre)), focal, source
+            focal, source = told_focal / factor, slice_.told.source
+    across, down = slice_.camera.principal_point or centre
+    return Camera(facts["width"], facts["height"], 1.0, (across / factor, down / factor)), focal, source
 
 
-def camera_entry(result: Placed) -> dict:
+def camera_entry(result: Placed, factor: int) -> dict:
+    """Pixels are those of the stage's maps, `factor` of the photo's each."""
     camera = result.camera
     return {
         "focal_px": float(camera.focal),
         "focal_source": result.focal_source,
         "focal_relative_stderr": result.log_focal_sigma,
         "principal_point": [float(c) for c in camera.centre],
+        "factor": factor,
     }
 
 

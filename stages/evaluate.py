@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.dataset.schema import LightSlice, Pose, TruthFile
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.geometry import NormalError, normal_error, pose_error
+from factorlib.evaluate.geometry import NormalError, averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.materials import Material, compare_materials
 from factorlib.evaluate.metrics import Counts, Metrics, reasons_of
@@ -122,14 +122,20 @@ def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.nda
 
 
 def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) -> dict[str, NormalError] | None:
-    found = {}
+    found, photos = {}, read_json(inputs["masks"] / "photos.json")
     for name in lights:
         if name in truth.normals:
-            channels = read_exr(inputs.file(truth.normals[name]))
-            keys = [f"normal.{a}" for a in "xyz"] if "normal.x" in channels else list("RGB")
+            true = _true_normals(inputs.file(truth.normals[name]), photos[name]["factor"])
             normal, _, pixels = _geometry(inputs, name)
-            found[name] = normal_error(normal, np.stack([channels[k] for k in keys], axis=-1), pixels)
+            found[name] = normal_error(normal, true, pixels)
     return {name: error for name, error in found.items() if error} or None
+
+
+def _true_normals(path: Path, factor: int) -> np.ndarray:
+    """Averaged down as the photo was, [h w 3]."""
+    channels = read_exr(path)
+    keys = [f"normal.{a}" for a in "xyz"] if "normal.x" in channels else list("RGB")
+    return averaged_normals(np.stack([channels[k] for k in keys], axis=-1), factor)
 
 
 def _poses(inputs: Inputs, truth: TruthFile) -> dict | None:

@@ -1,17 +1,19 @@
-"""Photo and masks to one EXR of linear radiance, labels, and which pixels can be used."""
+"""Photo and masks to one EXR of linear radiance, labels, and which pixels can be used, no larger than is useful."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import PhotoSlice
+from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
+from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
-from factorlib.images.photo import Photo, read_photo
+from factorlib.images.photo import Photo, decoded, open_photo
 from factorlib.jsonfile import write_json
 from factorlib.labels import Labels, read_labels, read_objects
 from factorlib.stage import Inputs, Progress, silent
@@ -20,7 +22,13 @@ log = logging.getLogger("factorlib.masks")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose: what a photo and its masks mean stands in dataset.yaml."""
+    """A photo that has more pixels than these is averaged down by the least whole factor that makes it fit.
+
+    pixels: that show a material;  frame: of the whole photo, whatever they show.
+    """
+
+    pixels: Annotated[int, msgspec.Meta(ge=100)] = 1_000_000
+    frame: Annotated[int, msgspec.Meta(ge=100)] = 4_000_000
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:
@@ -32,18 +40,40 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     facts = msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)
     materials = inputs.facts["dataset.materials"]
     name = inputs.photo
-    progress(0, 3, f"{name}: photo")
-    path = inputs.file(facts.image)
-    photo = read_photo(path, facts.encoding, f"photos[{name}].image")
-    progress(1, 3, f"{name}: masks")
-    size = (photo.height, photo.width)
-    labels = read_labels(facts.masks, inputs.file, materials, size, facts.image, f"photos[{name}].masks")
-    objects = read_objects([(o.name, o.mask) for o in facts.objects], inputs.file, size, f"photos[{name}].objects")
-    valid = _valid(photo, labels, path, f"photos[{name}].image")
+    path, key = inputs.file(facts.image), f"photos[{name}].image"
+    stored = open_photo(path, key)
+    progress(0, 3, f"{name}: masks")  # before the photo: they say how far it is averaged down while it is read
+    labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, f"photos[{name}].masks")
+    objects = read_objects([(o.name, o.mask) for o in facts.objects], inputs.file, stored.size, f"photos[{name}].objects")
+    factor = factor_of(labels, params)
+    labels, objects = reduced(labels, factor, path, f"photos[{name}].masks"), box_majority(objects, factor)
+    progress(1, 3, f"{name}: photo")
+    photo = decoded(stored, facts.encoding, factor, path)
+    valid = _valid(photo, labels, path, key)
     progress(2, 3, f"{name}: writing")
     write_exr(out / f"{name}.exr", _channels(photo, labels, valid, objects))
-    write_json(out / f"{name}.json", _summary(photo, labels, valid, facts, materials))
+    write_json(out / f"{name}.json", _summary(photo, labels, valid, facts, materials, stored.size))
     progress(3, 3, name)
+
+
+def factor_of(labels: Labels, params: Params) -> int:
+    """The least by which the photo fits both of the bounds."""
+    height, width = labels.label.shape
+    factor = max(least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame))
+    return min(factor, height, width)
+
+
+def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
+    """By majority, where being left out counts as a label."""
+    if factor == 1:
+        return labels
+    label = box_majority(np.where(labels.left_out, np.uint8(LEFT_OUT), labels.label), factor)
+    left_out = label == LEFT_OUT
+    label[left_out] = 0
+    if not label.any():
+        found = f"averaged down {factor} × {factor}, no pixel shows mostly one material: the mask is made of specks"
+        raise InputError(found, file=path, key=key, cure='SET="masks.frame=…" with more pixels, or a mask of whole objects')
+    return Labels(label, left_out)
 
 
 def _valid(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:
@@ -63,15 +93,23 @@ def _channels(photo: Photo, labels: Labels, valid: np.ndarray, objects: np.ndarr
     return {**colours, "label": labels.label, "valid": valid, "left_out": labels.left_out, "object": objects, **clipped}
 
 
-def _summary(photo: Photo, labels: Labels, valid: np.ndarray, facts: PhotoSlice, materials: list[str]) -> dict:
-    """`pixels` counts the valid ones of each material; `clipped_fraction` is the share of them clipped in any channel."""
-    focal_px = facts.focal_px or photo.focal_px
+def _summary(
+    photo: Photo, labels: Labels, valid: np.ndarray, facts: PhotoSlice, materials: list[str], size: tuple[int, int]
+) -> dict:
+    """`pixels` counts the valid ones of each material; `clipped_fraction` is the share of them clipped in any channel.
+
+    All pixels are those of the EXR; `original_size` (width, height) is the photo's own, `factor` times as large, as displayed.
+    """
+    focal_px = facts.focal_px / photo.factor if facts.focal_px else photo.focal_px
     return {
         "width": photo.width,
         "height": photo.height,
+        "factor": photo.factor,
+        "original_size": [size[1], size[0]],
         "focal_px": focal_px,
         "focal_source": "dataset" if facts.focal_px else "exif" if photo.focal_px else None,
         "encoding": photo.encoding,
+        "exposure": photo.exposure,
         "illumination": facts.illumination,
         "pixels": {material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)},
         "clipped_fraction": float(photo.clipped[valid].any(axis=-1).mean()),

@@ -40,9 +40,11 @@ from factorlib.solve.uncertainty import GAUGE, standard_errors
 from factorlib.solve.unknowns import Materials
 from factorlib.solve.warm import from_earlier
 from factorlib.stage import Inputs, Progress
+from factorlib.urm.exposure import at_one_exposure, relative_exposures
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate, read_observations
 
+EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
 log = logging.getLogger("factorlib.solve")
 Meta = msgspec.Meta
 
@@ -99,6 +101,8 @@ def _main(params: Params, inputs: Inputs, out: Path, progress: Progress, spread:
     earlier = _earlier(params, inputs)
     read = spread(partial(_merged, degrees=params.merge_degrees), sorted(inputs["urm"].glob("*.parquet")))
     seen = concatenate([photo.merged for photo in read])
+    relative = relative_exposures(seen)
+    seen, earlier = at_one_exposure(seen, relative), earlier and _at_one_exposure(earlier, relative)
     _warn_of_unusable(read)
     blocks = blocks_of_observations(
         seen,
@@ -113,7 +117,7 @@ def _main(params: Params, inputs: Inputs, out: Path, progress: Progress, spread:
     journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
     joint = _solved(params, blocks, materials, operator, spread, progress, journal, earlier)
     shown = blocks if joint.self_shadowing else [without_shadows(block) for block in blocks]
-    _write(out, materials, shown, joint, operator, params.solver, earlier)
+    _write(out, materials, shown, joint, operator, params.solver, earlier, relative)
 
 
 def operator_of(params: Params) -> str:
@@ -152,6 +156,11 @@ def _earlier(params: Params, inputs: Inputs) -> Earlier | None:
     if params.solver == "paper":
         raise InputError("the paper's solver starts from nothing", key="solve.start", cure="leave it out, or set solve.solver=bundle")
     return read_earlier(inputs["start"])
+
+
+def _at_one_exposure(earlier: Earlier, relative: dict[str, float]) -> Earlier:
+    exposures = {photo: tuple(e / relative.get(photo, 1.0) for e in channels) for photo, channels in earlier.exposures.items()}
+    return msgspec.structs.replace(earlier, exposures=exposures)
 
 
 def _rotations(inputs: Inputs) -> dict[str, np.ndarray]:
@@ -240,7 +249,16 @@ def _warn_of_gaps(materials: list[str], blocks: list[Block], seen: Observations)
         )  # fmt: skip
 
 
-def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, operator, solver: str, earlier: Earlier | None) -> None:
+def _write(
+    out: Path,
+    names: list[str],
+    blocks: list[Block],
+    joint: Joint,
+    operator,
+    solver: str,
+    earlier: Earlier | None,
+    relative: dict[str, float],
+) -> None:
     errors, deviation = standard_errors(blocks, joint.solution, operator, joint.loss)
     _warn(untold_by_answer(names, blocks, joint.solution.materials, errors))
     _warn(ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator))
@@ -258,7 +276,7 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
         "self_shadowing_chosen_by": {f"held_out_loss_{name}": loss for name, loss in joint.held_out.items()},
     }
     model["tone"] = {
-        photo: {"exponent": float(np.exp(log_tone)), "pivot": block.unit}
+        photo: {"exponent": float(np.exp(log_tone)), "pivot": block.unit * relative[photo]}
         for block, light in zip(blocks, joint.solution.lights, strict=True)
         for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
     }
@@ -271,13 +289,24 @@ def _write(out: Path, names: list[str], blocks: list[Block], joint: Joint, opera
     write_json(out / "uncertainty.json", {"residual_sigma": deviation, "materials": _as_json(names, errors, None), "gauge": GAUGE})
     lights = list(zip(blocks, joint.solution.lights, strict=True))
     write_lobes(out / "lobes.parquet", {b.name: Lobes(light.axis, light.sharpness, light.weight * b.unit) for b, light in lights})
-    exposures = {photo: [float(np.exp(light.log_exposure[k]))] * 3 for b, light in lights for k, photo in enumerate(b.photos)}
-    write_json(out / "exposures.json", exposures)
+    found_beside = {photo: float(np.exp(light.log_exposure[k])) for b, light in lights for k, photo in enumerate(b.photos)}
+    _warn_of_exposures(found_beside, relative)
+    write_json(out / "exposures.json", {photo: [factor * relative[photo]] * 3 for photo, factor in found_beside.items()})
     _write_history(out / "convergence.parquet", joint.history)
     (out / "coverage").mkdir()
     for block, light in lights:
         coverage = relative_standard_errors(block, light, found, operator, joint.loss, deviation)
         write_rgb_exr(out / "coverage" / f"{block.name}.exr", coverage, LAT_LONG)
+
+
+def _warn_of_exposures(found: dict[str, float], relative: dict[str, float]) -> None:
+    """found: of each photo, beside what EXIF says."""
+    for photo, factor in found.items():
+        if relative[photo] != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS):
+            log.warning(
+                "photo '%s': by its EXIF its exposure is %.3g of its light's first photo, by its pixels %.3g: was it made brighter or darker later?",
+                photo, relative[photo], factor * relative[photo],
+            )  # fmt: skip
 
 
 def _as_json(names: list[str], materials: Materials, errors: Materials | None) -> dict:

@@ -1,4 +1,4 @@
-"""Unstructured reflectance map: every pixel whose material and normal are known becomes an observation.
+"""Unstructured reflectance map: every pixel whose material and normal are known becomes an observation, or a sample of them.
 
 What an observation sees past its own mesh and the photo's other objects stands in its `visibility`.
 """
@@ -20,18 +20,21 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.sample import sample
 from factorlib.urm.visibility import Occluders, visibility
 
 log = logging.getLogger("factorlib.urm")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """directions: of the sphere whose visibility is cast, 0 for none;  cast_points: observations of a photo that rays are
+    """most: observations of a photo; of more, a sample is taken, evenly over materials and normals, and weighted;
+    directions: of the sphere whose visibility is cast, 0 for none;  cast_points: observations of a photo that rays are
     cast from, the others take their neighbours' visibility.
     """
 
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0  # 0 keeps every pixel
     least_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    most: Annotated[int, msgspec.Meta(ge=5000)] = 100_000
     directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
     cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
 
@@ -47,10 +50,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         illumination=light["illumination"],
         materials=inputs.facts["dataset.materials"],
         least_confidence=params.least_confidence,
+        exposure=read_json(inputs["masks"] / f"{name}.json")["exposure"],
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
-    elif params.directions:
+    observations = sample(observations, params.most)
+    if params.directions and len(observations):
         observations = with_visibility(observations, photo["label"].shape, inputs, params)
     write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
 

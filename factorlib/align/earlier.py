@@ -51,9 +51,12 @@ class EarlierObject(EarlierPose, frozen=True):
 
 
 class EarlierCamera(msgspec.Struct, frozen=True):
+    """focal_px: in pixels that stand for factor² of the photo's."""
+
     focal_px: POSITIVE
     focal_source: str = "estimated"
     focal_relative_stderr: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    factor: Annotated[int, msgspec.Meta(ge=1)] = 1
 
 
 class EarlierPhoto(msgspec.Struct, frozen=True):
@@ -62,9 +65,10 @@ class EarlierPhoto(msgspec.Struct, frozen=True):
     camera: EarlierCamera
     objects: dict[str, EarlierObject]
 
-    @property
-    def focal(self) -> EarlierFocal:
-        return EarlierFocal(self.camera.focal_px, self.camera.focal_source, self.camera.focal_relative_stderr)
+    def focal(self, factor: int) -> EarlierFocal:
+        """In pixels of the photo averaged down by `factor`, which may have been another one then."""
+        camera = self.camera
+        return EarlierFocal(camera.focal_px * (camera.factor / factor), camera.focal_source, camera.focal_relative_stderr)
 
 
 def read_earlier(folder: Path) -> dict[str, EarlierPhoto]:

@@ -18,6 +18,7 @@ from factorlib.dataset.schema import (
     ENCODINGS,
     FORMAT,
     MAX_MATERIALS,
+    RAW,
     SOURCES,
     CameraSource,
     DatasetFile,
@@ -29,7 +30,7 @@ from factorlib.dataset.schema import (
 from factorlib.errors import InputError, did_you_mean
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
-IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr")
+IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
 MASKS = (".png", ".json")
 ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own name
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)

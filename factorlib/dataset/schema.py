@@ -16,6 +16,7 @@ FORMAT = 1
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
 MAX_MATERIALS = LEFT_OUT - 1
 SOURCES = ("colmap", "transforms", "bop")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # suffixes of raw photos
 ENCODINGS = ("srgb", "linear", "gamma2.2")
 
 Vec2 = tuple[float, float]

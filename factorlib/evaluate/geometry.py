@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.conventions import FRONT
+from factorlib.images.boxes import box_sum
 
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
 
@@ -45,6 +46,17 @@ def normal_error(estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, 
         return None
     facing = np.broadcast_to(FRONT, truth[known].shape)
     return NormalError(int(known.sum()), _summary(estimate[known], truth[known]), _summary(facing, truth[known]))
+
+
+def averaged_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[np.ndarray, "i j 3"]:
+    """Unit mean normals of boxes of factor × factor pixels; zero where less than half of a box is known."""
+    if factor == 1:
+        return normal
+    known = np.linalg.norm(normal, axis=-1) > 0.5
+    mean = box_sum(np.where(known[..., None], normal, 0), factor)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    enough = (2 * box_sum(known, factor, np.int64) >= factor**2)[..., None] & (length > 0)
+    return np.where(enough, mean / np.where(enough, length, 1), 0)
 
 
 def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

@@ -1,36 +1,42 @@
-"""Reading a photo: linear radiance, which channels are clipped, which pixels are numbers, and the focal length.
+"""Reading a photo: linear radiance, which channels are clipped, which pixels are numbers, and what the camera wrote about it.
 
 Orientation   as displayed: the EXIF orientation is applied.
-Encoding      8- and 16-bit files are sRGB-encoded, float files linear, unless `encoding` says otherwise; primaries
+Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` says otherwise; primaries
               are taken for Rec. 709.
-Channels      one is grey; alpha is dropped.  Integer colours are taken as stored, without the alpha multiplied in;
-              float colours (EXR) are premultiplied by convention and are taken so.
-Clipped       integer codes from CLIPPED of the range (254 of 255) on: JPEG compression ripples the top code a little.
+Channels      one is grey; alpha is dropped.
+Clipped       integer codes from CLIPPED of the range (254 of 255) on; of a raw file, what the sensor's white level cut.
               A float file has no top code; what is not finite in it is no pixel.
+Size          a photo can be averaged down by a whole factor (`boxes`) while it is read, so that no more than some rows of it
+              are ever held: radiance by its linear mean; clipped where any part is; finite where any part is.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
-import OpenImageIO as oiio
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
-from factorlib.errors import InputError
+from factorlib.images.boxes import box_any, box_mean
+from factorlib.images.exif import exposure_of_exif
 from factorlib.images.focal import focal_px_of_exif
+from factorlib.images.heif import is_heif, open_heif
+from factorlib.images.raw import is_raw, open_raw
+from factorlib.images.scanlines import open_scanlines
+from factorlib.images.stored import Stored
 from factorlib.images.transfer import decoder
 
-CLIPPED = 0.995
-ORIENTATIONS = range(1, 9)
+READ_AT_ONCE = 1 << 21  # pixels of the rows that are held as floats
 log = logging.getLogger("factorlib.images")
 
 
 class Photo(msgspec.Struct, frozen=True):
     """radiance: linear Rec. 709, scene-referred up to exposure, 0 where not finite; clipped: at the top code or above;
-    finite: all three channels are numbers; focal_px: from EXIF, of the photo as displayed; encoding: the one used."""
+    finite: all three channels are numbers; focal_px: from EXIF, in pixels of `radiance` as displayed; encoding: the one used;
+    factor: a pixel of `radiance` stands for factor² of the file; exposure: t·S/N² from EXIF."""
 
     radiance: Float[np.ndarray, "h w 3"]
     clipped: Bool[np.ndarray, "h w 3"]
@@ -39,90 +45,99 @@ class Photo(msgspec.Struct, frozen=True):
     width: int
     height: int
     encoding: str
+    factor: int = 1
+    exposure: float | None = None
+
+
+def open_photo(path: str | Path, key: str | None = None) -> Stored:
+    """The photo at `path` (JPEG, PNG, TIFF, EXR, HDR, HEIC, DNG or raw): its header is read, its pixels are not.
+
+    What kind of file it is, its contents say: a DNG is a TIFF whose first picture is a small preview.
+    key: where the photo is named, for messages.
+    Raises InputError for a file that is unreadable, or holds no grey or RGB.
+    """
+    if is_heif(path):
+        return open_heif(path, key)
+    return open_raw(path, key) if is_raw(path) else open_scanlines(path, key)
 
 
 def read_photo(path: str | Path, encoding: str | None = None, key: str | None = None) -> Photo:
-    """The photo at `path` (JPEG, PNG, TIFF, EXR, HDR) as displayed.
+    """The photo at `path` as displayed, in its own pixels.
 
     encoding: srgb, linear or gamma2.2; None takes what the kind of file implies.
-    key: where the photo is named, for messages.
-    Raises InputError for a file that is unreadable, truncated, or holds no grey or RGB.
+    Raises InputError as `open_photo` does, and for a file that is truncated.
     """
-    spec, stored = _read_pixels(path, key)
-    rgb = _oriented(_rgb(stored, spec, path, key), spec.get_int_attribute("Orientation", 1))
-    integer = rgb.dtype.kind == "u"
-    encoding = encoding or ("srgb" if integer else "linear")
-    radiance = (_decoded_codes if integer else _decoded_floats)(rgb, encoding)
-    finite = np.isfinite(radiance).all(axis=-1)
-    _warn_of_profile(spec, path)
+    return decoded(open_photo(path, key), encoding, 1, path)
+
+
+def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path) -> Photo:
+    """An open photo as displayed, averaged down by `factor`; `path` is named in warnings."""
+    encoding = encoding or stored.encoding
+    height, width = (n // factor for n in (stored.height, stored.width))
+    radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
+    finite = np.empty((height, width), bool)
+    for rows, codes, cut in _strips(stored, factor):
+        linear = _decoded(codes, stored.white, encoding)
+        numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
+        linear[~numbers] = 0
+        if factor == 1:
+            radiance[rows], finite[rows], clipped[rows] = linear, numbers, cut
+        else:
+            radiance[rows], finite[rows] = box_mean(linear, numbers, factor)
+            clipped[rows] = box_any(cut, factor)
+    _warn_of_profile(stored.profile, path)
+    radiance, clipped, finite = (_oriented(pixels, stored.orientation) for pixels in (radiance, clipped, finite))
+    focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
     return Photo(
-        radiance=np.where(finite[..., None], radiance, np.float32(0)),
-        clipped=rgb >= CLIPPED * np.iinfo(rgb.dtype).max if integer else np.zeros(rgb.shape, dtype=bool),
-        finite=finite,
-        focal_px=focal_px_of_exif({a.name: a.value for a in spec.extra_attribs}, spec.width, spec.height, path),
-        width=rgb.shape[1],
-        height=rgb.shape[0],
-        encoding=encoding,
-    )
+        radiance, clipped, finite, focal_px and focal_px / factor, finite.shape[1], finite.shape[0], encoding, factor,
+        exposure_of_exif(stored.exif),
+    )  # fmt: skip
 
 
-def _read_pixels(path: str | Path, key: str | None) -> tuple[oiio.ImageSpec, np.ndarray]:
-    """Header and pixels [h, w, c] as stored, in the file's own type, alpha not multiplied in."""
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), wish)
-    if source is None:
-        found = f"not readable as an image ({_line(oiio.geterror())})"
-        raise InputError(found, file=path, key=key, cure="is it whole, and of the kind its suffix says?")
-    spec = source.spec()
-    pixels = source.read_image(spec.format)
-    error = _line(source.geterror())
-    source.close()
-    if pixels is None or "Premature end" in error:
-        raise InputError(f"truncated or damaged ({error})", file=path, key=key, cure="copy it again from where it came")
-    if error:
-        log.warning("%s: %s", path, error)
-    return spec, pixels.reshape(spec.height, spec.width, spec.nchannels)
+def _strips(stored: Stored, factor: int) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
+    """Whole rows of boxes, some at a time: which rows of boxes, the codes in them, and where these are clipped.
+
+    Boxes count from the displayed corner, so what is left over lies at the other end of an axis that display turns round.
+    """
+    turned = _reversed_axes(stored.orientation)
+    top, left = (n % factor if back else 0 for n, back in zip((stored.height, stored.width), turned))
+    columns, height = slice(left, left + stored.width // factor * factor), stored.height // factor
+    if top:
+        stored.rows(0, top)
+    step = max(1, READ_AT_ONCE // (factor * stored.width))
+    for first in range(0, height, step):
+        last = min(first + step, height)
+        begin, end = top + first * factor, top + last * factor
+        codes = stored.rows(begin, end)
+        yield slice(first, last), codes[:, columns], stored.clipped(begin, end, codes)[:, columns]
+    if end < stored.height:
+        stored.rows(end, stored.height)  # a file that is cut short there is refused all the same
 
 
-def _line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def _rgb(pixels: np.ndarray, spec: oiio.ImageSpec, path: str | Path, key: str | None) -> np.ndarray:
-    """The colour channels, grey repeated."""
-    names = list(spec.channelnames)
-    if set("RGB") <= set(names):
-        return pixels[..., [names.index(name) for name in "RGB"]]
-    colours = [index for index in range(len(names)) if index != spec.alpha_channel and names[index] != "Z"]
-    if len(colours) != 1:
-        raise InputError(f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer")
-    return np.repeat(pixels[..., colours], 3, axis=-1)
+def _reversed_axes(orientation: int) -> tuple[bool, bool]:
+    """Whether display reverses the order of the stored rows, and of the stored columns."""
+    down, across = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
+    return (across, down) if orientation >= 5 else (down, across)
 
 
 def _oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Turned as EXIF says: 1 as is, 2-4 mirrored or half turned, 5-8 with rows and columns swapped."""
-    if orientation not in ORIENTATIONS:
-        return pixels
     turned = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
     rows, columns = -1 if orientation in (3, 4, 7, 8) else 1, -1 if orientation in (2, 3, 6, 7) else 1
     return np.ascontiguousarray(turned[::rows, ::columns])
 
 
-def _decoded_codes(codes: np.ndarray, encoding: str) -> Float[np.ndarray, "h w 3"]:
-    if codes.dtype.itemsize > 2:
-        return decoder(encoding)(codes / np.iinfo(codes.dtype).max).astype(np.float32)
-    top = np.iinfo(codes.dtype).max
-    return decoder(encoding)(np.arange(top + 1) / top).astype(np.float32)[codes]
+def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
+    """Linear values, an array of their own."""
+    if white is None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
+    if white >= 2**16:
+        return decoder(encoding)(codes / white).astype(np.float32)
+    return decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
 
 
-def _decoded_floats(values: np.ndarray, encoding: str) -> Float[np.ndarray, "h w 3"]:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return decoder(encoding)(values.astype(np.float32)).astype(np.float32)
-
-
-def _warn_of_profile(spec: oiio.ImageSpec, path: str | Path) -> None:
-    profile = spec.get_string_attribute("ICCProfile:profile_description")
+def _warn_of_profile(profile: str, path: str | Path) -> None:
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         log.warning(
             "%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours", path, profile

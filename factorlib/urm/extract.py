@@ -33,11 +33,13 @@ def observations_of_photo(
     illumination: str,
     materials: Sequence[str],
     least_confidence: float = 0.0,
+    exposure: float | None = None,
 ) -> Observations:
     """One observation per observed pixel, in row order; `weight` is the confidence of its normal, 0 to 1.
 
     photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
     geometry:  channels normal.x/y/z, view.x/y/z, label, confidence of the stage `align`
+    exposure:  t·S/N² from EXIF, where it is known
     """
     seen = observed_pixels(photo, geometry, least_confidence)
     y, x = np.nonzero(seen)
@@ -59,6 +61,7 @@ def observations_of_photo(
         materials=tuple(materials),
         photos=(name,),
         illuminations=(illumination,),
+        exposures=(exposure,),
     )
 
 

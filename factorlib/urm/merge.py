@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.sparse import csr_array
 
 from factorlib.light.sphere import fibonacci_sphere
+from factorlib.urm.cells import direction_cells, groups
 from factorlib.urm.observations import Observations
 
 HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
@@ -32,39 +33,10 @@ def merge(observations: Observations, degrees: float) -> Observations:
     cell = np.radians(degrees)
     mirror = 2 * np.sum(observations.normal * observations.view, -1, keepdims=True) * observations.normal - observations.view
     flags = observations.clipped @ np.array([1, 2, 4])
-    keys = np.column_stack([observations.photo, observations.material, flags, _cells(observations.normal, cell), _cells(mirror, 2 * cell)])
+    keys = np.column_stack([observations.photo, observations.material, flags, direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)])
     if observations.visibility is not None:
         keys = np.column_stack([keys, _hidden_cells(observations.visibility)])
-    return _merged(observations, *_groups(keys))
-
-
-def _groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "g"], Int[np.ndarray, "n"]]:
-    """The first row of each group of equal rows, groups in lexicographic order, and each row's group.
-
-    As np.unique of rows, on one number a row.
-    """
-    code, size = np.zeros(len(keys), np.int64), 1
-    for column in keys.T - keys.min(0)[:, None]:
-        span = int(column.max()) + 1
-        if size * span >= 1 << 62:
-            code = np.unique(code, return_inverse=True)[1]
-            size = int(code.max()) + 1
-        code, size = code * span + column, size * span
-    order = np.argsort(code)
-    starts = np.flatnonzero(np.diff(code[order], prepend=-1))
-    group = np.empty(len(keys), np.int64)
-    group[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
-    return np.minimum.reduceat(order, starts), group
-
-
-def _cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n 3"]:
-    """Cells of roughly `size` radians: an octahedral map of the sphere, cut into squares."""
-    x, y, z = np.moveaxis(direction / np.abs(direction).sum(-1, keepdims=True), -1, 0)
-    fold = z > 0  # the viewer's side (z < 0) stays whole in the middle
-    u = np.where(fold, (1 - np.abs(y)) * np.sign(x), x)
-    v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
-    step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
-    return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)
+    return _merged(observations, *groups(keys))
 
 
 def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"]:
@@ -91,7 +63,7 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
         radiance=mean(observations.radiance).astype("f4"),
         weight=total.astype("f4"),
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
-        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations")},
+        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
         visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
     )
 

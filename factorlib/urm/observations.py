@@ -50,6 +50,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
+    exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -79,6 +80,8 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
     names = {"materials": observations.materials, "photos": observations.photos, "illuminations": observations.illuminations}
     about = {**UNITS, **names}
+    if any(exposure is not None for exposure in observations.exposures):
+        about["exposures"] = observations.exposures
     if observations.visibility is not None:
         columns["visibility"], about["visibility"] = _bytes(observations.visibility), VISIBILITY
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
@@ -94,7 +97,8 @@ def read_observations(path: str | Path) -> Observations:
         columns["visibility"] = _of_bytes(table["visibility"].combine_chunks()) if "visibility" in table.column_names else None
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise InputError(f"not a reflectance map ({error})", file=path, cure="run the stage `urm` again") from error
-    return Observations(**columns, **{k: tuple(names[k]) for k in ("materials", "photos", "illuminations")})
+    named = {k: tuple(names[k]) for k in ("materials", "photos", "illuminations")}
+    return Observations(**columns, **named, exposures=tuple(names.get("exposures", ())))
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -108,7 +112,10 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
         columns[column] = np.concatenate(renumbered).astype("i4")
-    return Observations(**columns, materials=materials, **names, visibility=_all_visibility(parts))
+    exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
+    return Observations(
+        **columns, materials=materials, **names, visibility=_all_visibility(parts), exposures=tuple(exposures.get(p) for p in names["photos"])
+    )
 
 
 def _all_visibility(parts: Sequence[Observations]) -> UInt8[np.ndarray, "n k"] | None:

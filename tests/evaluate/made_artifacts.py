@@ -117,7 +117,7 @@ def _photo(made: Made, folders: dict, photo: str, seen: list[str], materials: li
     write_observations(folders["urm"] / f"{photo}.parquet", observations)
     counts = {m: int((label == materials.index(m) + 1).sum()) for m in seen}
     write_json(folders["masks"] / f"{photo}.json", {
-        "width": label.shape[1], "height": SIZE, "focal_px": None, "focal_source": None, "encoding": "srgb",
+        "width": label.shape[1], "height": SIZE, "factor": 1, "original_size": [label.shape[1], SIZE], "focal_px": None, "focal_source": None, "encoding": "srgb",
         "illumination": photo, "pixels": counts, "clipped_fraction": float((rgb >= made.clip).any(-1).mean()),
     })  # fmt: skip
     write_rgb_exr(folders["truth"] / f"{photo}_env.exr", light_values, LAT_LONG)

@@ -1,12 +1,16 @@
 """Reading photos: the same scene is the same radiance whatever file it came in."""
 
+import tracemalloc
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.images import photo as photo_module
+from factorlib.images.boxes import box_mean
 from factorlib.images.focal import FILM_DIAGONAL, focal_px_of_exif
-from factorlib.images.photo import read_photo
+from factorlib.images.photo import decoded, open_photo, read_photo
 from factorlib.images.transfer import gamma_encode, srgb_encode
 
 RNG = np.random.default_rng(3)
@@ -74,6 +78,93 @@ def test_orientation_is_applied(tmp_path, orientation):
     photo = read_photo(path)
     np.testing.assert_array_equal(codes(srgb_encode(photo.radiance)), expected)
     assert (photo.height, photo.width) == expected.shape[:2] == ((18, 12) if orientation >= 5 else (12, 18))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("file, pixels", [("a.png", codes(srgb_encode(RADIANCE))), ("a.exr", RADIANCE)])
+def test_averaging_down_is_that_of_the_photo_as_displayed(tmp_path, orientation, file, pixels):
+    pixels = np.ascontiguousarray(pixels[:11, :17])  # nothing comes out even, so that the displayed corner matters
+    path = save(tmp_path / file, pixels, Orientation=orientation)
+    whole, small = read_photo(path), decoded(open_photo(path), None, 3, path)
+    assert small.radiance.shape == tuple(n // 3 for n in whole.radiance.shape[:2]) + (3,)
+    assert (small.height, small.width, small.factor) == (*small.radiance.shape[:2], 3)
+    np.testing.assert_allclose(small.radiance, box_mean(whole.radiance, whole.finite, 3)[0], rtol=1e-6)
+
+
+def averaged(path, factor, rows_at_once):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_module, "READ_AT_ONCE", rows_at_once * 18)
+        return decoded(open_photo(path), None, factor, path)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 5])
+@pytest.mark.parametrize("file, pixels", [("a.jpg", codes(RADIANCE)), ("a.png", codes(RADIANCE, np.uint16)), ("a.exr", RADIANCE)])
+def test_how_many_rows_are_read_at_once_changes_no_bit(tmp_path, factor, file, pixels):
+    path = save(tmp_path / file, pixels)
+    once = averaged(path, factor, 100)
+    for rows in (1, 2, 7):
+        some = averaged(path, factor, rows)
+        for name in ("radiance", "clipped", "finite"):
+            assert getattr(some, name).tobytes() == getattr(once, name).tobytes(), (rows, name)
+
+
+def test_no_more_than_some_rows_of_a_large_photo_are_held(tmp_path):
+    path = save(tmp_path / "a.tif", np.zeros((1500, 4000, 3), np.uint16), Compression="zip")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_module, "READ_AT_ONCE", 1 << 17)
+        tracemalloc.start()
+        decoded(open_photo(path), None, 8, path)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 1500 * 4000 * 3 * 4 / 4, "a quarter of the photo as floats"
+
+
+def test_a_clipped_part_clips_the_average_and_what_is_not_finite_has_no_part_in_it(tmp_path):
+    pixels = codes(srgb_encode(np.full((4, 4, 3), 0.5)))
+    pixels[1, 1, 2] = 255
+    photo = decoded(open_photo(save(tmp_path / "a.png", pixels)), None, 2, "a.png")
+    assert np.argwhere(photo.clipped).tolist() == [[0, 0, 2]]
+    pixels = np.full((4, 4, 3), 2.0, np.float32)
+    pixels[0, 0, 1], pixels[2:, 2:] = np.nan, np.inf
+    photo = decoded(open_photo(save(tmp_path / "a.exr", pixels)), None, 2, "a.exr")
+    assert photo.finite.tolist() == [[True, True], [True, False]] and (photo.radiance[0] == 2).all() and (photo.radiance[1, 1] == 0).all()
+
+
+def test_a_file_cut_in_the_rows_that_averaging_drops_is_refused_too(tmp_path):
+    path = save(tmp_path / "a.png", RNG.integers(0, 255, (65, 64, 3)).astype(np.uint8))
+    path.write_bytes(path.read_bytes()[:-80])
+    with pytest.raises(InputError, match="truncated or damaged"):
+        decoded(open_photo(path), None, 8, path)
+
+
+def test_tiles_are_read_as_scanlines_are(tmp_path):
+    pixels = RNG.uniform(0, 1, (70, 90, 3)).astype(np.float32)
+    spec = oiio.ImageSpec(90, 70, 3, oiio.FLOAT)
+    spec.tile_width = spec.tile_height = 32
+    output = oiio.ImageOutput.create("a.exr")
+    assert output.open(str(tmp_path / "a.exr"), spec) and output.write_image(pixels)
+    output.close()
+    del output
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.exr").radiance, pixels)
+
+
+def test_a_focal_length_is_in_pixels_of_the_averaged_photo(tmp_path):
+    path = save(tmp_path / "a.jpg", np.zeros((40, 60, 3), dtype=np.uint8), Exif__FocalLengthIn35mmFilm=50)
+    assert decoded(open_photo(path), None, 4, path).focal_px == pytest.approx(read_photo(path).focal_px / 4)
+
+
+@pytest.mark.parametrize(
+    "tags, expected",
+    [
+        ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 125}, 125 / 60 / 1.8**2),
+        ({"ExposureTime": 1 / 60, "FNumber": 1.8}, None),
+        ({"ExposureTime": 1 / 60, "FNumber": 0.0, "Exif__PhotographicSensitivity": 125}, None),  # a lens that says nothing
+        ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 65535}, None),  # "more than fits"
+    ],
+)
+def test_the_exposure_is_what_the_camera_wrote(tmp_path, tags, expected):
+    found = read_photo(save(tmp_path / "a.jpg", np.zeros((40, 60, 3), dtype=np.uint8), **tags)).exposure
+    assert found == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
 def test_a_quarter_turn_by_hand(tmp_path):

@@ -20,6 +20,7 @@ from factorlib.stage import Inputs, silent
 from stages import align
 from tests.align.scenes import blob, chair, photo_of
 
+FACTS = {"width": 200, "height": 150, "factor": 1, "original_size": [200, 150]}
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
 
 
@@ -31,7 +32,7 @@ def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, s
     masks.mkdir()
     zero = np.zeros(label.shape)
     write_exr(masks / "a.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
-    write_json(masks / "a.json", {"width": 200, "height": 150, "focal_px": focal, "focal_source": source})
+    write_json(masks / "a.json", {**FACTS, "focal_px": focal, "focal_source": source})
     write_ply(tmp_path / "thing.ply", mesh_given)
     thing = {"name": "thing", "mesh": "thing"}
     if pose_given:

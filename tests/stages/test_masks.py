@@ -11,6 +11,7 @@ from PIL import Image
 
 from factorlib.dataset.schema import ObjectMask, PhotoSlice
 from factorlib.errors import InputError
+from factorlib.images.boxes import box_majority
 from factorlib.images.exr import read_exr, write_rgb_exr
 from factorlib.images.transfer import srgb_encode
 from factorlib.stage import Inputs
@@ -34,7 +35,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def run(folder, progress=lambda *_: None, **facts):
+def run(folder, progress=lambda *_: None, params=masks.Params(), **facts):
     """The channels and the summary the stage writes for a photo `kitchen` with the given facts."""
     given = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen", "objects": []}
     photo = PhotoSlice(**given | facts)
@@ -46,7 +47,7 @@ def run(folder, progress=lambda *_: None, **facts):
     )
     out = folder / "out"
     out.mkdir(exist_ok=True)
-    masks.main(masks.Params(), inputs, out, progress)
+    masks.main(params, inputs, out, progress)
     assert sorted(path.name for path in out.iterdir()) == ["kitchen.exr", "kitchen.json"]
     return read_exr(out / "kitchen.exr"), json.loads((out / "kitchen.json").read_text())
 
@@ -70,9 +71,12 @@ def test_channels_say_what_photo_and_mask_say(folder):
     assert summary == {
         "width": W,
         "height": H,
+        "factor": 1,
+        "original_size": [W, H],
         "focal_px": None,
         "focal_source": None,
         "encoding": "linear",
+        "exposure": None,
         "illumination": "kitchen",
         "pixels": {"red": 56, "wood": 96},
         "clipped_fraction": 0.0,
@@ -183,3 +187,60 @@ def test_bad_input_is_refused_and_nothing_is_left(folder, spoil, said):
     spoil(folder)
     message = refusal(folder)
     assert all(word in message for word in said), message
+
+
+SMALLER = masks.Params(pixels=100)  # of the 152 that show a material: factor 2
+
+
+def test_a_photo_of_many_pixels_is_averaged_down_and_says_so(folder):
+    Image.fromarray(LABEL == 2).save(folder / "in" / "own.png")
+    channels, summary = run(folder, params=SMALLER, objects=[ObjectMask("a", None), ObjectMask("b", "own.png")])
+    mean = RADIANCE.reshape(H // 2, 2, W // 2, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(np.dstack([channels[c] for c in "RGB"]), mean, rtol=1e-6)
+    label = box_majority(LABEL, 2)
+    np.testing.assert_array_equal(channels["label"], np.where(label == 255, 0, label))
+    np.testing.assert_array_equal(channels["left_out"], label == 255)
+    np.testing.assert_array_equal(channels["object"], 2 * box_majority((LABEL == 2).astype("u1"), 2))
+    np.testing.assert_array_equal(channels["valid"], channels["label"] > 0)
+    assert (summary["factor"], summary["original_size"]) == (2, [W, H]) and (summary["width"], summary["height"]) == (W // 2, H // 2)
+    assert summary["pixels"] == {"red": int((label == 1).sum()), "wood": int((label == 2).sum())}
+
+
+@pytest.mark.parametrize(
+    "params, factor", [({"pixels": 152}, 1), ({"pixels": 151}, 2), ({"frame": H * W}, 1), ({"frame": 100}, 2), ({"frame": 100, "pixels": 100}, 2)]
+)
+def test_the_factor_is_the_least_that_fits_both_bounds(folder, params, factor):
+    assert run(folder, params=masks.Params(**params))[1]["factor"] == factor
+
+
+def test_a_photo_that_fits_is_the_same_bytes_whatever_the_bounds(folder):
+    run(folder)
+    first = (folder / "out" / "kitchen.exr").read_bytes()
+    run(folder, params=masks.Params(pixels=152, frame=H * W))
+    assert (folder / "out" / "kitchen.exr").read_bytes() == first
+
+
+def test_a_given_focal_length_is_of_the_photo_as_it_is(folder):
+    assert run(folder, params=SMALLER, focal_px=812.0)[1]["focal_px"] == 406.0
+
+
+def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
+    radiance = RADIANCE.copy()
+    radiance[2, 3], radiance[4:6, 4:6] = np.nan, np.inf
+    write_rgb_exr(folder / "in" / "photo.exr", radiance)
+    channels, _ = run(folder, params=SMALLER)
+    assert channels["valid"][1, 1] == 1 and channels["valid"][2, 2] == 0
+    assert channels["R"][1, 1] == pytest.approx(np.delete(RADIANCE[2:4, 2:4, 0].ravel(), 1).mean())
+    codes = np.full((H, W, 3), 90, np.uint8)
+    codes[3, 3, 1] = 255
+    Image.fromarray(codes).save(folder / "in" / "photo.png")
+    channels, summary = run(folder, image="photo.png", params=SMALLER)
+    assert np.argwhere(channels["clipped.G"]).tolist() == [[1, 1]] and summary["clipped_fraction"] == pytest.approx(1 / sum(summary["pixels"].values()))
+
+
+def test_a_mask_of_specks_that_averaging_loses_is_refused(folder):
+    specks = np.zeros((H, W), np.uint8)
+    specks[::4, ::4] = 1
+    Image.fromarray(specks).save(folder / "in" / "mask.png")
+    with pytest.raises(InputError, match="specks"):
+        run(folder, params=masks.Params(frame=100))

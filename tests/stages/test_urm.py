@@ -10,6 +10,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import read_observations
+from factorlib.urm.sample import sample
 from stages import urm
 from tests.align.scenes import ball, mesh_of
 
@@ -30,6 +31,7 @@ def step(folder, poses: dict[str, Pose]):
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
     clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside})
+    write_json(folder / "masks" / "a.json", {"exposure": None})
     placed = {name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()} for name, pose in poses.items()}
     camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
     write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})
@@ -75,3 +77,14 @@ def test_two_balls_hide_each_other_where_they_face(tmp_path, two):
 
 def test_the_same_bytes_again(tmp_path, two):
     assert run(tmp_path / "1", two, merge_degrees=3.0).read_bytes() == run(tmp_path / "2", two, merge_degrees=3.0).read_bytes()
+
+
+def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_path, two, monkeypatch):
+    whole = read_observations(run(tmp_path / "whole", two))
+    monkeypatch.setattr(urm, "sample", lambda seen, most: sample(seen, 600))
+    part = read_observations(run(tmp_path / "part", two))
+    assert len(whole) > 1000 > len(part) == 600
+    assert part.weight.sum() == pytest.approx(whole.weight.sum(), rel=1e-5) == pytest.approx(len(whole), rel=1e-5)
+    place = {(x, y): k for k, (x, y) in enumerate(zip(whole.x.tolist(), whole.y.tolist()))}
+    rows = [place[at] for at in zip(part.x.tolist(), part.y.tolist())]
+    np.testing.assert_array_equal(part.visibility, whole.visibility[rows])

@@ -1,0 +1,108 @@
+"""What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags, and how much light its exposure let in."""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from PIL import Image
+
+EXIF_IFD = 0x8769
+NAMES = {
+    0x829A: "ExposureTime",
+    0x829D: "FNumber",
+    0x8827: "Exif:PhotographicSensitivity",
+    0x920A: "Exif:FocalLength",
+    0xA002: "Exif:PixelXDimension",
+    0xA003: "Exif:PixelYDimension",
+    0xA20E: "Exif:FocalPlaneXResolution",
+    0xA210: "Exif:FocalPlaneResolutionUnit",
+    0xA405: "Exif:FocalLengthIn35mmFilm",
+}
+WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA405)
+DNG_VERSION = 0xC612  # a tag that every DNG has
+ISO_UNSAID = 65535  # what the tag holds for all that does not fit into it
+DAMAGED = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, struct.error)  # what Pillow makes of it
+
+
+def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
+    """t · S / N²: exposure time (s) times ISO sensitivity over the square of the f-number; None where one is not said.
+
+    What a camera writes of the same light is proportional to it.
+
+    >>> exposure_of_exif({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
+    0.25
+    """
+    time, aperture, iso = (_positive(exif.get(name)) for name in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity"))
+    if time is None or aperture is None or iso is None or iso == ISO_UNSAID:
+        return None
+    exposure = time * iso / aperture**2
+    return exposure if 0 < exposure < math.inf else None
+
+
+def exif_of_bytes(data: bytes | None) -> dict[str, float | int]:
+    """Of a block as HEIF keeps it ("Exif", two zeros, a TIFF); what is damaged says nothing."""
+    try:
+        exif = Image.Exif()
+        with _unwarned():
+            exif.load(data or b"")
+        return _named(exif)
+    except DAMAGED:
+        return {}
+
+
+def exif_of_tiff(path: str | Path) -> dict[str, float | int]:
+    """Of a file that begins as a TIFF does, as DNG and most raw files do; nothing of others."""
+    try:
+        with Path(path).open("rb") as stream:
+            return _named(_tags(stream))
+    except DAMAGED:
+        return {}
+
+
+def is_dng(path: str | Path) -> bool:
+    """Whether a file is a TIFF that says it is a DNG."""
+    try:
+        with Path(path).open("rb") as stream:
+            return DNG_VERSION in _tags(stream)
+    except DAMAGED:
+        return False
+
+
+def _tags(stream: BinaryIO) -> Image.Exif:
+    exif = Image.Exif()
+    with _unwarned():
+        exif.load_from_fp(stream)
+    return exif
+
+
+@contextmanager
+def _unwarned() -> Iterator[None]:
+    """Pillow warns of tags that are damaged, in its own source's lines: such tags say nothing here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _named(exif: Image.Exif) -> dict[str, float | int]:
+    with _unwarned():
+        tags = exif.get_ifd(EXIF_IFD)
+    found = {tag: _number(tags[tag]) for tag in NAMES if tag in tags}
+    return {NAMES[tag]: round(value) if tag in WHOLE else value for tag, value in found.items() if value is not None}
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None

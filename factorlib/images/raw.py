@@ -1,0 +1,116 @@
+"""Raw photos (DNG and what cameras write), developed by LibRaw: linear, camera white balance, Rec. 709, no automatic brightness.
+
+Red, green and blue of the result are mixed from those of the sensor, each of which is taken from the pixels around.  Where one
+of these has reached the sensor's white level, all three channels of the result are clipped.
+
+The picture is cut as the file says (DNG's DefaultCrop), as other programs show it.  It is developed at once: about 800 MB for
+48 megapixels.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Shaped
+from scipy.ndimage import maximum_filter
+
+from factorlib.dataset.schema import RAW
+from factorlib.errors import InputError
+from factorlib.images.exif import exif_of_tiff, is_dng
+from factorlib.images.stored import CLIPPED, Stored
+
+ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's of LibRaw's `flip`
+AROUND = 5  # pixels a side from which demosaicing takes a pixel's colour
+WHITE = 2**16 - 1
+CONVERT = "develop it: darktable-cli {0} {1}.tif"
+
+
+def is_raw(path: str | Path) -> bool:
+    """By its suffix, or as a TIFF that says it is a DNG: its first picture is but a preview."""
+    return Path(path).suffix.lower() in RAW or is_dng(path)
+
+
+def open_raw(path: str | Path, key: str | None) -> Stored:
+    """Raises InputError for a file that LibRaw cannot read."""
+    rawpy, sensor = _opened(path, key)
+    sizes, held = sensor.sizes, {}
+    top, left, height, width = _crop(sizes)
+
+    def developed() -> dict[str, np.ndarray]:
+        if not held:
+            with sensor:
+                pixels, saturated = _developed(rawpy, sensor, path, key), _saturated(sensor)
+            inner = slice(top, top + height), slice(left, left + width)
+            held.update(pixels=pixels[inner], saturated=saturated[inner])
+        return held
+
+    return Stored(
+        width=width,
+        height=height,
+        orientation=ORIENTATION.get(sizes.flip, 1),
+        exif={**_of_camera(sensor), **exif_of_tiff(path)},
+        profile="",
+        white=WHITE,
+        encoding="linear",
+        rows=lambda begin, end: developed()["pixels"][begin:end],
+        saturated=lambda begin, end: np.repeat(developed()["saturated"][begin:end, :, None], 3, axis=2),
+    )
+
+
+def _opened(path: str | Path, key: str | None) -> tuple[Any, Any]:
+    try:
+        import rawpy
+    except ImportError as error:
+        raise _refused(f"raw photos are read by rawpy, which cannot be imported ({error})", path, key) from None
+    try:
+        return rawpy, rawpy.imread(str(path))
+    except rawpy.LibRawError as error:
+        raise _refused(f"not readable as a raw photo ({_said(error)})", path, key) from None
+
+
+def _developed(rawpy: Any, sensor: Any, path: str | Path, key: str | None) -> Shaped[np.ndarray, "h w 3"]:
+    """16-bit linear codes, not turned; the sensor's white level is the top code of its least amplified channel."""
+    try:
+        return sensor.postprocess(
+            output_bps=16, gamma=(1, 1), no_auto_bright=True, use_camera_wb=True, output_color=rawpy.ColorSpace.sRGB,
+            adjust_maximum_thr=0.0, user_flip=0,
+        )  # fmt: skip
+    except rawpy.LibRawError as error:
+        raise _refused(f"cannot be developed ({_said(error)})", path, key) from None
+
+
+def _saturated(sensor: Any) -> Bool[np.ndarray, "h w"]:
+    """Where a sensor pixel that a developed one is made of has reached the white level."""
+    levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
+    full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
+    return full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
+
+
+def _crop(sizes: Any) -> tuple[int, int, int, int]:
+    """Top, left, height and width, in developed pixels, of what the file says is the picture; all of it where it does not."""
+    top, left, height, width = sizes.crop_top_margin, sizes.crop_left_margin, sizes.crop_height, sizes.crop_width
+    top, left = top - sizes.top_margin, left - sizes.left_margin
+    inside = min(top, left) >= 0 < min(height, width) and top + height <= sizes.iheight and left + width <= sizes.iwidth
+    return (top, left, height, width) if inside else (0, 0, sizes.iheight, sizes.iwidth)
+
+
+def _of_camera(sensor: Any) -> dict[str, float]:
+    """What LibRaw knows of the exposure, for raw files that are no TIFF."""
+    other = sensor.other
+    return {
+        "ExposureTime": other.shutter_speed,
+        "FNumber": other.aperture,
+        "Exif:PhotographicSensitivity": other.iso_speed,
+        "Exif:FocalLength": other.focal_length,
+    }
+
+
+def _said(error: Exception) -> str:
+    text = error.args[0] if error.args else error
+    return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+
+
+def _refused(found: str, path: str | Path, key: str | None) -> InputError:
+    return InputError(found, file=path, key=key, cure=CONVERT.format(Path(path).name, Path(path).stem))
