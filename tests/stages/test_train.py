@@ -6,9 +6,13 @@ import pyarrow.parquet as pq
 import pytest
 from safetensors import safe_open
 
+from factorlib.__main__ import project
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.report.training import CURVES
+from factorlib.runner.project import LIBRARY
+from factorlib.runner.shipped import shipped_folder
+from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
 from stages import train
 
@@ -89,3 +93,9 @@ def test_a_killed_training_goes_on_to_the_same_bytes(trained, tmp_path):
     assert len(points) - before < 40, "it started again"
     for path in trained[0].iterdir():
         assert path.read_bytes() == (tmp_path / "out" / path.name).read_bytes(), path.name
+
+
+def test_the_shipped_weights_are_taken_by_the_stage():
+    """Where this fails, sources of the training changed: `make train DATASET=eames FORCE=1`, then `python -m factorlib ship train --dataset eames`."""
+    seen = survey(project(), "eames", ["train"], [])
+    assert shipped_folder([LIBRARY], seen.spec.pipeline.stages["train"].shipped, seen.planned()[0].record) == SHIPPED
