@@ -6,8 +6,8 @@ by more than `LEAST_GAIN` of itself nor that of all observations by more than `M
 reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out highlights
 better than the right one, and a dark glossy material would lose all it shows.
 
-Both sides of a comparison are judged where their descents explain held-out observations best: with these out of its sight, a lobe may
-grow in the part of the light that they alone mirror, and what is lost there says nothing about a specular part.
+With held-out observations out of its sight, a lobe may grow in the part of the light that they alone mirror.  Their loss then rises
+by far more than `MOST_HARM`, and says nothing about a specular part: such iterations are not taken.
 
 What is brought to rest for a trial are the `LIGHTS` lights that show most of the material, so that a trial costs the same
 however large the set.
@@ -64,17 +64,16 @@ def matte_where_it_may_be(
     everywhere = np.arange(len(blocks))
 
     def rested(of: Int[np.ndarray, "k"], materials: Materials, matte: Bool[np.ndarray, "m"], most: float = np.inf) -> Solution:
-        """The lights `of` and the materials, at that point of the descent which explains held-out observations best.
+        """The lights `of` and the materials, some iterations later, or as they are where those did harm to what is held out.
 
         Not all the way where a glance at the held-out loss says that it ends above `most`.
         """
         own, held = [blocks[k] for k in of], specular_unknowns(matte)
-        points = [evaluated(own, materials, [start.lights[k] for k in of], operator, loss, map_)]
-        for iterations in (GLANCE, ITERATIONS):
-            points.append(descend(own, points[-1], operator, loss, Descent(iterations), map_, held=held))
-            if np.isfinite(most) and mean_loss(own, points[-1]) > most:
-                break
-        return min(points, key=lambda point: mean_loss(own, point))
+        before = evaluated(own, materials, [start.lights[k] for k in of], operator, loss, map_)
+        after = descend(own, before, operator, loss, Descent(GLANCE), map_, held=held)
+        if not (np.isfinite(most) and mean_loss(own, after) > most):
+            after = descend(own, after, operator, loss, Descent(ITERATIONS), map_, held=held)
+        return after if mean_loss(own, after) <= (1 + MOST_HARM) * mean_loss(own, before) else before
 
     def mean_loss(own: Sequence[Block], point: Solution) -> float:
         return float(np.concatenate(losses(own, point)).mean())

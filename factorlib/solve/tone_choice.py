@@ -53,7 +53,8 @@ def toned_where_it_pays(
     if promised_gain(blocks, start, operator, loss, map_) < PROMISED:
         return start, [Tone(bool(has)) for has in had]
     without, found = (rested(blocks, start, lights, operator, loss, map_) for lights in (start.lights, loosened(start.lights, ~had)))
-    with_, without_ = (_means(losses(blocks, s)) for s in (found, without))
+    with_, without_, before = (_means(losses(blocks, s)) for s in (found, without, start))
+    without_ = np.minimum(without_, before)  # a lobe that grew in a gap of what is fitted says nothing for curves
     kept = (with_ < (1 - LEAST_GAIN) * without_) & ~had
     if kept.any():
         settled = rested(blocks, found, found.lights, operator, loss, map_)

@@ -6,6 +6,7 @@ import numpy as np
 from factorlib.reflection import reflection_operator
 from factorlib.solve import choice
 from factorlib.solve.bundle import solve
+from factorlib.solve.descent import descend
 from factorlib.solve.options import Bundle
 from factorlib.solve.problem import mirror_cells
 from factorlib.solve.unknowns import Materials
@@ -66,3 +67,15 @@ def test_what_shines_more_than_it_scatters_is_not_tried():
     glossy = Materials(MIXED.diffuse / np.array([[1], [1], [5]]), MIXED.specular, MIXED.roughness)
     joint = chosen(glossy, [0, 1, 2])
     assert not joint.matte[2] and joint.specular[2].held_out_loss_without is None
+
+
+def test_a_descent_that_spoils_what_is_held_out_decides_nothing(monkeypatch):
+    """Out of sight of the fit, a lobe may grow where held-out observations alone mirror it: here it does where all have specular parts."""
+
+    def spoiled(blocks, start, *arguments, held, **options):
+        at = descend(blocks, start, *arguments, held=held, **options)
+        factor = 1 if held.any() else 3
+        return msgspec.structs.replace(at, lights=[msgspec.structs.replace(light, weight=factor * light.weight) for light in at.lights])
+
+    monkeypatch.setattr(choice, "descend", spoiled)
+    assert chosen(MIXED, [2]).specular[2].kept
