@@ -25,6 +25,7 @@ from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
+from factorlib.wholefile import append_text, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say
 
@@ -199,7 +200,7 @@ class Run:
         """What the steps above cost and said when their present results were made, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.survey.store.log(p.key) for p in self.planned if p.step.stage in above and p.key]
-        path.write_text("".join(log.read_text(encoding="utf-8") for log in logs if log.exists()), encoding="utf-8")
+        write_text(path, "".join(log.read_text(encoding="utf-8") for log in logs if log.exists()))
         return path
 
     # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -269,14 +270,13 @@ class Run:
         if outcome.traceback:
             path = self.survey.home.folder / "errors" / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(outcome.traceback, encoding="utf-8")
+            write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
 
     def _log(self, lines: str) -> None:
         self.survey.home.folder.mkdir(parents=True, exist_ok=True)
-        with open(self.survey.home.log, "a", encoding="utf-8") as stream:
-            stream.write(lines)
+        append_text(self.survey.home.log, lines)
 
 
 class Refused(Exception):

@@ -27,7 +27,7 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.runner.integrity import Inspector, hashes_of_tree
-from factorlib.wholefile import replace_file, sync
+from factorlib.wholefile import replace_file, sync, sync_tree
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -70,10 +70,8 @@ class Store:
         files = hashes_of_tree(folder)
         entry = Entry(output_of(files), record, files)
         for name in files:
-            sync(folder / name)
             (folder / name).chmod(0o444)
-        for path in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
-            sync(path)
+        sync_tree(folder)
         return entry, self.put(folder, self.tree(entry.output), lambda: _holds(self.tree(entry.output), files))
 
     def keep(self, key: str, entry: Entry) -> None:
