@@ -25,9 +25,10 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
     """
     for found in _behind(error):
         code = _code(found)
-        if code in FULL or (code in CLOSED and found is error):
-            name = getattr(found, "filename", None)
-            return _full(code, _folder(name, folder)) if code in FULL else _closed(code, name, folder)
+        if code in FULL:
+            return _full(code, _folders(found, folder)[0])
+        if code in CLOSED and found is error:
+            return _closed(code, error, folder)
     return None
 
 
@@ -54,16 +55,19 @@ def _full(code: int, folder: Path) -> InputError:
     return InputError(f"{FULL[code]}: {free / 1e6:.1f} MB are free", file=folder, cure=cure)
 
 
-def _closed(code: int, name: str | None, folder: Path) -> InputError:
-    if name is not None and os.path.isfile(name) and not os.access(name, os.R_OK):
+def _closed(code: int, error: BaseException, folder: Path) -> InputError:
+    name = getattr(error, "filename", None)
+    if isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
         return InputError(f"{CLOSED[code]}: it may not be read", file=name, cure="give yourself the right to read it")
-    folder = _folder(name, folder)
+    folders = _folders(error, folder)
+    folder = next((found for found in folders if not os.access(found, os.W_OK)), folders[0])
     free = shutil.disk_usage(folder).free
     cure = "give yourself the right to write there, or work in a copy elsewhere"
     return InputError(f"{CLOSED[code]}: nothing can be written there ({free / 1e6:.1f} MB are free)", file=folder, cure=cure)
 
 
-def _folder(name: str | None, folder: Path) -> Path:
-    """The nearest folder that is there: of the file that the error names, else the given one."""
-    path = Path(os.path.abspath(os.fsdecode(name))).parent if isinstance(name, str | bytes) else folder.absolute()
-    return next(p for p in (path, *path.parents) if p.is_dir())
+def _folders(error: BaseException, folder: Path) -> list[Path]:
+    """Those of the files that the error names (of a rename there are two), the given one where it names none; as far as they exist."""
+    names = [name for name in (getattr(error, "filename", None), getattr(error, "filename2", None)) if isinstance(name, str | bytes)]
+    paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names] or [folder.absolute()]
+    return [next(p for p in (path, *path.parents) if p.is_dir()) for path in paths]

@@ -133,7 +133,8 @@ class Outputs(Mapping):
     def still(self, keys: Iterable[str]) -> bool:
         """Whether those keys have the outputs they had, looked up again."""
         before = {key: self._known.pop(key, None) for key in keys}
-        return all([self.get(key) == output for key, output in before.items()])  # noqa: C419  each is to be looked up
+        now = {key: self.get(key) for key in before}
+        return None not in now.values() and now == before
 
     def __getitem__(self, key):
         found = self.get(key)

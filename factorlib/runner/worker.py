@@ -96,6 +96,7 @@ def run_step(task: Task) -> Outcome:
             _keep(task, entry)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
+            shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
             return _failed(error, task.temporary.parent, meter.read(task.code.threads)["seconds"])
 
 
