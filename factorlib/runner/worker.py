@@ -188,13 +188,10 @@ def _check_code_still(task: Task, hashes: FileHashes) -> None:
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     if changes := closure.changes(task.record):
-        files = [closure.files[name] for name in changes if name in closure.files]
-        found = "; ".join(
-            difference(
-                {k: task.record[k] for k in changes if k in task.record}, {k: v for k, v in closure.record().items() if k in changes}
-            )
-        )
-        raise InputError(f"the code changed while the run went on ({found})", file=", ".join(map(str, files)) or None, cure="run again")
+        before, now = ({name: record[name] for name in changes if name in record} for record in (task.record, closure.record()))
+        files = [str(closure.files[name]) for name in changes if name in closure.files]
+        found = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
+        raise InputError(found, file=", ".join(files) or None, cure="run again")
 
 
 def _check_made(task: Task) -> None:

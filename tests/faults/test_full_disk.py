@@ -110,10 +110,9 @@ def test_a_library_that_says_it_in_words_of_its_own(made_once, tmp_path, capsys)
     assert "the disk is full" in said and said_well(said, "root")
 
 
-@pytest.mark.parametrize("verb", ["all", "table"])
-def test_a_disk_that_is_full_before_the_run_begins(project, disk, monkeypatch, verb):
+def test_a_disk_that_is_full_before_the_run_begins(project, disk, monkeypatch):
     disk.fill(but=0)
-    said = run_as_command(project, monkeypatch, verb, "--dataset", "set")
+    said = run_as_command(project, monkeypatch, "all", "--dataset", "set")
     assert said.startswith("error: ") and "the disk is full" in said and said_well(said)
 
 
@@ -147,7 +146,15 @@ def test_a_read_only_build_shows_everything_and_runs_nothing(project, disk, monk
     assert make(project) == 0
 
 
-@pytest.mark.parametrize("closed", ["store/keys", "store/trees", "store/tmp", "store/logs", "set", ".", "store/cache"])
+@pytest.mark.parametrize(
+    "closed",
+    [
+        "store/trees",
+        "set",
+        "store/cache",
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("store/keys", "store/tmp", "store/logs", ".")),
+    ],
+)
 def test_a_build_that_the_user_may_not_write(made_once, tmp_path, closed):
     project = toy.copy(made_once, tmp_path / "root")
     write(project.root / "data" / "set" / "a.txt", "another")
