@@ -38,7 +38,7 @@ def write_text(path: str | Path, text: str, encoding: str = "utf-8") -> None:
 def replace_file(path: str | Path, data: bytes) -> None:
     """By one rename, on disk when it returns: whoever reads `path` finds the old or the new content, after a power cut too."""
     path = Path(path)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(draft):
         with open(draft, "wb") as stream:
             stream.write(data)
