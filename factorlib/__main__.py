@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
@@ -112,6 +113,11 @@ def main() -> None:
         app(prog_name="python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        known = disk_error(error, project().build)
+        if known is None:
+            raise
+        sys.exit(f"error: {known}")
 
 
 if __name__ == "__main__":

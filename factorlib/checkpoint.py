@@ -6,13 +6,15 @@ unknowns, the optimiser's memory, the random generator's state and how far it is
 
 from __future__ import annotations
 
+import io
 import logging
-import os
 import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from factorlib.wholefile import replace_file
 
 log = logging.getLogger("factorlib")
 
@@ -37,6 +39,6 @@ class Checkpoint:
         """Keep `state`: tensors, numbers, strings, lists and dictionaries of them."""
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            draft = self.path.with_name(f"{self.path.name}.{os.getpid()}.draft")
-            torch.save(state, draft)
-            os.replace(draft, self.path)
+            stream = io.BytesIO()
+            torch.save(state, stream)
+            replace_file(self.path, stream.getvalue())

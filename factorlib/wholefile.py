@@ -38,7 +38,7 @@ def write_text(path: str | Path, text: str, encoding: str = "utf-8") -> None:
 def replace_file(path: str | Path, data: bytes) -> None:
     """By one rename, on disk when it returns: whoever reads `path` finds the old or the new content, after a power cut too."""
     path = Path(path)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(draft):
         with open(draft, "wb") as stream:
             stream.write(data)
@@ -60,6 +60,13 @@ def append_text(path: Path, text: str) -> None:
             raise
 
 
+def sync_tree(folder: Path) -> None:
+    """Every file and folder below a folder, and itself."""
+    for path in folder.rglob("*"):
+        sync(path)
+    sync(folder)
+
+
 def sync(path: Path) -> None:
     """A file's content, or a folder's entries, on disk."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -73,11 +80,16 @@ def sync(path: Path) -> None:
 
 
 def bytes_of(write: Callable[[str], None]) -> bytes:
-    """What `write(path)` writes, to a file in memory: for libraries that say nothing where a disk is full.
+    """What `write(path)` writes, to a file in memory: for libraries that say nothing where there is no more room.
 
-    Where the system has no files in memory, a temporary one stands in.
+    Where the system has no files in memory, a temporary one stands in.  There, too, room can end (`ulimit -f`): then
+    there is none for one byte more.
     """
-    with open(os.memfd_create("factorlib"), "rb") if hasattr(os, "memfd_create") else tempfile.TemporaryFile() as stream:
-        write(f"/dev/fd/{stream.fileno()}")
+    with open(os.memfd_create("factorlib"), "r+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile() as stream:
+        try:
+            write(f"/dev/fd/{stream.fileno()}")
+        finally:
+            size = os.fstat(stream.fileno()).st_size
+            os.pwrite(stream.fileno(), b"\0", size)
         stream.seek(0)
-        return stream.read()
+        return stream.read(size)

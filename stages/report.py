@@ -18,6 +18,7 @@ from factorlib.report.page import page
 from factorlib.report.photos import photo_row, strip
 from factorlib.report.tags import material_tags
 from factorlib.stage import Inputs, Progress
+from factorlib.wholefile import write_bytes, write_text
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -32,7 +33,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for done, name in enumerate(run.set.photos):
         progress(done, len(run.set.photos) + 1, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))
-        (out / "figures" / "photos" / f"{name}.png").write_bytes(strip(rows[-1]))
+        write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
     progress(len(rows), len(rows) + 1, "page")
-    (out / "figures" / "overview.png").write_bytes(overview(run, rows))
-    (out / "index.html").write_text(page(run, rows, tags), encoding="utf-8")
+    write_bytes(out / "figures" / "overview.png", overview(run, rows))
+    write_text(out / "index.html", page(run, rows, tags))

@@ -43,6 +43,7 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm.exposure import at_one_exposure, relative_exposures
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate, read_observations
+from factorlib.wholefile import writing
 
 EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
 log = logging.getLogger("factorlib.solve")
@@ -326,4 +327,5 @@ def _one(materials: Materials, m: int) -> Materials:
 
 def _write_history(path: Path, history: list[Event]) -> None:
     columns = {name: [getattr(event, name) for event in history] for name in Event.__struct_fields__}
-    pq.write_table(pa.table(columns), path, compression="zstd")
+    with writing(path):
+        pq.write_table(pa.table(columns), path, compression="zstd")

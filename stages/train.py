@@ -18,6 +18,7 @@ from factorlib.reflection.network import write_layers
 from factorlib.reflection.samples import diffuse_samples, specular_samples
 from factorlib.reflection.training import Schedule, Step, diffuse_problem, specular_problem, train
 from factorlib.stage import Inputs, Progress
+from factorlib.wholefile import writing
 
 Meta = msgspec.Meta
 HELD_OUT_TOLERANCE = 1e-5  # of the reference; a tenth of the median error that is measured with it, or less
@@ -105,4 +106,5 @@ def _report(progress: Progress, part: str, steps: int):
 
 def _write_curves(path: Path, curves: dict[str, list[Step]]) -> None:
     rows = [{"part": part, **msgspec.structs.asdict(point)} for part, curve in curves.items() for point in curve]
-    pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
+    with writing(path):
+        pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")

@@ -23,6 +23,7 @@ from trimesh.visual.texture import TextureVisuals
 from factorlib.export.materials import Material
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
+from factorlib.wholefile import write_bytes
 
 DIELECTRIC = 0.04
 EXTENSION = "KHR_materials_specular"
@@ -37,7 +38,7 @@ def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Map
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
     data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=lambda tree: _set_materials(tree, materials))
-    Path(path).write_bytes(data)
+    write_bytes(path, data)
 
 
 def _set_materials(tree: dict[str, Any], materials: Mapping[str, Material]) -> None:

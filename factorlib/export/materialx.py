@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from factorlib.export.materials import Material
+from factorlib.wholefile import write_text
 
 
 def write_materialx(path: str | Path, materials: Mapping[str, Material]) -> None:
@@ -21,7 +22,7 @@ def write_materialx(path: str | Path, materials: Mapping[str, Material]) -> None
     for name, material in materials.items():
         _add_material(document, f"m_{name.replace('-', '_')}", name, material)
     ET.indent(document, " ")
-    Path(path).write_text('<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n", encoding="utf-8")
+    write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n")
 
 
 def _add_material(document: ET.Element, prefix: str, name: str, material: Material) -> None:

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.materials import Material
+from factorlib.wholefile import write_text
 
 VERSION = "3.0.0"
 DEFAULTS = {"spp": 256, "max_depth": 2}
@@ -73,7 +74,7 @@ def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Material
 
 
 def write_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: dict[str, Material], light: Environment) -> None:
-    Path(path).write_text(scene_xml(view, shapes, materials, light), encoding="utf-8")
+    write_text(path, scene_xml(view, shapes, materials, light))
 
 
 def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:

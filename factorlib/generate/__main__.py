@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from factorlib.disk import disk_error
 from factorlib.errors import InputError
+from factorlib.wholefile import sync_tree
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 Seed = Annotated[int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")]
@@ -51,8 +53,12 @@ def _write(set_, out: Path, seed: int, lights: Path | None) -> None:
                 set_.Parameters(),
                 lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
             )
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
+        sync_tree(fresh)
+    except (InputError, OSError) as error:
+        known = error if isinstance(error, InputError) else disk_error(error, fresh)
+        if known is None:
+            raise
+        typer.echo(f"error: {known}", err=True)
         raise typer.Exit(2) from None
     rmtree(out, ignore_errors=True)
     fresh.rename(out)

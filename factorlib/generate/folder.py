@@ -17,6 +17,8 @@ from factorlib.dataset.schema import LEFT_OUT
 from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.focal import FILM_DIAGONAL
 from factorlib.images.transfer import srgb_encode
+from factorlib.images.write import write_image
+from factorlib.wholefile import write_text
 
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
 
@@ -51,10 +53,7 @@ def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> No
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if codes.dtype == np.uint16 else oiio.UINT8)
     for name, value in attributes.items():
         spec.attribute(name, value)
-    output = oiio.ImageOutput.create(str(path))
-    if not (output.open(str(path), spec) and output.write_image(np.ascontiguousarray(codes))):
-        raise OSError(f"{path}: cannot be written: {output.geterror()}")
-    output.close()
+    write_image(path, spec, codes)
 
 
 def write_light(path: Path, lat_long: Float[np.ndarray, "h w 3"]) -> None:
@@ -73,7 +72,7 @@ def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> No
         lines += [f"g {name}", *(f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices)]
         lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + first]
         first += len(vertices)
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def labels_of(meshes, camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
@@ -106,7 +105,7 @@ def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
 
 def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
     """Nested mappings as YAML; lists of mappings as blocks, other lists on one line."""
-    path.write_text(f"# {comment}\n{yaml_text(value)}", encoding="utf-8")
+    write_text(path, f"# {comment}\n{yaml_text(value)}")
 
 
 def yaml_text(value: dict[str, Any], indent: int = 0) -> str:

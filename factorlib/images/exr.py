@@ -1,7 +1,6 @@
 """OpenEXR files of named float32 channels, through OpenImageIO; the same channels are the same bytes.
 
-OpenImageIO stamps the date into every file and leaves it incomplete until the output object is deleted:
-here the date is fixed, and a file is whole when `write_exr` returns.
+OpenImageIO stamps the date into every file: here the date is fixed.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import OpenImageIO as oiio
 from jaxtyping import Float
 
 from factorlib.errors import InputError
+from factorlib.images.write import write_image
 
 FIXED_DATE = "2000:01:01 00:00:00"
 LAT_LONG = {"textureformat": "LatLong Environment"}  # OpenImageIO's word for the OpenEXR attribute `envmap`
@@ -23,20 +23,12 @@ Channels = Mapping[str, Float[np.ndarray, "h w"]]
 def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str | int | float] | None = None) -> None:
     """Write `channels` (name -> [h, w], any real type) as float32, ZIP-compressed, in the order given."""
     names = list(channels)
-    pixels = np.ascontiguousarray(np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1))
+    pixels = np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), oiio.FLOAT)
     spec.channelnames = names
     for name, value in {"compression": "zip", "DateTime": FIXED_DATE, "Software": "factorlib", **(attributes or {})}.items():
         spec.attribute(name, value)
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec):
-        raise OSError(f"{path}: cannot be written: {oiio.geterror() if output is None else output.geterror()}")
-    written = output.write_image(pixels)
-    error = output.geterror()
-    output.close()
-    del output
-    if not written:
-        raise OSError(f"{path}: cannot be written: {error}")
+    write_image(path, spec, pixels)
 
 
 def write_rgb_exr(path: str | Path, radiance: Float[np.ndarray, "h w 3"], attributes: Mapping | None = None) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from factorlib.errors import InputError
 from factorlib.images.transfer import srgb_encode
+from factorlib.images.write import write_image
 
 PERCENTILE = 99.0
 
@@ -45,18 +46,10 @@ def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = No
 
 def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
     """Write an 8-bit PNG of 1, 3 or 4 channels (alpha not multiplied in), without date or program name."""
-    pixels = np.ascontiguousarray(np.asarray(pixels, dtype=np.uint8))
+    pixels = np.asarray(pixels, dtype=np.uint8)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec):
-        raise OSError(f"{path}: cannot be written: {oiio.geterror() if output is None else output.geterror()}")
-    written = output.write_image(pixels)
-    error = output.geterror()
-    output.close()
-    del output  # only then is the file whole
-    if not written:
-        raise OSError(f"{path}: cannot be written: {error}")
+    write_image(path, spec, pixels)
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

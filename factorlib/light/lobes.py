@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from factorlib.errors import InputError
+from factorlib.wholefile import writing
 
 FRAME = (
     "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
@@ -90,7 +91,8 @@ def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
     columns = {"illumination": pa.array(illumination, pa.string())} | {c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)}
     about = {"frame": FRAME, "lobe": "weight * exp(sharpness * (dot(direction, axis) - 1))", "illuminations": names}
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
-    pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
+    with writing(path):
+        pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
 
 
 def read_lobes(path: str | Path) -> dict[str, Lobes]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from factorlib.meshes.mesh import Mesh
+from factorlib.wholefile import write_bytes
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:
@@ -19,7 +20,7 @@ def write_ply(path: str | Path, mesh: Mesh) -> None:
     vertices = np.concatenate([mesh.vertices, mesh.normals], axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3), ("label", "<i4")])
     faces["count"], faces["index"], faces["label"] = 3, mesh.faces, mesh.face_label
-    Path(path).write_bytes(header.encode("ascii") + vertices.tobytes() + faces.tobytes())
+    write_bytes(path, header.encode("ascii") + vertices.tobytes() + faces.tobytes())
 
 
 def submesh(mesh: Mesh, label: int) -> Mesh:

@@ -32,6 +32,7 @@ from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.network import LARGEST, Layers, diffuse_columns, fading, specular_columns
 from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value
+from factorlib.wholefile import sync
 
 log = logging.getLogger("factorlib.reflection")
 ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
@@ -157,6 +158,7 @@ def compiled(part: str, features: int, width: int, depth: int):
             subprocess.run(
                 [*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"], check=True, capture_output=True, text=True
             )
+            sync(made)
             os.replace(made, library)
     function = ctypes.CDLL(str(library)).response
     function.restype = None

@@ -16,7 +16,7 @@ import msgspec
 import torch
 from jaxtyping import Float
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import silu
 
@@ -26,6 +26,7 @@ from factorlib.reflection import diffuse as diffuse_form
 from factorlib.reflection.filtering import Filtered, filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST, Operator, Response, columns
+from factorlib.wholefile import write_bytes
 
 SHIPPED = Path(__file__).parent / "weights"
 FEATURES = {"diffuse": 8, "specular": 24}
@@ -164,8 +165,7 @@ def write_layers(path: Path, layers: Layers, dtype: torch.dtype = torch.float32,
     sizes = [layers.weights[0].shape[1], *(len(b) for b in layers.biases)]
     about = {"architecture": "standardise, linear, SiLU, …, linear", "sizes": sizes, **metadata}
     one_key = {"factorlib": json_text(about)}  # safetensors writes several in an order that changes from run to run
-    save_file({name: t.detach().to(dtype).contiguous() for name, t in tensors.items()}, path, metadata=one_key)
-    path.chmod(0o644)
+    write_bytes(path, save({name: t.detach().to(dtype).contiguous() for name, t in tensors.items()}, metadata=one_key))
 
 
 def read_layers(path: Path, features: int) -> Layers:

@@ -75,7 +75,11 @@ class Closure(msgspec.Struct, frozen=True):
 
 def _program(name: str, default: str) -> str | None:
     """The words that name a program, without the folder it lies in; None where there is no such program."""
-    words = shlex.split(os.environ.get(name, default)) or [""]
+    command = os.environ.get(name, default)
+    try:
+        words = shlex.split(command) or [""]
+    except ValueError as error:
+        raise InputError(f"{command!r} is no command ({error})", key=name, cure=f"name a program, as in {name}={default}") from None
     return " ".join([Path(words[0]).name, *words[1:]]) if shutil.which(words[0]) else None
 
 

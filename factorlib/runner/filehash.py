@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+
+from factorlib.wholefile import replace_file
 
 if TYPE_CHECKING:
     from factorlib.runner.closure import Source
@@ -28,6 +31,13 @@ def signature(path: Path) -> Signature:
 def hash_of_file(path: Path) -> str:
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
+
+
+def write_cache(path: Path, tables: Any) -> None:
+    """In whole or not at all; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, msgspec.json.encode(tables))
 
 
 class FileHashes:
@@ -66,8 +76,5 @@ class FileHashes:
     def save(self) -> None:
         if not self._changed or self.cache is None:
             return
-        self.cache.parent.mkdir(parents=True, exist_ok=True)
-        draft = self.cache.with_name(f"{self.cache.name}.{os.getpid()}")
-        draft.write_bytes(msgspec.json.encode({"format": FORMAT, "contents": self._contents, "sources": self._sources}))
-        os.replace(draft, self.cache)
+        write_cache(self.cache, {"format": FORMAT, "contents": self._contents, "sources": self._sources})
         self._changed = False

@@ -15,9 +15,8 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.filehash import hash_of_file, write_cache
 from factorlib.runner.leftover import left_over
-from factorlib.wholefile import replace_file
 
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
 NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
@@ -121,16 +120,12 @@ class Inspector:
             return {}
 
     def save(self) -> None:
-        """Write the cache, where there is anything new to write; without it the next look takes longer, and no more."""
+        """Write the cache, where there is anything new to write."""
         if not self._changed:
             return
         there = {name: stamps for name, stamps in self.known.items() if (self.trees / name).is_dir() or (self.views / name).is_dir()}
-        try:
-            self.cache.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(self.cache, msgspec.json.encode(there))
-            self._changed = False
-        except OSError:
-            pass
+        write_cache(self.cache, there)
+        self._changed = False
 
 
 def in_short(damage: list[str]) -> str:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import msgspec
 
+from factorlib.runner.filehash import write_cache
+
 
 class Packages:
     """Import name -> "distribution version", looked up once per state of site-packages."""
@@ -45,8 +47,5 @@ class Packages:
 
     def save(self) -> None:
         if self._changed and self.cache is not None:
-            self.cache.parent.mkdir(parents=True, exist_ok=True)
-            draft = self.cache.with_name(f"{self.cache.name}.{os.getpid()}")
-            draft.write_bytes(msgspec.json.encode({"state": self.state, "versions": self._known}))
-            os.replace(draft, self.cache)
+            write_cache(self.cache, {"state": self.state, "versions": self._known})
             self._changed = False

@@ -11,7 +11,8 @@ from typing import Any, Protocol
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import write_json
+from factorlib.jsonfile import json_text
+from factorlib.wholefile import replace_file
 
 RESERVED = ("studies", "bench", "store")  # folders of build/ that are no datasets
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
@@ -111,9 +112,7 @@ class Home(msgspec.Struct, frozen=True):
             return {}
 
     def write_keys(self, keys: dict[str, str]) -> None:
-        draft = self.keys_file.with_name(f".current.{os.getpid()}")
-        write_json(draft, keys)
-        os.replace(draft, self.keys_file)
+        replace_file(self.keys_file, json_text(keys).encode())
 
 
 def home_of(project: Project, dataset: Path) -> Home:
@@ -145,4 +144,4 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
     home.folder.mkdir(parents=True, exist_ok=True)
     words = str(dataset.relative_to(project.root)) if dataset.is_relative_to(project.root) else str(dataset)
     if owner_of(project, home) != project.root / words:
-        (home.folder / "dataset.txt").write_text(words + "\n", encoding="utf-8")
+        replace_file(home.folder / "dataset.txt", f"{words}\n".encode())

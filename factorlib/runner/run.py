@@ -25,6 +25,7 @@ from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
+from factorlib.wholefile import append_text, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say
 
@@ -77,7 +78,8 @@ class Run:
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()
-        self.made: set[str] = set()
+        self.keys: dict[Step, str | None] = {}
+        self.made: set[str] = set()  # keys
         self.tally = Tally()
         self.planned: list[Planned] = []
 
@@ -113,6 +115,7 @@ class Run:
 
     def _plan(self) -> None:
         self.planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        self.keys = {planned.step: planned.key for planned in self.planned}
         self.display.plan(self.planned)
 
     def _start_ready(self) -> None:
@@ -128,10 +131,6 @@ class Run:
         if planned.key in self.made:
             self._fail(planned.step, Outcome(error=f"{planned.reasons[0]}, and was made just now: is the disk failing?"))
             return
-        if not self.survey.outputs.still(self._keys_above(planned.step)):  # a run takes hours, and they are used only now
-            self.waiting.add(planned.step)
-            self._plan()
-            return
         lock = FileLock(self.survey.store.locks / f"{planned.key}.lock")
         try:
             lock.acquire(timeout=0)
@@ -145,14 +144,14 @@ class Run:
             self.waiting.add(planned.step)
             self._plan()
             return
+        if not self.survey.outputs.still([self.keys[above] for above in self.survey.spec.above(planned.step)]):
+            lock.release()  # a run takes hours, and what is used only now is damaged by now
+            self.waiting.add(planned.step)
+            return
         work = Running(planned, self._task(planned), lock)
         self.running[planned.step] = work
         self.display.start(planned.step)
         work.future = self.pools.submit(work.task.code.threads, run_step, work.task)
-
-    def _keys_above(self, step: Step) -> list[str]:
-        above = set(self.survey.spec.above(step))
-        return [found.key for found in self.planned if found.step in above]
 
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
@@ -199,7 +198,7 @@ class Run:
         """What the steps above cost and said when their present results were made, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.survey.store.log(p.key) for p in self.planned if p.step.stage in above and p.key]
-        path.write_text("".join(log.read_text(encoding="utf-8") for log in logs if log.exists()), encoding="utf-8")
+        write_text(path, "".join(log.read_text(encoding="utf-8") for log in logs if log.exists()))
         return path
 
     # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -264,19 +263,18 @@ class Run:
 
     def _fail(self, step: Step, outcome: Outcome) -> None:
         self.tally.failed[step] = outcome
-        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
         where = None
         if outcome.traceback:
             path = self.survey.home.folder / "errors" / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(outcome.traceback, encoding="utf-8")
+            write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
+        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
 
     def _log(self, lines: str) -> None:
         self.survey.home.folder.mkdir(parents=True, exist_ok=True)
-        with open(self.survey.home.log, "a", encoding="utf-8") as stream:
-            stream.write(lines)
+        append_text(self.survey.home.log, lines)
 
 
 class Refused(Exception):

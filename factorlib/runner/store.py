@@ -27,7 +27,7 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.runner.integrity import Inspector, hashes_of_tree
-from factorlib.wholefile import replace_file, sync
+from factorlib.wholefile import replace_file, sync, sync_tree
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -70,10 +70,8 @@ class Store:
         files = hashes_of_tree(folder)
         entry = Entry(output_of(files), record, files)
         for name in files:
-            sync(folder / name)
             (folder / name).chmod(0o444)
-        for path in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
-            sync(path)
+        sync_tree(folder)
         return entry, self.put(folder, self.tree(entry.output), lambda: _holds(self.tree(entry.output), files))
 
     def keep(self, key: str, entry: Entry) -> None:
@@ -135,7 +133,8 @@ class Outputs(Mapping):
     def still(self, keys: Iterable[str]) -> bool:
         """Whether those keys have the outputs they had, looked up again."""
         before = {key: self._known.pop(key, None) for key in keys}
-        return all([self.get(key) == output for key, output in before.items()])  # noqa: C419  each is to be looked up
+        now = {key: self.get(key) for key in before}
+        return None not in now.values() and now == before
 
     def __getitem__(self, key):
         found = self.get(key)

@@ -6,6 +6,7 @@ than `submit`.  While it runs a step says how far it is, and what it warns of, i
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import logging
@@ -21,6 +22,7 @@ from typing import Any
 
 import msgspec
 
+from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
@@ -93,11 +95,9 @@ def run_step(task: Task) -> Outcome:
             _write_log(task, events, cost)
             _keep(task, entry)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
-        except InputError as error:
-            return Outcome(error=str(error), seconds=meter.read(task.code.threads)["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
-            text = f"{type(error).__name__}: {error}"
-            return Outcome(error=text, traceback=traceback.format_exc(), seconds=meter.read(task.code.threads)["seconds"])
+            shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
+            return _failed(error, task.temporary.parent, meter.read(task.code.threads)["seconds"])
 
 
 def check_params(code: Code) -> Outcome:
@@ -105,10 +105,15 @@ def check_params(code: Code) -> Outcome:
     try:
         params_of(load_stage(code), code)
         return Outcome()
-    except InputError as error:
-        return Outcome(error=str(error))
     except BaseException as error:
-        return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
+        return _failed(error, code.root)
+
+
+def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
+    """What the user can mend says how; the rest is a defect, and comes with its traceback."""
+    if known := error if isinstance(error, InputError) else disk_error(error, folder):
+        return Outcome(error=str(known), seconds=seconds)
+    return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc(), seconds=seconds)
 
 
 def load_stage(code: Code) -> ModuleType:
@@ -183,13 +188,10 @@ def _check_code_still(task: Task, hashes: FileHashes) -> None:
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     if changes := closure.changes(task.record):
-        files = [closure.files[name] for name in changes if name in closure.files]
-        found = "; ".join(
-            difference(
-                {k: task.record[k] for k in changes if k in task.record}, {k: v for k, v in closure.record().items() if k in changes}
-            )
-        )
-        raise InputError(f"the code changed while the run went on ({found})", file=", ".join(map(str, files)) or None, cure="run again")
+        before, now = ({name: record[name] for name in changes if name in record} for record in (task.record, closure.record()))
+        files = [str(closure.files[name]) for name in changes if name in closure.files]
+        found = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
+        raise InputError(found, file=", ".join(files) or None, cure="run again")
 
 
 def _check_made(task: Task) -> None:
@@ -231,7 +233,8 @@ class Events(logging.Handler):
     def __exit__(self, *exception) -> None:
         for name in ("factorlib", "py.warnings"):
             logging.getLogger(name).removeHandler(self)
-        self._stream.close()
+        with contextlib.suppress(OSError):  # what could not be said, see `_say`
+            self._stream.close()
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         now = time.monotonic()
@@ -246,5 +249,7 @@ class Events(logging.Handler):
             self._say({"warning": text})
 
     def _say(self, event: dict) -> None:
-        self._stream.write(json.dumps(event) + "\n")
-        self._stream.flush()
+        """On a full disk nothing more is said: the step itself fails there, or finds room again."""
+        with contextlib.suppress(OSError):
+            self._stream.write(json.dumps(event) + "\n")
+            self._stream.flush()

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
+from factorlib.wholefile import writing
 
 VECTORS = ("normal", "half", "view", "radiance")
 VISIBILITY = (
@@ -85,7 +86,8 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     if observations.visibility is not None:
         columns["visibility"], about["visibility"] = _bytes(observations.visibility), VISIBILITY
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
-    pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
+    with writing(path):
+        pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
 
 
 def read_observations(path: str | Path) -> Observations:

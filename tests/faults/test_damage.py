@@ -79,8 +79,12 @@ DAMAGES = {
 }
 
 
+OF_A_PHOTO, OF_THE_SET = ("upper", "a.txt", "upper/a"), ("total", "total.txt", "total")
+QUICK = ("other content", "another file", "one too many")  # the rest go other ways to the same place
+
+
+@pytest.mark.parametrize("stage, file, step", [pytest.param(*OF_A_PHOTO, marks=pytest.mark.long), OF_THE_SET])
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("stage, file, step", [("upper", "a.txt", "upper/a"), ("total", "total.txt", "total")])
 def test_a_damaged_result_is_made_again_and_nothing_else_is(project, damage, stage, file, step, capsys):
     before = shown(project)
     DAMAGES[damage](tree_of(project, stage, file))
@@ -91,7 +95,7 @@ def test_a_damaged_result_is_made_again_and_nothing_else_is(project, damage, sta
     assert new_runs(project) == [] and verbs.verify(project, None) == 0
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("damage", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in DAMAGES])
 def test_what_a_user_does_to_a_file_under_the_datasets_name_is_noticed(project, damage):
     before = shown(project)
     DAMAGES[damage]((project.build / "set" / "upper").resolve() / "a.txt")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
@@ -166,9 +167,14 @@ def test_whether_a_program_that_a_module_declares_is_there_is_in_the_key(speakin
     assert set(state(speaking).values()) == {"current"}, "where it lies is no matter"
 
 
-def test_a_declaration_that_is_no_list_of_names_is_refused(project):
-    from factorlib.errors import InputError
+def test_a_command_that_no_shell_could_read_is_refused(speaking, monkeypatch):
+    monkeypatch.setenv("TOY_CC", "sh 'open")
+    with pytest.raises(InputError, match="is no command") as caught:
+        state(speaking)
+    assert caught.value.key == "TOY_CC"
 
+
+def test_a_declaration_that_is_no_list_of_names_is_refused(project):
     write(project.root / "toylib" / "letters.py", SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
     with pytest.raises(InputError, match="ENVIRONMENT") as caught:
         state(project)
