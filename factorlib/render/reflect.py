@@ -18,7 +18,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from factorlib.light.lobes import Lobes
@@ -33,13 +33,18 @@ Report = Callable[[float, float], None]
 
 
 class Shadows(msgspec.Struct, frozen=True):
-    """What n points see of k directions, 0 to 255; directions in the frame of their normals."""
+    """What n points see of k directions, 0 to 255; directions in the frame of their normals.
 
-    visibility: UInt8[np.ndarray, "n k"]
+    which: row of `visibility` that each point sees as, so that many points can share one; None: each has its own
+    """
+
+    visibility: UInt8[np.ndarray, "m k"]
     directions: Float[np.ndarray, "k 3"]
+    which: Int[np.ndarray, "n"] | None = None
 
     def take(self, rows) -> Shadows:
-        return Shadows(self.visibility[rows], self.directions)
+        """Those of some points, a row for each."""
+        return Shadows(self.visibility[rows if self.which is None else self.which[rows]], self.directions)
 
 
 class Reflector:

@@ -47,7 +47,7 @@ def shadows_at(seen: Observations, material: int, y: Int[np.ndarray, "n"], x: In
     if of.visibility is None or len(of) == 0 or len(x) == 0:
         return None
     nearest = cKDTree(np.column_stack([of.x, of.y])).query(np.column_stack([x, y]))[1]
-    return Shadows(of.visibility[nearest], fibonacci_sphere(of.visibility.shape[1]))
+    return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest)
 
 
 def _onward(report: Report, before: int, total: int) -> Report:

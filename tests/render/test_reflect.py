@@ -119,3 +119,13 @@ def test_each_point_has_its_own_shadow_whatever_is_computed_at_once(monkeypatch)
     whole = reflector(GLOSSY, normals, views, shadows=shadows)
     monkeypatch.setattr(reflect, "PAIRS_AT_ONCE", 7 * len(light()))
     np.testing.assert_allclose(reflector(GLOSSY, normals, views, shadows=shadows), whole, rtol=1e-5)
+
+
+def test_points_that_share_a_row_of_visibility_are_shadowed_as_with_rows_of_their_own():
+    random = np.random.default_rng(0)
+    visibility, which = 255 * random.integers(0, 2, (7, 64)).astype(np.uint8), random.integers(0, 7, 40)
+    directions = random.normal(size=(64, 3))
+    shared, own = Shadows(visibility, directions, which), Shadows(visibility[which], directions)
+    for rows in (slice(3, 20), np.array([5, 1, 39])):
+        np.testing.assert_array_equal(shared.take(rows).visibility, own.take(rows).visibility)
+        assert shared.take(rows).which is None

@@ -171,3 +171,36 @@ def test_a_photo_that_the_earlier_result_lacks_is_searched(tmp_path):
     path = other["poses"] / "poses.json"
     path.write_text(path.read_text().replace('"a"', '"b"'))
     assert run(tmp_path, other)[1]["objects"]["thing"]["source"] == "found"
+
+
+def in_a_file_twice_as_large(inputs, **camera):
+    """The photo as `masks` averages one of 401 × 300 pixels down, with a camera in those pixels."""
+    facts = {**FACTS, "factor": 2, "original_size": [401, 300], "focal_px": 300.0, "focal_source": "dataset"}
+    write_json(inputs["masks"] / "a.json", facts)
+    inputs.facts["dataset.objects"]["camera"] = camera
+    return inputs
+
+
+def test_the_middle_of_an_averaged_photo_is_that_of_its_file(tmp_path):
+    inputs, _, _, _ = step(tmp_path, chair(), chair(), pose_given=True)
+    camera = run(tmp_path, in_a_file_twice_as_large(inputs))[1]["camera"]
+    assert camera["principal_point"] == [100.25, 75.0] and camera["focal_px"] == 300.0 and camera["factor"] == 2
+
+
+def test_keypoints_and_principal_point_are_pixels_of_the_file(tmp_path):
+    inputs, caster, camera, pose = step(tmp_path, chair(), chair())
+    corners = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0]])
+    pixels = 2 * camera.project(pose.apply(corners))
+    keypoints = [{"pixel": list(p), "point": list(q)} for p, q in zip(pixels.tolist(), corners.tolist())]
+    inputs.facts["dataset.objects"]["objects"][0]["keypoints"] = keypoints
+    entry = run(tmp_path, in_a_file_twice_as_large(inputs, principal_point=[200.0, 150.0]))[1]
+    thing = entry["objects"]["thing"]
+    assert thing["source"] == "keypoints" and thing["doubts"] == [] and np.allclose(thing["rotation"], pose.rotation, atol=0.02)
+    assert entry["camera"]["principal_point"] == [100.0, 75.0]
+
+
+def test_an_earlier_focal_length_of_another_factor_is_scaled(tmp_path):
+    inputs, _, camera, pose = step(tmp_path, chair(), chair())
+    with_poses = in_a_file_twice_as_large(earlier(tmp_path, inputs, pose, camera, focal=600.0))  # of the file, before it was averaged
+    entry = run(tmp_path, with_poses)[1]
+    assert entry["camera"]["focal_px"] == 300.0 and entry["objects"]["thing"]["silhouette_iou"] > 0.97

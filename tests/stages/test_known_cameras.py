@@ -87,7 +87,7 @@ def bop(folder, pose):
 SOURCES = {"colmap": colmap, "transforms": transforms, "bop": bop}
 
 
-def aligned(folder, **params):
+def aligned(folder, averaged=masks.Params(), **params):
     dataset = read_dataset(folder)
     parts = {name: dataset_slice(dataset, name, "hall") for name in ("materials", "photo", "objects")}
     folders = {name: folder.parent / name for name in ("masks", "align")}
@@ -95,7 +95,7 @@ def aligned(folder, **params):
         made.mkdir()
     files = {path: folder / path for part in parts.values() for path in part.files}
     inputs = Inputs(folders, {f"dataset.{name}": part.facts for name, part in parts.items()}, files, "hall")
-    masks.main(masks.Params(), inputs, folders["masks"])
+    masks.main(averaged, inputs, folders["masks"])
     align.main(align.Params(**params), inputs, folders["align"], lambda *_: None)
     return json.loads((folders["align"] / "hall.json").read_text())
 
@@ -115,6 +115,13 @@ def test_a_photo_of_twice_the_size_is_the_same_scene(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source, scale=2))
     assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
     assert entry["objects"]["thing"]["silhouette_iou"] > 0.995
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_a_told_camera_follows_a_photo_that_is_averaged_down(tmp_path, source):
+    entry = aligned(scene(tmp_path / "set", source), averaged=masks.Params(frame=200 * 150 // 4))
+    assert entry["camera"]["focal_px"] == 150.0 and np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
+    assert entry["objects"]["thing"]["silhouette_iou"] > 0.98
 
 
 def test_where_only_the_camera_is_told_the_pose_is_searched(tmp_path):

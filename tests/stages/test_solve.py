@@ -35,12 +35,12 @@ def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0
     return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
 
 
-def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None, start=None, **params):
+def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None, start=None, light=None, **params):
     urm, out = folder / "urm", folder / "out"
     urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
     for name, part in seen.items():
         write_observations(urm / f"{name}.parquet", part)
-    light = {name: {"illumination": name, "world_from_camera": None} for name in seen}
+    light = light or {name: {"illumination": name, "world_from_camera": None} for name in seen}
     folders = {"urm": urm, "train": folder} | ({"start": start} if start else {})
     inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
     quick = {"operator": "closed_form", "lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
@@ -203,3 +203,31 @@ def test_a_start_that_is_none_says_which_file_and_what_to_do(tmp_path, a_result,
 @pytest.fixture(scope="module")
 def a_result(tmp_path_factory, linked):
     return run(tmp_path_factory.mktemp("result"), linked)
+
+
+def of_one_room(exposures: dict[str, float], said: dict[str, float | None]) -> dict[str, Observations]:
+    """Photos of three spheres in one light, `exposures` times as bright, whose EXIF says `said`."""
+    return {
+        name: msgspec.structs.replace(observations(name, [0, 1, 2], 1, 12, unit), illuminations=("room",), exposures=(said[name],))
+        for name, unit in exposures.items()
+    }
+
+
+def exposures_of(folder, seen, **params):
+    light = {name: {"illumination": "room", "world_from_camera": None} for name in seen}
+    out = run(folder, seen, light=light, **params)
+    return {name: factors[0] for name, factors in read_json(out / "exposures.json").items()}
+
+
+def test_photos_of_one_light_start_from_what_exif_says_of_their_exposures(tmp_path):
+    true = {"a": 1.0, "b": 64.0}  # six stops
+    found = exposures_of(tmp_path / "said", of_one_room(true, {"a": 0.5, "b": 30.0}), rounds=1, iterations=1, polish=0, settle=0)
+    assert found["a"] == 1 and found["b"] == pytest.approx(64, rel=0.1)
+    unsaid = exposures_of(tmp_path / "unsaid", of_one_room(true, {"a": 0.5, "b": None}), rounds=1, iterations=1, polish=0, settle=0)
+    assert abs(np.log(unsaid["b"] / 64)) > abs(np.log(found["b"] / 64))
+
+
+def test_exif_of_a_photo_made_brighter_later_is_only_where_the_solve_starts(tmp_path, caplog):
+    found = exposures_of(tmp_path, of_one_room({"a": 1.0, "b": 1.2}, {"a": 1.0, "b": 3.0}), rounds=3, iterations=20, polish=20)
+    assert found["b"] == pytest.approx(1.2, rel=0.02)
+    assert "photo 'b': by its EXIF its exposure is 3 of its light's first photo" in caplog.text
