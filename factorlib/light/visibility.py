@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.elementary import square_root
+from factorlib.elementary import product, square_root
 
 FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
 LEAST = 1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
@@ -47,7 +47,7 @@ def widest_sharpness(count: int) -> float:
 
 def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"]) -> Float[Tensor, "n k"]:
     """f of equation (1), each row's sum 1."""
-    cosine = (normals @ directions.T).clamp_min(0)
+    cosine = product(normals, directions.T).clamp_min(0)
     return cosine / cosine.sum(1, keepdim=True).clamp_min(1e-12)
 
 
@@ -56,7 +56,7 @@ def highlight_weights(
 ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
     """f of equation (2), each row's sum 1, and its derivative by roughness."""
     square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
-    nd, no, od = normals @ directions.T, (normals * views).sum(1, keepdim=True), views @ directions.T
+    nd, no, od = product(normals, directions.T), (normals * views).sum(1, keepdim=True), product(views, directions.T)
     upper = (nd > 0).to(nd.dtype)
     nd = nd.clamp_min(1e-6)
     nh2 = ((nd + no) ** 2 / (2 + 2 * od).clamp_min(1e-6)).clamp(0, 1)
@@ -81,7 +81,7 @@ def widened(sharpness: Float[Tensor, "p"], count: int) -> Float[Tensor, "p"]:
 
 def seen_share(visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
-    return ((visibility * weights) @ lobes + LEAST) / (weights @ lobes + LEAST)
+    return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
 
 
 def seen(
@@ -96,12 +96,12 @@ def seen(
     """v with its derivatives; by_roughness: of the `weights`, where v is to be differentiated by it too."""
     p, kappa = len(sharpness), widened(sharpness, len(directions))
     lobes = kernel(directions, axis, sharpness)
-    turned = [kappa * (directions @ t.T) * lobes for t in tangents]
-    sharpened = (directions @ axis.T - 1) * kappa**2 / sharpness * lobes
+    turned = [kappa * product(directions, t.T) * lobes for t in tangents]
+    sharpened = (product(directions, axis.T) - 1) * kappa**2 / sharpness * lobes
     columns = torch.cat([lobes, *turned, sharpened], 1)
-    passed, whole = (visibility * weights) @ columns, weights @ columns
+    passed, whole = product(visibility * weights, columns), product(weights, columns)
     below = whole[:, :p] + LEAST
     share = (passed[:, :p] + LEAST) / below
     slopes = [(passed[:, k * p : (k + 1) * p] - share * whole[:, k * p : (k + 1) * p]) / below for k in (1, 2, 3)]
-    rough = None if by_roughness is None else ((visibility * by_roughness) @ lobes - share * (by_roughness @ lobes)) / below
+    rough = None if by_roughness is None else (product(visibility * by_roughness, lobes) - share * product(by_roughness, lobes)) / below
     return Seen(share, *slopes, rough)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from factorlib.elementary import square_root
+from factorlib.elementary import product, square_root
 from factorlib.images.tone import by_log_exponent, curve, slope
 from factorlib.solve.problem import Block, not_held_out
 from factorlib.solve.shadowing import Turning, shadowed, shadowed_response
@@ -63,7 +63,7 @@ class System(msgspec.Struct, frozen=True):
 def operator_inputs(block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpness: Float[np.ndarray, "p"], roughness: float, operator):
     """roughness, sharpness, n·o, n·z, o·z of lobes at the observations `rows`, as the operator takes them."""
     normal, view, axis = (torch.from_numpy(v) for v in (block.normal[rows], block.view[rows], axis))
-    inputs = torch.tensor(roughness), torch.from_numpy(sharpness), (normal * view).sum(1), normal @ axis.T, view @ axis.T
+    inputs = torch.tensor(roughness), torch.from_numpy(sharpness), (normal * view).sum(1), product(normal, axis.T), product(view, axis.T)
     return [t.to(operator.dtype) for t in inputs]
 
 
@@ -158,8 +158,8 @@ def system(
         for channel in whitened_rows(block, light, materials, some, loss):
             total += channel.loss
             places, scaled, residual = channel.places, channel.jacobian, channel.residual
-            hessian[np.ix_(places, places)] += (scaled.T @ scaled).numpy()
-            gradient[places] += (scaled.T @ residual).numpy()
+            hessian[np.ix_(places, places)] += product(scaled.T, scaled).numpy()
+            gradient[places] += product(scaled.T, residual).numpy()
             if scores is not None:
                 np.add.at(scores, (clusters[some.rows][:, None], places[None]), (scaled * residual[:, None]).numpy())
     prior, prior_gradient, prior_hessian = beforehand(block, light, loss)
@@ -178,10 +178,10 @@ def energy_systems(
     for some in shown:
         for c in range(3):
             basis = _basis(some, materials, c)
-            seen = _whitened(block, some.rows, c, basis @ weight[:, c], light, loss)
+            seen = _whitened(block, some.rows, c, product(basis, weight[:, c]), light, loss)
             scaled = basis / spread * (seen.rising * seen.scale[:, None])
-            hessian[c] += (scaled.T @ scaled).numpy()
-            gradient[c] += (scaled.T @ seen.residual).numpy()
+            hessian[c] += product(scaled.T, scaled).numpy()
+            gradient[c] += product(scaled.T, seen.residual).numpy()
             total += seen.loss
     prior, prior_gradient, prior_hessian = beforehand(block, light, loss)
     for c in range(3):
@@ -208,7 +208,7 @@ def whitened_rows(block: Block, light: Light, materials: Materials, some: Respon
     p, first, m, rows, r = len(light), 7 * len(materials), some.material, some.rows, some.parts
     normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
     tangents = [torch.from_numpy(t) for t in light.tangents()]
-    by_tangent = [(normal @ t.T, view @ t.T) for t in tangents]
+    by_tangent = [(product(normal, t.T), product(view, t.T)) for t in tangents]
     weight, spread = torch.from_numpy(light.weight), torch.from_numpy(light.spread)
     by_s, weight_by_s = (torch.from_numpy(slope) for slope in light.sharpness_slopes(materials.blur))
     photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure)).double()
@@ -225,8 +225,9 @@ def whitened_rows(block: Block, light: Light, materials: Materials, some: Respon
             columns = [column + also for column, also in zip(columns, shading, strict=True)]
         by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
         columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / spread]
-        linear = basis @ weight[:, c]
-        own = [r["diffuse"] @ weight[:, c], r["specular"] @ weight[:, c], ks * (r["specular_by_roughness"] @ weight[:, c])]
+        linear = product(basis, weight[:, c])
+        lit = [product(r[name], weight[:, c]) for name in ("diffuse", "specular", "specular_by_roughness")]
+        own = [lit[0], lit[1], ks * lit[2]]
         seen = _whitened(block, rows, c, linear, light, loss)
         jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * seen.rising
         jacobian = torch.cat([jacobian, photos * seen.by_tone], 1) if len(light.log_tone) else jacobian
