@@ -103,7 +103,7 @@ def test_unusable_meshes_are_refused(tmp_path, text, match):
 
 
 def test_missing_file_and_unknown_format(tmp_path):
-    for name, match in (("no.obj", "not found"), ("mesh.xyz", "unknown mesh format")):
+    for name, match in (("no.obj", "No such file"), ("mesh.xyz", "unknown mesh format")):
         with pytest.raises(InputError, match=match):
             read_mesh(tmp_path / name, MATERIALS, material="red")
 
