@@ -64,7 +64,7 @@ def read_header(path: Path, content: bytes) -> Header:
         try:
             order = _take(words, order, elements)
         except (ValueError, LookupError) as error:
-            raise InputError(f"its header says {shown(' '.join(words))} ({error})", file=path, cure=CURE) from error
+            raise InputError(f"its header says {shown(' '.join(words))} ({shown(str(error))[1:-1]})", file=path, cure=CURE) from error
     if order is None:
         raise InputError("its header does not say its format", file=path, cure=CURE)
     header = Header(order == "", elements, start)

@@ -57,6 +57,13 @@ def read_mesh(
     return usable(soup, label[soup.part], crease_deg, path)
 
 
+def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str, ...]]:
+    """The names of each part of a mesh file in which everything but its materials is as `read_mesh` needs it."""
+    soup = read_soup(path, limits or Limits())
+    solid(soup, path)
+    return soup.parts
+
+
 def read_soup(path: str | Path, limits: Limits) -> Soup:
     """What the file says; InputError where it says nothing usable."""
     path = Path(path)
@@ -75,13 +82,7 @@ def read_soup(path: str | Path, limits: Limits) -> Soup:
 
 def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file) -> Mesh:
     """Welded, without zero-area and duplicate faces, consistently wound, with normals; InputError if nothing is left."""
-    vertices, faces = _used(soup)
-    weld = welded(vertices)
-    first = np.unique(weld, return_index=True)[1]
-    vertices, faces = vertices[first], weld[faces]
-    keep = good_faces(vertices, faces, file)
-    if not keep.any():
-        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
+    vertices, faces, keep = solid(soup, file)
     faces, face_label, supplied = faces[keep], face_label[keep], soup.normals[keep]
     flip, is_open = consistently_wound(vertices, faces)
     faces = np.where(flip[:, None], faces[:, ::-1], faces)
@@ -90,6 +91,18 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file) -> Mesh:
         log.info("%s: %d faces turned to agree with their neighbours", file, int(flip.sum()))
     normals = merged_normals(corner_normals(vertices, faces, crease_deg), supplied, area_vectors(vertices, faces))
     return split_at_creases(vertices, faces, normals, face_label, is_open)
+
+
+def solid(soup: Soup, file) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Welded vertices, the faces by these, and which of the faces to keep; InputError if none."""
+    vertices, faces = _used(soup)
+    weld = welded(vertices)
+    first = np.unique(weld, return_index=True)[1]
+    vertices, faces = vertices[first], weld[faces]
+    keep = good_faces(vertices, faces, file)
+    if not keep.any():
+        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
+    return vertices, faces, keep
 
 
 def _used(soup: Soup) -> tuple[np.ndarray, np.ndarray]:
@@ -113,8 +126,8 @@ def good_faces(vertices: np.ndarray, faces: np.ndarray, file) -> np.ndarray:
 
 def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
     """[F, 3, 3]: the file's normals where they are sane (unit length, within 75° of the face's), else our own."""
-    length = np.linalg.norm(supplied, axis=-1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(all="ignore"):  # a file may hold any number for a normal; what is not sane is not used
+        length = np.linalg.norm(supplied, axis=-1, keepdims=True)
         unit = supplied / length
         face = (area / np.linalg.norm(area, axis=1, keepdims=True))[:, None, :]
         sane = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05) & (np.sum(unit * face, axis=-1) > 0.26)

@@ -129,6 +129,12 @@ def test_the_same_gltf_is_the_same_mesh_each_time(tmp_path):
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces) and len(first.faces) == 8
 
 
+def test_a_normal_of_any_length_does_no_harm(tmp_path):
+    for normal in ("1e300 0 1", "nan 0 1", "inf inf 1", "0 0 0"):
+        plain, odd = (read(write(tmp_path, "a.obj", OBJ.replace("vn 0 0 1", f"vn {words}"))) for words in ("0 0 0", normal))
+        assert np.array_equal(plain.normals, odd.normals)
+
+
 # ---- textures ---------------------------------------------------------------------------------------------------------
 
 
@@ -253,6 +259,8 @@ DAMAGED = {
     "cut_text.ply": (PLY_TEXT[:-9], "."),
     "words.ply": (PLY_TEXT.replace("3 0 2 1", "3 0 two 1"), "."),
     "negative.ply": (PLY_TEXT.replace("vertex 4", "vertex -4"), "."),
+    "long_type.ply": (PLY_TEXT.replace("float x", f"{'9' * 5000} x"), "."),
+    "long_format.ply": (PLY_TEXT.replace("ascii", "9" * 5000), "."),
     "no_type.ply": (PLY_TEXT.replace("float x", "real x"), "."),
     "no_x.ply": (PLY_TEXT.replace("float x", "float w"), "."),
     "twice.ply": (PLY_TEXT.replace("float y", "float x"), "."),
