@@ -6,6 +6,7 @@ They belong to a mesh's content: when one changes, so does the mesh.
 from __future__ import annotations
 
 import mmap
+import os
 import re
 from pathlib import Path, PurePosixPath
 
@@ -19,14 +20,16 @@ _MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 def companions_of_mesh(path: str, key: str, refuse: Refusal) -> list[str]:
     """Dataset-relative paths of the companions of the mesh at dataset-relative `path`.
 
-    An absent .mtl is left out, for a part's name is in the OBJ itself; an absent glTF buffer is refused, and so is
-    any companion outside the dataset.
+    An absent .mtl is left out, for a part's name is in the OBJ itself, and so is one that is no plain file; an absent glTF
+    buffer is refused, and so is any companion outside the dataset, or too large.
     """
     suffix, file = Path(path).suffix.lower(), refuse.folder / path
     if suffix == ".obj":
-        return [near for near in _beside(path, _mtllibs(file, key), key, refuse) if (refuse.folder / near).is_file()]
+        near = [near for near in _beside(path, _mtllibs(file, key), key, refuse) if os.path.isfile(refuse.folder / near)]
+        return _plain(near, "an .mtl", key, refuse)
     if suffix in (".gltf", ".glb"):
-        return _present(_beside(path, _buffers(file, key, refuse), key, refuse), key, refuse)
+        near = _beside(path, _buffers(file, key, refuse), key, refuse)
+        return _plain(_present(near, key, refuse), "a glTF buffer", key, refuse)
     return []
 
 
@@ -68,7 +71,16 @@ def _within(error: ValueError) -> str:
 
 def _present(paths: list[str], key: str, refuse: Refusal) -> list[str]:
     for path in paths:
-        if not (refuse.folder / path).exists():
+        try:
+            os.stat(refuse.folder / path)
+        except FileNotFoundError:
             refuse(key, f"the mesh names {path!r}, which is not there", "copy it beside the mesh, or export one .glb")
-        check_plain(refuse.folder / path, "a glTF buffer", key)
+        except OSError:
+            continue  # there, perhaps, and not to be opened: `_plain` says why
+    return paths
+
+
+def _plain(paths: list[str], what: str, key: str, refuse: Refusal) -> list[str]:
+    for path in paths:
+        check_plain(refuse.folder / path, what, key)
     return paths
