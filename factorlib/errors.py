@@ -9,6 +9,8 @@ from __future__ import annotations
 from difflib import get_close_matches
 from os import PathLike
 
+MOST_NAMED, MOST_LETTERS = 50, 80  # words in a cure, and letters of each
+
 
 class InputError(ValueError):
     """Something in a user's input that the user can mend.
@@ -45,4 +47,7 @@ def did_you_mean(word: str, known) -> str:
     """
     known = sorted(str(k) for k in known)
     near = get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known))
+    if near:
+        return f"did you mean {near[0]!r}?"
+    more = f", and {len(known) - MOST_NAMED} more" if len(known) > MOST_NAMED else ""
+    return "known are: " + ", ".join(repr(k if len(k) < MOST_LETTERS else k[:MOST_LETTERS] + "…") for k in known[:MOST_NAMED]) + more

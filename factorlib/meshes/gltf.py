@@ -18,7 +18,7 @@ from factorlib.dataset.gltf import BEFORE_JSON, CURE, Accessor, Header, Node, Pr
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.parts import check_count
-from factorlib.meshes.soup import Soup, at_corners, no_normals
+from factorlib.meshes.soup import Soup, at_corners, floats, no_normals
 from factorlib.reading import read_bytes
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -220,7 +220,7 @@ def _vectors(primitive: Primitive, attribute: str, data: Buffers) -> Float[np.nd
     values = data.array(primitive.attributes[attribute])
     if values.shape[1] != 3:
         raise InputError(f"a {attribute} has {values.shape[1]} numbers, not 3", file=data.path, cure=CURE)
-    return values.astype(float)
+    return floats(values)
 
 
 def _faces(primitive: Primitive, data: Buffers) -> Int[np.ndarray, "f 3"]:

@@ -7,6 +7,7 @@ The .mtl is never opened: a part's name is in the OBJ itself.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.soup import Soup
-from factorlib.meshes.text import decoded, shown
+from factorlib.meshes.text import lines_of, shown
 
 MOST = 2**31  # vertices that any file numbers
 COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
@@ -23,8 +24,7 @@ COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
 def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     """Triangles of an OBJ file, parts named by (usemtl, groups…, object); InputError names the line that is wrong."""
     reader = _Reader()
-    text = decoded(content).replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
-    for number, line in enumerate(text.split("\n"), start=1):
+    for number, line in _statements(content):
         words = line.split("#", 1)[0].split() if "#" in line else line.split()
         if not words:
             continue
@@ -37,6 +37,20 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
             reader.check(limits, path)
     reader.check(limits, path)
     return reader.soup()
+
+
+def _statements(content: bytes) -> Iterator[tuple[int, str]]:
+    """Lines by the number they end at; a line that ends in a backslash goes on in the next."""
+    begun: list[str] = []
+    number = 0
+    for number, line in enumerate(lines_of(content), start=1):
+        if line.endswith("\\"):
+            begun.append(line[:-1])
+            continue
+        yield number, " ".join([*begun, line]) if begun else line
+        begun.clear()
+    if begun:
+        yield number, " ".join(begun)
 
 
 class _Reader:

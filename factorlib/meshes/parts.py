@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.reading import one_line
 
 MOST_PARTS = 100_000  # of one file
 
@@ -44,20 +45,19 @@ def _label(names, materials, parts, default, overrides, file) -> int:
     for mapping in (overrides, parts):
         chosen = {mapping[name] for name in names if name in mapping}
         if len(chosen) > 1:
-            raise InputError(
-                f"part {' / '.join(names)} gets several materials: {', '.join(sorted(chosen))}", file=file, cure="name it once"
-            )
+            raise InputError(f"part {_called(names)} gets several materials: {', '.join(sorted(chosen))}", file=file, cure="name it once")
         if chosen:
             return list(materials).index(chosen.pop()) + 1
     if default is None:
-        part = " / ".join(names) or "(unnamed)"
-        raise InputError(
-            f"part {part} has no material",
-            file=file,
-            key=part,
-            cure=f"add it to `parts`, e.g. {names[0] if names else 'name'}: {materials[0]}",
-        )
+        part = _called(names)
+        cure = f"add it to `parts`, e.g. {_called(names[:1])}: {materials[0]}" if names else "give it a name in a mesh editor"
+        raise InputError(f"part {part} has no material", file=file, key=part, cure=cure)
     return list(materials).index(default) + 1
+
+
+def _called(names: Sequence[str]) -> str:
+    """A part by all its names, as messages write it."""
+    return one_line(" / ".join(names)) or "(unnamed)"
 
 
 def _check_material(name: str, materials: Sequence[str], part: str | None, file) -> None:

@@ -11,7 +11,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_header import CURE, read_header
 from factorlib.meshes.ply_rows import Column, Columns, columns_of
-from factorlib.meshes.soup import Soup, fans, of_one_part
+from factorlib.meshes.soup import Soup, fans, floats, of_one_part
 
 CORNERS = ("vertex_indices", "vertex_index")
 
@@ -48,7 +48,7 @@ def _vectors(columns: Columns, names: str | tuple[str, ...]) -> np.ndarray | Non
     """Three properties as vectors; None where one is missing, or a list."""
     if not all(name in columns and (columns[name].counts == 1).all() for name in names):
         return None
-    return np.stack([np.asarray(columns[name].values, float) for name in names], axis=1)
+    return np.stack([floats(columns[name].values) for name in names], axis=1)
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:

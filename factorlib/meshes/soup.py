@@ -31,11 +31,17 @@ class Soup(msgspec.Struct, frozen=True):
     normals: Float[np.ndarray, "f 3 3"]
 
 
+def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
+    """As float64; a NaN of any kind is one, without a warning."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(values, dtype=float)
+
+
 def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None) -> Soup:
     """A soup whose faces are all one part; normals: [V, 3], by vertex."""
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
     of_corners = no_normals(len(faces)) if normals is None else at_corners(normals, faces)
-    return Soup(np.asarray(vertices, float).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
+    return Soup(floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
 
 
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
@@ -45,7 +51,7 @@ def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
 def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Normals by vertex as normals by corner, NaN where a face's index is not one of a vertex."""
     there = (faces >= 0) & (faces < len(normals))
-    table = np.concatenate([np.asarray(normals, float), np.full((1, 3), np.nan)])
+    table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
     return table[np.where(there, faces, len(normals))]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -10,24 +12,23 @@ from jaxtyping import Float
 SHOWN = 80  # characters of a line in a message
 
 
-def decoded(content: bytes) -> str:
-    """
-    >>> decoded("Stühle".encode("latin-1")), decoded("Stühle".encode("utf-8-sig"))
-    ('Stühle', 'Stühle')
-    """
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def lines_of(content: bytes) -> list[str]:
+def lines_of(content: bytes) -> Iterator[str]:
     """Lines, whichever of the three ways they end; characters that Python alone takes for line ends are none.
 
-    >>> lines_of(b"a\\r\\nb\\rc\\x0cd\\n")
-    ['a', 'b', 'c\\x0cd', '']
+    >>> list(lines_of("Stühle\\r\\nb\\rc\\x0cd\\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
+    (['Stühle', 'b', 'c\\x0cd'], ['Stühle'])
     """
-    return decoded(content).replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    with io.TextIOWrapper(io.BytesIO(content), _encoding_of(content)) as text:  # line by line: a list of them is far larger
+        for line in text:
+            yield line.rstrip("\n")
+
+
+def _encoding_of(content: bytes) -> str:
+    try:
+        content.decode("utf-8-sig")
+        return "utf-8-sig"
+    except UnicodeDecodeError:
+        return "latin-1"
 
 
 def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import struct
+import time
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -42,7 +44,8 @@ def refused(path, words="."):
     """The error with which the mesh at `path` is refused, in little memory."""
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=words) as caught:
+        with warnings.catch_warnings(), pytest.raises(InputError, match=words) as caught:
+            warnings.simplefilter("error")
             read(path)
         assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY
     finally:
@@ -252,6 +255,9 @@ DAMAGED = {
     "empty.stl": ("", "."),
     "none.stl": (STL[:80] + struct.pack("<I", 0), "without faces"),
     "nan_binary.stl": (STL.replace(struct.pack("<f", 1), struct.pack("<f", float("nan"))), "not finite"),
+    "signalling_nan.stl": (STL.replace(struct.pack("<f", 1), b"\x01\x00\xa0\x7f"), "not finite"),
+    "signalling_nan.ply": (PLY.replace(struct.pack("<f", 1), b"\x01\x00\xa0\x7f"), "not finite"),
+    "signalling_nan.glb": (glb(data=DATA.replace(struct.pack("<f", 1), b"\x01\x00\xa0\x7f")), "not finite"),
     "cut.stl": (STL[:-1], "."),
     "empty.ply": ("", "."),
     "no_end.ply": (PLY_HEADER.format("ascii").replace("end_header\n", ""), "."),
@@ -357,3 +363,28 @@ def test_any_honest_unit_is_read(tmp_path, scale):
 
 def test_a_far_vertex_that_no_face_uses_does_not_blur_the_rest(tmp_path):
     assert len(read(write(tmp_path, "a.obj", OBJ + "v 1e9 0 0\n")).faces) == 4
+
+
+def test_many_and_long_names_of_parts_stay_cheap(tmp_path):
+    """A name of a megabyte, a thousand names at once, a million continued lines."""
+    cases = {
+        "long.obj": OBJ.replace("shell", "x" * 1_000_000),
+        "many.obj": OBJ.replace("shell", " ".join(f"part{k}" for k in range(1000))),
+        "continued.obj": OBJ + "g a\\\n" + "b\\\n" * 300_000,
+        "parts.obj": OBJ + "".join(f"g part{k}\nf 1 2 3\n" for k in range(20_000)),
+    }
+    for name, text in cases.items():
+        path = write(tmp_path, name, text)
+        started = time.process_time()
+        with pytest.raises(InputError) as caught:
+            read_mesh(path, MATERIALS, {"no such": "red"})
+        assert len(str(caught.value)) < 5000 and time.process_time() - started < 2
+        with pytest.raises(InputError) as caught:
+            read_mesh(path, MATERIALS, {"thing": "rot"})
+        assert len(str(caught.value)) < 5000
+
+
+def test_more_parts_than_any_mesh_has_are_refused(tmp_path):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"g {k}\nf 1 2 3\n" for k in range(100_001))
+    with pytest.raises(InputError, match="100,001 parts"):
+        read(write(tmp_path, "a.obj", text))
