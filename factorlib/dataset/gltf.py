@@ -20,6 +20,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
 WHAT = "glTF"
 CURE = "is it whole? export it again, as .glb or .gltf"
+MOST_VALUES = 2_000_000  # of a header: each becomes an object of some hundred bytes; base64 has no commas
 BEFORE_JSON = 20  # bytes of a .glb: its own header, and that of its first chunk
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
@@ -118,6 +119,9 @@ class Header(msgspec.Struct, frozen=True):
 def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
     """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
     text = _json_chunk(file, key, most_bytes) if file.suffix.lower() == ".glb" else read_bytes(file, WHAT, key, most_bytes)
+    if text.count(b",") > MOST_VALUES:
+        cure = "export the geometry alone, with its data in a .bin file or as .glb"
+        raise InputError(f"its header has more than {MOST_VALUES:,} values", file=file, key=key, cure=cure)
     with reading(WHAT, file, key, CURE):
         header = msgspec.json.decode(text, type=Header)
     if header.asset.version.split(".")[0] != "2":

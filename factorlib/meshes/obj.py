@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.soup import Soup
-from factorlib.meshes.text import lines_of, shown
+from factorlib.meshes.text import check_length, lines_of, shown
 
 MOST = 2**31  # vertices that any file numbers
 COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
@@ -42,13 +42,16 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
 def _statements(content: bytes) -> Iterator[tuple[int, str]]:
     """Lines by the number they end at; a line that ends in a backslash goes on in the next."""
     begun: list[str] = []
-    number = 0
+    number = letters = 0
     for number, line in enumerate(lines_of(content), start=1):
         if line.endswith("\\"):
             begun.append(line[:-1])
+            letters += len(line)
+            check_length(letters)
             continue
         yield number, " ".join([*begun, line]) if begun else line
         begun.clear()
+        letters = 0
     if begun:
         yield number, " ".join(begun)
 
@@ -104,7 +107,7 @@ class _Reader:
         limits.check(len(self.vertices) // 3, len(self.part), path)
 
     def soup(self) -> Soup:
-        normal_table = np.array([*self.vertex_normals, *[np.nan] * 3]).reshape(-1, 3)
+        normal_table = np.concatenate([np.array(self.vertex_normals), np.full(3, np.nan)]).reshape(-1, 3)
         index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
         index[(index < 0) | (index >= len(normal_table))] = len(normal_table) - 1
         vertices = np.array(self.vertices, dtype=float).reshape(-1, 3)

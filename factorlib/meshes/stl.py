@@ -39,6 +39,6 @@ def _text_corners(path: Path, content: bytes, limits: Limits) -> np.ndarray:
         raise InputError(f"has {len(lines)} corners, which makes no triangles", file=path, cure="is it whole? export it again")
     limits.check(len(lines), len(lines) // 3, path)
     for number, line in enumerate(lines, start=1):
-        if len(line.split()) != 3:
+        if len(line.split(None, 3)) != 3:
             raise InputError(f"vertex {number} has not three coordinates", file=path, cure="is it whole? export it again")
     return numbers_in(b"\n".join(lines)).reshape(-1, 3)

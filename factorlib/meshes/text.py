@@ -10,17 +10,26 @@ import numpy as np
 from jaxtyping import Float
 
 SHOWN = 80  # characters of a line in a message
+LONGEST = 2_000_000  # characters of a line
 
 
 def lines_of(content: bytes) -> Iterator[str]:
-    """Lines, whichever of the three ways they end; characters that Python alone takes for line ends are none.
+    """Lines, whichever of the three ways they end; characters that Python alone takes for line ends are none.  ValueError
+    for one of more than LONGEST characters.
 
     >>> list(lines_of("Stühle\\r\\nb\\rc\\x0cd\\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
     (['Stühle', 'b', 'c\\x0cd'], ['Stühle'])
     """
     with io.TextIOWrapper(io.BytesIO(content), _encoding_of(content)) as text:  # line by line: a list of them is far larger
         for line in text:
+            check_length(len(line))
             yield line.rstrip("\n")
+
+
+def check_length(letters: int) -> None:
+    """Words of a line are held one by one: ValueError for more of them than any polygon has corners."""
+    if letters > LONGEST:
+        raise ValueError(f"a line of more than {LONGEST:,} letters")
 
 
 def _encoding_of(content: bytes) -> str:

@@ -384,6 +384,19 @@ def test_many_and_long_names_of_parts_stay_cheap(tmp_path):
         assert len(str(caught.value)) < 5000
 
 
+def test_text_whose_words_would_fill_memory_is_refused(tmp_path):
+    """Polygons of a million corners, continued lines, and headers of millions of values take many times their size."""
+    for name, text in {
+        "face.obj": OBJ + "f" + " 1" * 1_500_000,
+        "continued.obj": OBJ + "g a\\\n" * 800_000,
+        "polygon.off": OFF.replace("3 0 2 1", "1500000" + " 1" * 1_500_000),
+        "vertex.stl": STL_TEXT.replace("vertex 1.0", "vertex" + " 1" * 1_500_000),
+        "nodes.gltf": gltf_text(nodes=[]).replace('"nodes": []', '"nodes": [{}' + ",{}" * 2_000_001 + "]", 1),
+    }.items():
+        with pytest.raises(InputError, match="more than 2,000,000|has not three"):
+            read(write(tmp_path, name, text))
+
+
 def test_more_parts_than_any_mesh_has_are_refused(tmp_path):
     text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"g {k}\nf 1 2 3\n" for k in range(100_001))
     with pytest.raises(InputError, match="100,001 parts"):
