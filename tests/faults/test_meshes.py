@@ -370,8 +370,8 @@ def test_many_and_long_names_of_parts_stay_cheap(tmp_path):
     cases = {
         "long.obj": OBJ.replace("shell", "x" * 1_000_000),
         "many.obj": OBJ.replace("shell", " ".join(f"part{k}" for k in range(1000))),
-        "continued.obj": OBJ + "g a\\\n" + "b\\\n" * 300_000,
-        "parts.obj": OBJ + "".join(f"g part{k}\nf 1 2 3\n" for k in range(20_000)),
+        "continued.obj": OBJ + "g a\\\n" + "b\\\n" * 100_000,
+        "parts.obj": OBJ + "".join(f"g part{k}\nf 1 2 3\n" for k in range(5_000)),
     }
     for name, text in cases.items():
         path = write(tmp_path, name, text)
@@ -397,7 +397,8 @@ def test_text_whose_words_would_fill_memory_is_refused(tmp_path):
             read(write(tmp_path, name, text))
 
 
-def test_more_parts_than_any_mesh_has_are_refused(tmp_path):
-    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"g {k}\nf 1 2 3\n" for k in range(100_001))
-    with pytest.raises(InputError, match="100,001 parts"):
+def test_more_parts_than_any_mesh_has_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("factorlib.meshes.parts.MOST_PARTS", 1000)
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"g {k}\nf 1 2 3\n" for k in range(1001))
+    with pytest.raises(InputError, match="1,001 parts"):
         read(write(tmp_path, "a.obj", text))
