@@ -9,7 +9,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from os import PathLike
 
-MOST_NAMED, MOST_LETTERS = 50, 80  # words in a cure, and letters of each
+MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
 
 
 class InputError(ValueError):
@@ -46,8 +46,6 @@ def did_you_mean(word: str, known) -> str:
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    near = get_close_matches(word, known, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    more = f", and {len(known) - MOST_NAMED} more" if len(known) > MOST_NAMED else ""
-    return "known are: " + ", ".join(repr(k if len(k) < MOST_LETTERS else k[:MOST_LETTERS] + "…") for k in known[:MOST_NAMED]) + more
+    near = get_close_matches(word, known[:MOST_COMPARED], n=1)
+    more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
+    return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

@@ -34,7 +34,7 @@ def part_labels(
     for mapping in (parts or {}, overrides):
         for part, chosen in mapping.items():
             if part not in there:
-                raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=did_you_mean(part, there))
+                raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=did_you_mean(part, [one_line(name) for name in there]))
             _check_material(chosen, materials, part, file)
     if material is not None:
         _check_material(material, materials, None, file)
