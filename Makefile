@@ -51,7 +51,7 @@ help:
 	@echo '     SET="solve.lobes=64 …"          with other parameters      FORCE=1   run again, whatever is there'
 	@echo 'make fit_mesh | refine DATASET=…      only when asked for: proportions of meshes, poses by shading; SET="align.poses=build/…/refine" uses them'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
-	@echo 'make validate DATASET=…              check a dataset without running anything'
+	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'

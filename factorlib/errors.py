@@ -9,6 +9,8 @@ from __future__ import annotations
 from difflib import get_close_matches
 from os import PathLike
 
+MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
+
 
 class InputError(ValueError):
     """Something in a user's input that the user can mend.
@@ -44,5 +46,6 @@ def did_you_mean(word: str, known) -> str:
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    near = get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known))
+    near = get_close_matches(word, known[:MOST_COMPARED], n=1)
+    more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
+    return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

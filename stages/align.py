@@ -24,7 +24,8 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import read_json, write_json
-from factorlib.meshes.mesh import scaled
+from factorlib.meshes.limits import Limits
+from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.stage import Inputs, Progress
 
@@ -38,6 +39,7 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG  # sharper edges of a mesh stay sharp
     strict: bool = False  # stop at a doubtful pose
     keep_doubtful: bool = False  # let an object whose pose was found, and is doubtful, into the solve all the same
+    limits: Limits = Limits()  # how large a mesh may be
     search: Search = Search()
 
 
@@ -73,11 +75,15 @@ def things_of(
         pose = pose_of(thing, slice_.told)
         before = earlier.objects.get(thing.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
-        caster = Caster(scaled(read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg), scale))
+        caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         found = before.as_found() if before else None
         things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
     return things
+
+
+def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
+    return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
 
 
 def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:

@@ -23,6 +23,7 @@ from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes, read_lobes, write_lobes
+from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import CREASE_DEG, read_mesh
@@ -131,7 +132,7 @@ class MeshFiles:
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.inputs.file(entry.file)
-            self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg)
+            self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
         return self._meshes[key]
 
     def shapes(self, thing: ObjectEntry, meshes: dict[str, MeshEntry], poses: dict) -> list[Shape]:

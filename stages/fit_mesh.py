@@ -23,6 +23,7 @@ from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs, Progress
@@ -77,7 +78,7 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: dict, inputs: Inputs, 
         said, mesh = entry["objects"][thing.name], slice_.meshes[thing.mesh]
         if said["source"] not in SEARCHED or said["silhouette_iou"] < params.least_iou:
             continue
-        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials)
+        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials, limits=NO_LIMITS)
         evidence = object_evidence(channels, number, read.labels, thing.mask is not None)
         state = state_of(earlier.objects[thing.name].pose(), camera, scaled(read, earlier.objects[thing.name].scale))
         target = target_of(evidence, read.labels, params.resolution, MARGIN)

@@ -20,6 +20,7 @@ from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
 from factorlib.images.tone import straightened
 from factorlib.jsonfile import read_json, write_json
+from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.refine.choice import Standards
@@ -68,7 +69,8 @@ def scene_of(inputs: Inputs, photo: dict, entry: dict, shadows: int) -> Scene:
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, said, pose = slice_.meshes[thing.mesh], entry["objects"][thing.name], found.objects[thing.name]
         file = inputs.file(mesh.file)
-        caster = Caster(scaled(read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials), pose.scale))
+        read = read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials, limits=NO_LIMITS)
+        caster = Caster(scaled(read, pose.scale))
         evidence, other = object_evidence(photo, number, caster.mesh.labels, thing.mask is not None), pose.runner_up
         moves = said["source"] in SEARCHED
         things.append(Thing(caster, evidence, pose.pose(), other.pose() if other else None, moves, not said["left_out"]))

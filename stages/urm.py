@@ -14,6 +14,7 @@ from factorlib.align.camera import Camera, Pose
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json
+from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs, Progress
@@ -73,7 +74,9 @@ def occluders_of(inputs: Inputs, poses: dict) -> Occluders:
     slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
     for thing in slice_.objects:
         entry = slice_.meshes[thing.mesh]
-        mesh = read_mesh(inputs.file(entry.file), inputs.facts["dataset.materials"], entry.parts, entry.material, thing.materials)
+        mesh = read_mesh(
+            inputs.file(entry.file), inputs.facts["dataset.materials"], entry.parts, entry.material, thing.materials, limits=NO_LIMITS
+        )
         meshes.append(scaled(mesh, poses[thing.name].get("scale", (1.0, 1.0, 1.0))))
     placed = [poses[thing.name] for thing in slice_.objects]
     return Occluders(meshes, [Pose(np.array(pose["rotation"]), np.array(pose["translation"])) for pose in placed])

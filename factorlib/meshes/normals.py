@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from factorlib.meshes.mesh import area_vectors
 
@@ -51,6 +49,9 @@ def consistently_wound(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray
     Of a connected patch's two orientations, an open patch takes the one that flips less area, a closed one the one
     that encloses positive volume.  A patch that has no orientation (Möbius) is left as it is.
     """
+    from scipy.sparse import coo_matrix  # half a second, which a look at a mesh's parts does not pay
+    from scipy.sparse.csgraph import connected_components
+
     count = len(faces)
     pairs, agrees, has_border = neighbours(faces)
     a, b = pairs.T

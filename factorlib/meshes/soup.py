@@ -8,6 +8,10 @@ from jaxtyping import Float, Int
 
 from factorlib.errors import InputError
 
+LARGEST = 1e15  # coordinate: cubes of it, and its ratio to any honest length, are numbers
+LEAST_EXTENT = 1e-12
+LEAST_SHARE = 1e-9  # extent over distance from the origin: below, too few digits are left for the shape
+
 
 class Soup(msgspec.Struct, frozen=True):
     """Triangles as read from a file.
@@ -27,12 +31,47 @@ class Soup(msgspec.Struct, frozen=True):
     normals: Float[np.ndarray, "f 3 3"]
 
 
+def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
+    """As float64; a NaN of any kind is one, without a warning."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(values, dtype=float)
+
+
+def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None) -> Soup:
+    """A soup whose faces are all one part; normals: [V, 3], by vertex."""
+    faces = np.asarray(faces, np.int64).reshape(-1, 3)
+    of_corners = no_normals(len(faces)) if normals is None else at_corners(normals, faces)
+    return Soup(floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
+
+
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
     return np.full((faces, 3, 3), np.nan)
 
 
+def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
+    """Normals by vertex as normals by corner, NaN where a face's index is not one of a vertex."""
+    there = (faces >= 0) & (faces < len(normals))
+    table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
+    return table[np.where(there, faces, len(normals))]
+
+
+def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "f 3"]:
+    """Triangles of polygons, each a fan about its first corner; polygons of fewer than three corners have none.
+
+    counts: corners of each polygon;  corners: those of all polygons, in a row
+
+    >>> fans(np.array([3, 2, 4]), np.array([7, 8, 9, 1, 2, 3, 4, 5, 6])).tolist()
+    [[7, 8, 9], [3, 4, 5], [3, 5, 6]]
+    """
+    triangles = np.maximum(counts - 2, 0)
+    first = np.repeat(np.cumsum(counts) - counts, triangles)
+    within = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
+
+
 def check(soup: Soup, file) -> Soup:
-    """The soup itself; raises InputError for no faces, indices out of range, and vertices that are not finite."""
+    """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
+    place that leaves no digits for the shape."""
     if len(soup.faces) == 0:
         raise InputError("mesh without faces", file=file, cure="export triangles, not only points or lines")
     low, high = int(soup.faces.min()), int(soup.faces.max())
@@ -43,4 +82,16 @@ def check(soup: Soup, file) -> Soup:
     if bad.any():
         found = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
         raise InputError(found, file=file, cure="remove them in a mesh editor, or export the mesh again")
+    _check_extent(soup.vertices[soup.faces.reshape(-1)], file)
     return soup
+
+
+def _check_extent(corners: Float[np.ndarray, "n 3"], file) -> None:
+    largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
+    cure = "give it in another unit, about its own origin"
+    if largest > LARGEST:
+        raise InputError(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", file=file, cure=cure)
+    if 0 < extent < LEAST_EXTENT:
+        raise InputError(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", file=file, cure=cure)
+    if 0 < extent < LEAST_SHARE * largest:
+        raise InputError(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", file=file, cure=cure)

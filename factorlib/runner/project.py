@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,12 +25,21 @@ class Slice(Protocol):
     files: list[str]
 
 
+def nothing_to_look_at(slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
+    return []
+
+
 class Data(msgspec.Struct, frozen=True):
-    """A dataset as the runner sees it: its folder, its photos, and a slice of it by name and photo."""
+    """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
+
+    faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes it
+            and the file in which these stand
+    """
 
     folder: Path
     photos: list[str]
     slice: Callable[[str, str | None], Slice]
+    faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = nothing_to_look_at
 
 
 class Provider(msgspec.Struct, frozen=True):
@@ -45,9 +56,20 @@ def photo_sets() -> Provider:
 
     def read(path: Path) -> Data:
         dataset = read_dataset(path)
-        return Data(dataset.folder, [photo.name for photo in dataset.spec.photos], lambda name, photo: dataset_slice(dataset, name, photo))
+        photos = [photo.name for photo in dataset.spec.photos]
+        return Data(dataset.folder, photos, lambda name, photo: dataset_slice(dataset, name, photo), _looking_at(dataset))
 
     return Provider(SLICES, read)
+
+
+def _looking_at(dataset) -> Callable[..., list[InputError]]:
+    """`factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
+
+    @cache
+    def validation():
+        return importlib.import_module("factorlib.validation").Validation(dataset)
+
+    return lambda *arguments: validation().faults(*arguments)
 
 
 class Project(msgspec.Struct, frozen=True):

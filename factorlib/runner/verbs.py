@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from pathlib import Path
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
+from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
@@ -20,11 +22,14 @@ def make(project: Project, dataset: str, targets: list[str] | None, settings: li
     """Run the stages that are wanted and what they need, as far as anything must run."""
     started = time.perf_counter()
     seen = survey(project, dataset, targets, settings, force)
-    if all(p.status == "current" for p in seen.planned()):
+    planned = seen.planned()
+    if all(p.status == "current" for p in planned):
         remember(seen)
         print(f"{seen.data.folder.name}: nothing to do, all {len(seen.records)} steps are current")
         _name_results(seen, targets)
         return 0
+    if found := new_faults(seen, planned):
+        return _refused(seen, found)
     return _run(seen, targets, started)
 
 
@@ -116,10 +121,23 @@ def show_graph(project: Project, mermaid: bool) -> int:
 
 
 def validate(project: Project, dataset: str, settings: list[str]) -> int:
-    """Check pipeline.yaml, the settings and the dataset, as far as that needs no pixel."""
+    """Check pipeline.yaml, the settings, dataset.yaml and every file it names, of photos only their headers."""
     seen = survey(project, dataset, None, settings)
-    print(f"{seen.data.folder.name}: pipeline.yaml and dataset.yaml are good: {len(seen.data.photos)} photos, {len(seen.records)} steps")
+    if found := faults(seen, seen.records):
+        return _refused(seen, found)
+    print(
+        f"{seen.data.folder.name}: pipeline.yaml, dataset.yaml and the files it names are good: "
+        f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
+    )
     return 0
+
+
+def _refused(seen: Survey, found: list[InputError]) -> int:
+    """Every fault at once, before anything has run."""
+    for fault in found:
+        print(f"error: {fault}", file=sys.stderr)
+    print(f"{seen.data.folder.name}: {len(found)} {'fault' if len(found) == 1 else 'faults'} in its files; nothing was run", file=sys.stderr)
+    return 1
 
 
 def clean(project: Project, dataset: str | None) -> int:

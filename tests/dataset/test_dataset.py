@@ -53,7 +53,8 @@ def folder(tmp_path):
         (path / name).write_text("")
     (path / "chair.obj").write_text("# a chair\nmtllib chair.mtl\nusemtl shell\n")
     (path / "chair.mtl").write_text("newmtl shell\n")
-    (path / "box.gltf").write_text(json.dumps({"buffers": [{"uri": "box%201.bin"}, {"uri": "data:,x"}]}))
+    buffers = [{"uri": "box%201.bin", "byteLength": 0}, {"uri": "data:,x", "byteLength": 1}]
+    (path / "box.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
     (path / "box 1.bin").write_text("")
     (tmp_path / "outside.jpg").write_text("")
     return path
@@ -329,8 +330,8 @@ def test_photos_of_one_light_agree_on_its_frame(folder):
     "file, content, words",
     [
         ("box.gltf", "{", "not readable as glTF"),
-        ("box.gltf", '{"buffers": [{"uri": "gone.bin"}]}', "gone.bin"),
-        ("box.gltf", '{"buffers": [{"uri": "../outside.jpg"}]}', "outside the dataset"),
+        ("box.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "gone.bin", "byteLength": 1}]}', "gone.bin"),
+        ("box.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "../outside.jpg", "byteLength": 1}]}', "outside the dataset"),
         ("chair.obj", "mtllib ../../etc/x.mtl\n", "outside the dataset"),
     ],
 )

@@ -7,6 +7,8 @@ import logging
 import numpy as np
 import pytest
 import trimesh
+from faults.mesh_files import VERTICES, glb, gltf_header
+from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
 from factorlib.meshes import read_mesh, write_ply
@@ -103,7 +105,7 @@ def test_unusable_meshes_are_refused(tmp_path, text, match):
 
 
 def test_missing_file_and_unknown_format(tmp_path):
-    for name, match in (("no.obj", "not found"), ("mesh.xyz", "unknown mesh format")):
+    for name, match in (("no.obj", "No such file"), ("mesh.xyz", "unknown mesh format")):
         with pytest.raises(InputError, match=match):
             read_mesh(tmp_path / name, MATERIALS, material="red")
 
@@ -158,3 +160,40 @@ def test_submesh_holds_one_material(tmp_path):
     mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"})
     parts = [submesh(mesh, label) for label in mesh.labels]
     assert sum(len(p.faces) for p in parts) == 12 and all(p.faces.max() == len(p.vertices) - 1 for p in parts)
+
+
+def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
+    turn, quaternion = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]), Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_quat().tolist()
+    header = gltf_header()
+    outer = np.eye(4)
+    outer[:3, 3] = (5, 6, 7)
+    header["nodes"] = [
+        {"matrix": outer.T.ravel().tolist(), "children": [1]},
+        {"mesh": 0, "scale": [1, 2, 3], "rotation": quaternion, "translation": [1, 0, 0]},
+    ]
+    (tmp_path / "a.glb").write_bytes(glb(header))
+    expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
+    found = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, material="red").vertices.round(5), axis=0)
+    assert np.allclose(found, np.unique(expected.round(5), axis=0), atol=2e-5)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_normals_of_the_file_are_used(tmp_path, suffix):
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    tilted = ball.vertex_normals + 0.2 * np.roll(ball.vertex_normals, 1, axis=1)
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
+    (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **({"vertex_normal": True} if suffix == "ply" else {})))
+    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, material="red")
+    nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
+    assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "off", "glb", "obj"])
+def test_what_trimesh_writes_and_reads_is_read_the_same(tmp_path, suffix):
+    made = trimesh.util.concatenate([trimesh.creation.torus(2, 0.5), trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))])
+    made.export(tmp_path / f"a.{suffix}")
+    theirs = trimesh.load_mesh(tmp_path / f"a.{suffix}")
+    ours = read_mesh(tmp_path / f"a.{suffix}", MATERIALS, material="red")
+    triangles = [np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0) for t in (theirs.triangles, ours.vertices[ours.faces])]
+    assert triangles[0].shape == triangles[1].shape and np.allclose(*triangles, atol=2e-3)

@@ -1,0 +1,157 @@
+"""The header of a glTF file: which buffers it draws in, and how its triangles lie in them.  No buffer is opened here.
+
+Only what geometry needs is decoded; textures, animations and the like are skipped.  Names of fields are glTF 2.0's.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path, PurePosixPath
+from typing import Annotated
+from urllib.parse import unquote
+
+import msgspec
+
+from factorlib.errors import InputError
+from factorlib.reading import MOST_BYTES, check_plain, read_bytes, reading
+
+Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
+Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
+WHAT = "glTF"
+CURE = "is it whole? export it again, as .glb or .gltf"
+MOST_VALUES = 2_000_000  # of a header: each becomes an object of some hundred bytes; base64 has no commas
+BEFORE_JSON = 20  # bytes of a .glb: its own header, and that of its first chunk
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+
+
+class Asset(msgspec.Struct, frozen=True):
+    version: str
+
+
+class Buffer(msgspec.Struct, frozen=True):
+    """uri: a file, or `data:…`; None for the chunk of a .glb."""
+
+    byteLength: Count
+    uri: str | None = None
+
+
+class View(msgspec.Struct, frozen=True):
+    buffer: Count
+    byteLength: Count
+    byteOffset: Count = 0
+    byteStride: Positive | None = None
+
+
+class SparseIndices(msgspec.Struct, frozen=True):
+    bufferView: Count
+    componentType: int
+    byteOffset: Count = 0
+
+
+class SparseValues(msgspec.Struct, frozen=True):
+    bufferView: Count
+    byteOffset: Count = 0
+
+
+class Sparse(msgspec.Struct, frozen=True):
+    count: Count
+    indices: SparseIndices
+    values: SparseValues
+
+
+class Accessor(msgspec.Struct, frozen=True):
+    componentType: int
+    count: Count
+    type: str
+    bufferView: Count | None = None
+    byteOffset: Count = 0
+    normalized: bool = False
+    sparse: Sparse | None = None
+
+
+class Primitive(msgspec.Struct, frozen=True):
+    attributes: dict[str, Count]
+    indices: Count | None = None
+    material: Count | None = None
+    mode: int = 4
+
+
+class Geometry(msgspec.Struct, frozen=True):
+    """What glTF calls a mesh."""
+
+    primitives: list[Primitive]
+    name: str | None = None
+
+
+class Material(msgspec.Struct, frozen=True):
+    name: str | None = None
+
+
+class Node(msgspec.Struct, frozen=True):
+    mesh: Count | None = None
+    name: str | None = None
+    children: list[Count] = []
+    matrix: tuple[float, ...] | None = None
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+class Scene(msgspec.Struct, frozen=True):
+    nodes: list[Count] = []
+
+
+class Header(msgspec.Struct, frozen=True):
+    asset: Asset
+    buffers: list[Buffer] = []
+    bufferViews: list[View] = []
+    accessors: list[Accessor] = []
+    materials: list[Material] = []
+    meshes: list[Geometry] = []
+    nodes: list[Node] = []
+    scenes: list[Scene] = []
+    scene: Count | None = None
+    extensionsRequired: list[str] = []
+
+
+def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
+    """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
+    text = _json_chunk(file, key, most_bytes) if file.suffix.lower() == ".glb" else read_bytes(file, WHAT, key, most_bytes)
+    if text.count(b",") > MOST_VALUES:
+        cure = "export the geometry alone, with its data in a .bin file or as .glb"
+        raise InputError(f"its header has more than {MOST_VALUES:,} values", file=file, key=key, cure=cure)
+    with reading(WHAT, file, key, CURE):
+        header = msgspec.json.decode(text, type=Header)
+    if header.asset.version.split(".")[0] != "2":
+        found = f"is glTF {header.asset.version[:20]}"
+        raise InputError(found, file=file, key=key, cure="export it again, as glTF 2.0")
+    packed = [name for name in COMPRESSED if name in header.extensionsRequired]
+    if packed:
+        raise InputError(f"its meshes are compressed ({packed[0]})", file=file, key=key, cure="export it without compression")
+    return header
+
+
+def _json_chunk(file: Path, key: str | None, most_bytes: int) -> bytes:
+    size = check_plain(file, WHAT, key, most_bytes)
+    with reading(WHAT, file, key, CURE), open(file, "rb") as stream:
+        magic, version, _, length, kind = struct.unpack("<4sIII4s", stream.read(BEFORE_JSON))
+        if magic != b"glTF" or version != 2 or kind != b"JSON":
+            raise ValueError("it does not begin as a .glb of version 2 does")
+        if length > size - BEFORE_JSON:
+            raise ValueError("its first chunk is longer than the file")
+        return stream.read(length)
+
+
+def buffer_path(uri: str) -> str | None:
+    """The path of a buffer, relative to the file that names it; None for one that lies within.  ValueError for a web address.
+
+    >>> buffer_path("../buffers/box%201.bin"), buffer_path("data:;base64,AAAA")
+    ('../buffers/box 1.bin', None)
+    """
+    if uri.startswith("data:"):
+        return None
+    if SCHEME.match(uri):
+        raise ValueError(f"names {uri[:80]!r}, which is no file beside it")
+    return str(PurePosixPath(unquote(uri).replace("\\", "/")))

@@ -1,0 +1,42 @@
+"""Looking at a dataset's files before anything runs: a fault in the last photo is told before the first is worked on.
+
+What there is to look at, and how, the dataset's provider knows; here is which files a run has not used yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from factorlib.errors import InputError
+from factorlib.runner.pipeline import DATASET
+from factorlib.runner.plan import Planned, Record, Step
+from factorlib.runner.survey import Survey
+
+
+def new_faults(seen: Survey, planned: list[Planned]) -> list[InputError]:
+    """Of the files that steps are to read which have no result of them yet, each fault once; a dataset all of whose files
+    have been used costs nothing."""
+    return faults(seen, [p.step for p in planned if p.status != "current" and _is_new(seen, p.step)])
+
+
+def faults(seen: Survey, steps: Iterable[Step]) -> list[InputError]:
+    """Of all files that the steps read; where several stages take a slice, by the parameters of the first."""
+    found, done = {}, set()
+    for step in steps:
+        stage = seen.spec.pipeline.stages[step.stage]
+        for slice_ in stage.slices:
+            if (slice_, step.photo) not in done:
+                done.add((slice_, step.photo))
+                for fault in seen.data.faults(slice_, step.photo, stage.values, seen.project.pipeline_file):
+                    found.setdefault(str(fault), fault)
+    return list(found.values())
+
+
+def _is_new(seen: Survey, step: Step) -> bool:
+    """Whether the step's part of the dataset is another than that of its last result."""
+    before = seen.previous.get(str(step))
+    return before is None or _of_dataset(before) != _of_dataset(seen.records[step])
+
+
+def _of_dataset(record: Record) -> Record:
+    return {name: value for name, value in record.items() if name.startswith(("file:", f"facts:{DATASET}"))}

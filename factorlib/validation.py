@@ -1,0 +1,87 @@
+"""What can be seen of a dataset's files before anything runs: photos against their masks, meshes against their parts.
+
+These are the checks that the stages make of what they read first, by the same functions; of photos only headers are read.
+The runner loads this module by its name, as it loads stages: it knows no science, and a run with nothing to do must not
+pay for any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.photo import open_photo
+from factorlib.labels import read_labels, read_objects
+from factorlib.meshes.limits import Limits
+from factorlib.meshes.parts import part_labels
+from factorlib.meshes.read import read_parts
+from factorlib.yamlfile import convert
+
+Check = Callable[[], object]
+
+
+class Validation:
+    """The files of one dataset, each looked at once."""
+
+    def __init__(self, dataset: Dataset):
+        self.dataset, self.folder = dataset, dataset.folder
+        self._done: set[str] = set()
+        self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
+
+    def faults(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
+        """What is wrong with the files that a slice names, of one photo or of all; what was looked at before is left out.
+
+        params: given to the stage that takes the slice, in the file `settings` or instead of what stands there
+        """
+        found = []
+        limits = convert(params.get("limits", {}), Limits, settings, "limits")
+        for what, check in self._checks(slice_, photo, limits):
+            if what in self._done:
+                continue
+            self._done.add(what)
+            try:
+                check()
+            except InputError as error:
+                found.append(error)
+        return found
+
+    def _checks(self, slice_: str, photo: str | None, limits: Limits) -> Iterator[tuple[str, Check]]:
+        spec = self.dataset.spec
+        entries = spec.photos if photo is None else [self.dataset.photo(photo)]
+        if slice_ == "photo":
+            yield from ((f"photo {entry.name}", partial(self._photo, entry)) for entry in entries)
+        elif slice_ == "objects":
+            for thing in (thing for entry in entries for thing in entry.objects):
+                yield f"mesh {thing.mesh} {thing.materials}", partial(self._object, thing, spec.meshes[thing.mesh], limits)
+        elif slice_ == "truth" and self.dataset.truth is not None:
+            for maps, read in ((self.dataset.truth.illumination, read_rgb_exr), (self.dataset.truth.normals, read_exr)):
+                yield from ((f"map {path}", partial(read, self.folder / path)) for path in maps.values())
+
+    def _photo(self, entry: PhotoEntry) -> None:
+        key = f"photos[{entry.name}]"
+        size = open_photo(self._file(entry.image), f"{key}.image").size
+        read_labels(entry.masks, self._file, self.dataset.spec.materials, size, entry.image, f"{key}.masks")
+        read_objects([(thing.name, thing.mask) for thing in entry.objects], self._file, size, f"{key}.objects")
+
+    def _object(self, thing: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
+        file = self._file(mesh.file)
+        part_labels(self._parts_of(mesh.file, limits), self.dataset.spec.materials, mesh.parts, mesh.material, thing.materials, file)
+
+    def _parts_of(self, name: str, limits: Limits) -> list[tuple[str, ...]]:
+        """The parts of a mesh file, which is read once; if it cannot be, that is said again for every object."""
+        if name not in self._parts:
+            try:
+                self._parts[name] = read_parts(self._file(name), limits)
+            except InputError as error:
+                self._parts[name] = error
+        if isinstance(found := self._parts[name], InputError):
+            raise found
+        return found
+
+    def _file(self, name: str) -> Path:
+        return self.folder / name
