@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from factorlib.runner.home import claim
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.project import claim
 from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
 

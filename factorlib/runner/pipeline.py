@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -10,9 +11,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.names import check_name
 from factorlib.yamlfile import parse_yaml, read_yaml
 
 FORMAT = 1
+NAME = re.compile("[a-z][a-z0-9_]*")
+TAKEN = ("errors",)  # a folder beside the links that are called as the stages
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -98,6 +102,10 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
 
 def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
+    if not NAME.fullmatch(name) or name in TAKEN:
+        raise InputError(f"a stage cannot be called {name!r}", file=path, key="stages", cure="give it another name, of a-z, 0-9 and _")
+    if stage.gather is not None:
+        check_name(stage.gather, "a gathered file", file=path, key=f"stages.{name}.gather")
     for entry in stage.inputs:
         known = [DATASET + s for s in known_slices] + list(pipeline.stages)
         if entry not in known:

@@ -18,9 +18,9 @@ from filelock import FileLock, Timeout
 from factorlib.runner.display import Display
 from factorlib.runner.executors import Pools
 from factorlib.runner.finish import label, remember
+from factorlib.runner.home import claim
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.project import claim
 from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
@@ -267,7 +267,7 @@ class Run:
         self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
         where = None
         if outcome.traceback:
-            path = self.survey.home.folder / "errors" / f"{label(step)}.txt"
+            path = self.survey.home.errors / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(outcome.traceback, encoding="utf-8")
             where = self.survey.project.shown(path)

@@ -13,10 +13,11 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.closure import Closure, Sources
 from factorlib.runner.filehash import FileHashes
+from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import DATASET, Pipeline, Stage, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import Data, Home, Project, home_of
+from factorlib.runner.project import Data, Project
 from factorlib.runner.store import Outputs, Store
 
 

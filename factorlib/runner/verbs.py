@@ -9,9 +9,10 @@ from pathlib import Path
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.finish import remember, results
+from factorlib.runner.home import made_home, made_homes
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
-from factorlib.runner.project import Project, home_of
+from factorlib.runner.project import Project
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 
@@ -28,12 +29,11 @@ def make(project: Project, dataset: str, targets: list[str] | None, settings: li
     return _run(seen, targets, started)
 
 
-def make_stage(project: Project, name: str, verbs: list[str], dataset: str, settings: list[str], force: bool) -> int:
-    """The same for a word from the command line that is no verb: it must be the name of a stage."""
+def check_stage(project: Project, name: str, verbs: list[str]) -> None:
+    """A word from the command line that is no verb must be the name of a stage."""
     stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
     if name not in stages:
         raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
-    return make(project, dataset, [name], settings, force)
 
 
 def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
@@ -123,25 +123,16 @@ def validate(project: Project, dataset: str, settings: list[str]) -> int:
 
 
 def clean(project: Project, dataset: str | None) -> int:
-    from factorlib.runner.gc import clean as delete
+    """Forget the results of one dataset, or of all, and say what was deleted."""
+    from factorlib.runner.gc import forget, forget_all
 
-    home = None if dataset is None else home_of_name(project, dataset)
-    delete(project, home)
-    print(f"deleted {project.shown(project.build if home is None else home.folder)}")
+    home = None if dataset is None else made_home(project, dataset)
+    if dataset is not None and home is None:
+        print(f"nothing to delete: {dataset} has no results")
+        return 0
+    gone = forget_all(project) if home is None else forget(project, home)
+    print("\n".join(gone.lines(project.shown)))
     return 0
-
-
-def home_of_name(project: Project, dataset: str):
-    """build/<dataset>, also of a dataset that is no longer there."""
-    try:
-        return home_of(project, project.dataset_folder(dataset))
-    except InputError:
-        from factorlib.runner.project import Home
-
-        home = Home(project.build / Path(dataset).name)
-        if not (home.folder / "dataset.txt").exists():
-            raise
-        return home
 
 
 def collect(project: Project) -> int:
@@ -154,28 +145,14 @@ def collect(project: Project) -> int:
 
 def verify(project: Project, dataset: str | None) -> int:
     """Read every result, of a dataset or of all; 1 where any is not as it was kept."""
-    from factorlib.runner.project import Home
     from factorlib.runner.verify import verify as read_all
 
-    store = Store(project.build / "store")
-    homes = [home_of_name(project, dataset)] if dataset else [Home(p.parent) for p in sorted(project.build.glob("*/current.json"))]
+    home = None if dataset is None else made_home(project, dataset)
+    if dataset is not None and home is None:
+        print(f"nothing to read: {dataset} has no results")
+        return 0
+    homes = made_homes(project) if home is None else [home]
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    verdict = read_all(store, homes, pipeline, everything=dataset is None)
+    verdict = read_all(Store(project.build / "store"), homes, pipeline, everything=home is None)
     print("\n".join(words.damage_lines(verdict, project.shown)))
     return 1 if verdict.damaged else 0
-
-
-def ship(project: Project, stage: str, dataset: str) -> int:
-    """Put the current result of a stage into the package, where pipeline.yaml says that it ships with the source."""
-    from factorlib.runner.shipped import ship as put
-
-    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
-    known = [name for name, found in stages.items() if found.shipped]
-    if stage not in known:
-        raise InputError(f"no result of {stage!r} ships with the source", key="ship", cure=did_you_mean(stage, known))
-    seen = survey(project, dataset, [stage], [])
-    planned = next(p for p in seen.planned() if p.step.stage == stage)
-    if planned.status != "current":
-        raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
-    print(f"{stage}: {project.shown(put(seen.store.tree(planned.output), planned.record, project.root, stages[stage].shipped))}")
-    return 0
