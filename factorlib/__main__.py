@@ -13,6 +13,7 @@ import typer
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.stop import heed_sigterm
 
 
 class Verbs(typer.core.TyperGroup):
@@ -135,8 +136,10 @@ def ship(stage: str, dataset: Dataset) -> None:
 
 def main() -> None:
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
-        app(prog_name="python -m factorlib")
+        with heed_sigterm():
+            app(prog_name="python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")
 

@@ -12,6 +12,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.names import RESERVED, check_name
+from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
@@ -44,6 +45,7 @@ def photo_sets() -> Provider:
 
     def read(path: Path) -> Data:
         dataset = read_dataset(path)
+        take_sigterm_back()
         return Data(dataset.folder, [photo.name for photo in dataset.spec.photos], lambda name, photo: dataset_slice(dataset, name, photo))
 
     return Provider(SLICES, read)

@@ -95,13 +95,16 @@ class Run:
         self._plan()
         stages = dict.fromkeys(p.step.stage for p in self.planned if p.status != "current")
         checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
-        futures = [self.pools.submit(code.threads, check_params, code) for code in checks]
-        outcomes = [_outcome_of(future) for future in futures]
-        for future in futures:
-            self.pools.done(future)
-        for code, outcome in zip(checks, outcomes, strict=True):
-            if outcome.error:
-                self._fail(Step(code.stage), outcome)
+        running: dict[Future, Code] = {}
+        while checks or running:
+            while checks and self.pools.free(checks[0].threads):
+                code = checks.pop(0)
+                running[self.pools.submit(code.threads, check_params, code)] = code
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                outcome, code = _outcome_of(future), running.pop(future)
+                self.pools.done(future)
+                if outcome.error:
+                    self._fail(Step(code.stage), outcome)
         if self.tally.failed:
             raise Refused(self.tally.failed)
 

@@ -13,12 +13,18 @@ from factorlib.runner.home import made_home, made_homes
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project
+from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_sigterm
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 
 
 def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
+    with heed_sigterm():
+        return _make(project, dataset, targets, settings, force)
+
+
+def _make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
     started = time.perf_counter()
     seen = survey(project, dataset, targets, settings, force)
     if all(p.status == "current" for p in seen.planned()):
@@ -45,9 +51,9 @@ def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
         tally = run(seen, display)
     except Refused:
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Stopped) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
-        return 130
+        return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
     if tally.failed:
