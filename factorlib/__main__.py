@@ -13,7 +13,7 @@ import typer
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.runner.stop import heed_sigterm
+from factorlib.runner.stop import heed_stops
 
 
 class Verbs(typer.core.TyperGroup):
@@ -138,7 +138,7 @@ def main() -> None:
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
     sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
-        with heed_sigterm():
+        with heed_stops():
             app(prog_name="python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")

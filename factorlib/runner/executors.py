@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import ClassVar
 
 from factorlib import arithmetic
+from factorlib.runner.stop import whole
 from factorlib.runner.worker import limit_threads
 
 
@@ -34,16 +35,16 @@ class Pools:
         return busy == 0 or busy + threads <= self.cores
 
     def submit(self, threads: int, function: Callable, *arguments) -> Future:
-        idle = self._idle.setdefault(threads, [])
-        executor = idle.pop() if idle else _executor(threads)
-        try:
-            with _OfWorkers():
+        with whole(), _OfWorkers():
+            idle = self._idle.setdefault(threads, [])
+            executor = idle.pop() if idle else _executor(threads)
+            try:
                 future = executor.submit(function, *arguments)
-        except BrokenProcessPool:  # its process was killed while it had nothing to do
-            executor.shutdown(wait=False)
-            return self.submit(threads, function, *arguments)
-        self._busy[future] = threads, executor
-        return future
+            except BrokenProcessPool:  # its process was killed while it had nothing to do
+                executor.shutdown(wait=False)
+                return self.submit(threads, function, *arguments)
+            self._busy[future] = threads, executor
+            return future
 
     def done(self, future: Future) -> None:
         threads, executor = self._busy.pop(future)

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
+_waiting: list[int] | None = None  # signals that came while nothing may be interrupted
 
 
 class Stopped(SystemExit):
@@ -18,16 +19,30 @@ class Stopped(SystemExit):
 
 
 @contextlib.contextmanager
-def heed_sigterm() -> Iterator[None]:
-    """Within, SIGTERM raises `Stopped`, once: a second one, which make sends on, disturbs no cleaning up."""
-    if not _in_main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, _stop)
+def heed_stops() -> Iterator[None]:
+    """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
+    heeded = [number for number in (signal.SIGINT, signal.SIGTERM) if _in_main_thread() and signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, _stop) for number in heeded}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def whole() -> Iterator[None]:
+    """What begins within is finished before a stop is heeded.  Processes that are started within never see SIGINT."""
+    global _waiting
+    outer, _waiting = _waiting, [] if _waiting is None else _waiting
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        came, _waiting = _waiting, outer
+    if outer is None and came:
+        _stop(came[0])
 
 
 def take_sigterm_back() -> None:
@@ -41,6 +56,10 @@ def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-def _stop(*_) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise Stopped
+def _stop(number: int, *_) -> None:
+    if _waiting is not None:
+        _waiting.append(number)
+        return
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    raise Stopped if number == signal.SIGTERM else KeyboardInterrupt

@@ -13,14 +13,14 @@ from factorlib.runner.home import made_home, made_homes
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project
-from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_sigterm
+from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 
 
 def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
-    with heed_sigterm():
+    with heed_stops():
         return _make(project, dataset, targets, settings, force)
 
 

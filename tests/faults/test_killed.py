@@ -103,7 +103,7 @@ def test_a_reader_that_takes_sigterm_prints_no_c_stack():
     """pycolmap itself, as reading cameras of a COLMAP model imports it."""
     code = (
         "import os, signal, factorlib.runner.stop as stop\n"
-        "with stop.heed_sigterm():\n"
+        "with stop.heed_stops():\n"
         "    import pycolmap; stop.take_sigterm_back(); os.kill(os.getpid(), signal.SIGTERM)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, text=True, check=False)
