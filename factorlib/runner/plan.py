@@ -47,9 +47,11 @@ class Spec(msgspec.Struct, frozen=True):
         return [Step(stage, photo) for photo in self.photos] if self.pipeline.stages[stage].over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:
-        """The steps whose results a step is handed."""
+        """The steps whose results a step is handed: of its own photo, or of all for a step over the whole set."""
         upstream = self.pipeline.stages[step.stage].upstream
-        return [found for name in upstream for found in self.steps_of(name) if step.photo is None or found.photo in (None, step.photo)]
+        if step.photo is None:
+            return [found for name in upstream for found in self.steps_of(name)]
+        return [Step(name, step.photo if self.pipeline.stages[name].over else None) for name in upstream]
 
 
 class Listing(msgspec.Struct, frozen=True):

@@ -1,7 +1,9 @@
 """Running a plan: start what is ready, take in what is done, plan again, until nothing is left that can run.
 
-After each result the same pure `plan` is asked anew, so an output that came out unchanged stops what follows there, and
-what another run made meanwhile is used.  A step that fails holds up only what depends on it.
+Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that came
+out unchanged stops what follows there, and what another run made meanwhile is used.  What a plan calls ready stays so, for
+all it takes is made; hence a plan for every stage is enough, not one for every result.  A step that fails holds up only
+what depends on it.
 """
 
 from __future__ import annotations
@@ -80,6 +82,9 @@ class Run:
         self.made: set[str] = set()
         self.tally = Tally()
         self.planned: list[Planned] = []
+        self.outputs: dict[Step, str | None] = {}  # as planned
+        self.stale = False  # there are results that the plan does not know
+        self.made: set[str] = set()  # keys
 
     def go(self) -> None:
         self._plan()
@@ -88,6 +93,9 @@ class Run:
             if not self.running and not self.waiting:
                 break
             self._wait()
+        for planned in self.planned:
+            if planned.key in self.made and planned.status != "current":
+                self._fail(planned.step, Outcome(error="its result is gone again: is something else deleting from build/store? run again"))
         self.tally.held_up = [p.step for p in self.planned if p.status != "current" and p.step not in self.tally.failed]
 
     def check(self) -> None:
@@ -116,15 +124,26 @@ class Run:
 
     def _plan(self) -> None:
         self.planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        self.outputs = {planned.step: planned.output for planned in self.planned}
         self.display.plan(self.planned)
+        self.stale = False
 
     def _start_ready(self) -> None:
         self.waiting = set()
-        for planned in list(self.planned):
-            step = planned.step
-            if planned.status != "to run" or planned.key is None or step in self.running or step in self.tally.failed:
+        self._start_planned()
+        while self.stale and self.pools.free(1):
+            self._plan()
+            self._start_planned()
+
+    def _start_planned(self) -> None:
+        for planned in self.planned:
+            if planned.status != "to run" or planned.key is None or planned.key in self.made:
                 continue
-            if self.pools.free(self.survey.spec.pipeline.stages[step.stage].threads):
+            if planned.step in self.running or planned.step in self.tally.failed:
+                continue
+            if not self.pools.free(1):
+                return
+            if self.pools.free(self.survey.spec.pipeline.stages[planned.step.stage].threads):
                 self._start(planned)
 
     def _start(self, planned: Planned) -> None:
@@ -145,8 +164,7 @@ class Run:
         self.survey.outputs.forget(planned.key)
         if self.survey.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
             lock.release()  # another run has made it meanwhile
-            self.waiting.add(planned.step)
-            self._plan()
+            self.stale = True
             return
         work = Running(planned, self._task(planned), lock)
         self.running[planned.step] = work
@@ -188,8 +206,7 @@ class Run:
 
     def _folder(self, step: Step, name: str) -> Path:
         """Where the files of the stage `name` are for this step."""
-        outputs = {planned.step: planned.output for planned in self.planned}
-        stage, store = self.survey.spec.pipeline.stages[name], self.survey.store
+        stage, store, outputs = self.survey.spec.pipeline.stages[name], self.survey.store, self.outputs
         if not stage.over:
             return store.tree(outputs[Step(name)])
         if step.photo is not None:
@@ -218,11 +235,10 @@ class Run:
             self._listen(work)
         for future in done:
             self._take(self.running.pop(futures[future]))
-        if done or self.waiting:
-            for planned in self.planned:
-                if planned.step in self.waiting:
-                    self.survey.outputs.forget(planned.key)
-            self._plan()
+        self.stale = self.stale or bool(done or self.waiting)
+        for planned in self.planned if self.waiting else []:
+            if planned.step in self.waiting:
+                self.survey.outputs.forget(planned.key)
         self.display.tick()
 
     def _listen(self, work: Running) -> None:
@@ -261,6 +277,7 @@ class Run:
             )
         self.survey.previous[str(step)] = work.task.record
         self.tally.ran.append(step)
+        self.made.add(work.task.key)
         self._log(self.survey.store.log(work.task.key).read_text(encoding="utf-8"))
         remember(self.survey, {str(step): work.task.key})
         self.display.finish(step, outcome.seconds)
