@@ -19,7 +19,10 @@ LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds
 
 
 class Slice(Protocol):
+    """facts: JSON-able;  fields: the same by the names that they have in the dataset's file;  files: that they name."""
+
     facts: Any
+    fields: dict[str, Any]
     files: list[str]
 
 

@@ -79,10 +79,10 @@ class Run:
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()
-        self.made: set[str] = set()
         self.tally = Tally()
         self.planned: list[Planned] = []
         self.outputs: dict[Step, str | None] = {}  # as planned
+        self.keys: dict[Step, str | None] = {}
         self.stale = False  # there are results that the plan does not know
         self.made: set[str] = set()  # keys
 
@@ -93,9 +93,6 @@ class Run:
             if not self.running and not self.waiting:
                 break
             self._wait()
-        for planned in self.planned:
-            if planned.key in self.made and planned.status != "current":
-                self._fail(planned.step, Outcome(error="its result is gone again: is something else deleting from build/store? run again"))
         self.tally.held_up = [p.step for p in self.planned if p.status != "current" and p.step not in self.tally.failed]
 
     def check(self) -> None:
@@ -125,6 +122,7 @@ class Run:
     def _plan(self) -> None:
         self.planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
         self.outputs = {planned.step: planned.output for planned in self.planned}
+        self.keys = {planned.step: planned.key for planned in self.planned}
         self.display.plan(self.planned)
         self.stale = False
 
@@ -137,7 +135,7 @@ class Run:
 
     def _start_planned(self) -> None:
         for planned in self.planned:
-            if planned.status != "to run" or planned.key is None or planned.key in self.made:
+            if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
             if planned.step in self.running or planned.step in self.tally.failed:
                 continue
@@ -151,8 +149,7 @@ class Run:
             self._fail(planned.step, Outcome(error=f"{planned.reasons[0]}, and was made just now: is the disk failing?"))
             return
         if not self.survey.outputs.still(self._keys_above(planned.step)):  # a run takes hours, and they are used only now
-            self.waiting.add(planned.step)
-            self._plan()
+            self.stale = True
             return
         lock = FileLock(self.survey.store.locks / f"{planned.key}.lock")
         try:
@@ -172,8 +169,7 @@ class Run:
         work.future = self.pools.submit(work.task.code.threads, run_step, work.task)
 
     def _keys_above(self, step: Step) -> list[str]:
-        above = set(self.survey.spec.above(step))
-        return [found.key for found in self.planned if found.step in above]
+        return [self.keys[above] for above in self.survey.spec.above(step)]
 
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]

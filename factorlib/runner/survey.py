@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from factorlib.runner.closure import Closure, Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
-from factorlib.runner.pipeline import DATASET, Pipeline, Stage, read_pipeline, with_settings
+from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project
 from factorlib.runner.store import Outputs, Store
@@ -70,6 +68,7 @@ def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packa
     records = {}
     for name in spec.pipeline.needed(spec.targets):
         of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        of_stage |= {f"default:{param}": text for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()}
         of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
             records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
@@ -117,11 +116,11 @@ def given_folder(stage: Stage, param: str) -> Path:
 
 
 def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> Record:
-    """The slices of the dataset a step declares, by hash, and the files they name."""
+    """The slices of the dataset that a step declares, field by field, and the files they name, by content."""
     record: Record = {}
     for name in pipeline.stages[step.stage].slices:
         slice_ = data.slice(name, step.photo)
-        record[f"facts:{DATASET}{name}"] = hashlib.sha256(json.dumps(slice_.facts, sort_keys=True).encode()).hexdigest()[:32]
+        record |= {f"dataset:{field}": value for field, value in slice_.fields.items()}
         for file in slice_.files:
             record[f"file:{file}"] = _hash(data.folder, file, hashes)
     return record
