@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import sys
@@ -24,6 +25,8 @@ class Verbs(typer.core.TyperGroup):
             args = ["stage", *args]
         return super().resolve_command(ctx, args)
 
+
+NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}  # what the system refuses to this user
 
 app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -142,6 +145,11 @@ def main() -> None:
             app(prog_name="python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        if error.errno not in NOT_OURS:
+            raise
+        cure = "check that the folder is there, and that you may read it and write to it"
+        sys.exit(f"error: {InputError(error.strerror, file=error.filename, cure=cure)}")
 
 
 if __name__ == "__main__":

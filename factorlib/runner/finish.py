@@ -15,7 +15,7 @@ def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
     planned = survey.planned(frozenset()) if more is None else []
     pipeline, spec = survey.spec.pipeline, survey.spec
     there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
-    before = survey.home.keys()
+    before = survey.home.last_keys()
     keys = {step: key for step, key in before.items() if step in there} | (more or {})
     keys |= {str(p.step): p.key for p in planned if p.status == "current"}
     if keys != before:

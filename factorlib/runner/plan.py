@@ -16,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from factorlib.runner.integrity import in_short
-from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.pipeline import DATASET, Pipeline
 
 Record = dict[str, Any]
 Status = Literal["current", "to run", "maybe"]
@@ -137,7 +137,7 @@ _KIND = {
     "source": "source of {}",
     "param": "parameter {}",
     "default": "default of parameter {}",
-    "dataset": "dataset.yaml: {}",
+    "facts": "dataset.yaml: {}",
     "file": "file {}",
     "given": "given file {}",
     "input": "result of {}",
@@ -163,7 +163,7 @@ _NAMED = 4  # names that came or went
 
 def _change(name: str, before: Record, after: Record) -> str:
     kind, colon, what = name.partition(":")
-    label = _KIND.get(kind, "{}").format(what) if colon else name
+    label = _KIND.get(kind, "{}").format(what.removeprefix(DATASET) if kind == "facts" else what) if colon else name
     old, new = before.get(name, _ABSENT), after.get(name, _ABSENT)
     if kind in _HASHED:
         return f"{label}: " + ("new" if old is _ABSENT else "gone" if new is _ABSENT else "changed")
@@ -175,8 +175,8 @@ def _change(name: str, before: Record, after: Record) -> str:
 def _shown(value: Any, record: Record, kind: str, what: str) -> str:
     if value is _ABSENT and kind == "param":
         return f"{record[f'default:{what}']} (the default)" if f"default:{what}" in record else "default"
-    if value is _ABSENT or (value is None and kind == "dataset"):
-        return "not given" if kind == "dataset" else "none"
+    if value is _ABSENT or (value is None and kind == "facts"):
+        return "not given" if kind == "facts" else "none"
     text = value if kind == "default" else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 

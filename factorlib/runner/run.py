@@ -21,6 +21,7 @@ from factorlib.runner.display import Display
 from factorlib.runner.executors import Pools
 from factorlib.runner.finish import label, remember
 from factorlib.runner.home import claim
+from factorlib.runner.logs import sound_lines
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.survey import Survey, given_folder
@@ -215,7 +216,7 @@ class Run:
         """What the steps above cost and said when their present results were made, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.survey.store.log(p.key) for p in self.planned if p.step.stage in above and p.key]
-        path.write_text("".join(log.read_text(encoding="utf-8") for log in logs if log.exists()), encoding="utf-8")
+        path.write_bytes(b"".join(line + b"\n" for log in logs for line in sound_lines(log)))
         return path
 
     # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -266,7 +267,6 @@ class Run:
         if before is not None and before != outcome.output:
             self.display.warn(step, "made again from the same inputs, it came out different")
         self.survey.outputs.forget(work.task.key)
-        self.made.add(work.task.key)
         if outcome.damaged:
             self.display.warn(
                 step, f"its kept result was damaged and is replaced; what was there: {self.survey.project.shown(outcome.damaged)}"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import fcntl
+import os
 import time
-from pathlib import Path
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.finish import remember, results
 from factorlib.runner.home import made_home, made_homes
+from factorlib.runner.logs import warnings_in
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project
@@ -96,23 +97,22 @@ def show_status(project: Project, dataset: str, targets: list[str] | None, setti
 
 def is_running(seen: Survey, planned: Planned) -> bool:
     """Whether a run holds the lock on a step's key."""
-    from filelock import FileLock, Timeout
-
-    path = seen.store.locks / f"{planned.key}.lock"
-    if not path.exists():
+    try:
+        descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
+    except FileNotFoundError:
         return False
     try:
-        with FileLock(path, timeout=0):
-            return False
-    except Timeout:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
         return True
+    finally:
+        os.close(descriptor)
 
 
 def warnings_of(seen: Survey, planned: Planned) -> list[str]:
     """What a step said when its present result was made."""
-    log: Path = seen.store.log(planned.key)
-    events = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()] if log.exists() else []
-    return [event["text"] for event in events if event["event"] == "warning"]
+    return warnings_in(seen.store.log(planned.key))
 
 
 def show_graph(project: Project, mermaid: bool) -> int:

@@ -112,7 +112,7 @@ def test_what_changed_in_every_photo_is_said_once(project):
 
 
 def test_long_values_are_cut():
-    line = difference({"dataset:a": "x" * 500}, {"dataset:a": "y" * 500})[0]
+    line = difference({"facts:dataset.a": "x" * 500}, {"facts:dataset.a": "y" * 500})[0]
     assert len(line) < 250 and "…" in line
 
 
