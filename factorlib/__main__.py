@@ -132,9 +132,9 @@ def gc() -> None:
 
 
 @app.command()
-def ship(stage: str, dataset: Dataset) -> None:
+def ship(stage: str, dataset: Dataset = None) -> None:
     """Put a stage's current result into the package (for those who change the stage)."""
-    raise typer.Exit(verbs.ship(project(), stage, dataset))
+    raise typer.Exit(verbs.ship(project(), stage, named(dataset)))
 
 
 def main() -> None:
