@@ -1,45 +1,38 @@
 # Verbs only. Everything runs in .venv, which set-up makes and keeps to requirements.lock.
 .DEFAULT_GOAL := help
+# What is given as NAME=value goes to programs through the environment, as it was written: make would expand a `$` in it
+# wherever it exports or mentions the variable, and a shell its quotes and backticks.  First of all, before any $(shell …).
+$(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(eval override $(name) := $$(value $(name)))$(eval export $(name))))
+override export GOAL = $@
 SHELL := /bin/bash
-PY := .venv/bin/python
-STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
-OPTIONS = $(if $(DATASET),--dataset "$(DATASET)") $(if $(SET),--set "$(SET)") $(if $(filter-out 0,$(FORCE)),--force)
-OPTIONS_NOT_FORCED = $(if $(DATASET),--dataset "$(DATASET)") $(if $(SET),--set "$(SET)")
+override PY := .venv/bin/python
+override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
-unexport DATASET SET FORCE
 
 .PHONY: all plan why status graph validate verify clean gc setup test test-long data help $(STAGES)
 
-all plan why $(STAGES): .venv/ready
-	@$(PY) -m factorlib $@ $(OPTIONS)
-
-status validate: .venv/ready
-	@$(PY) -m factorlib $@ $(OPTIONS_NOT_FORCED)
-
-graph gc: .venv/ready
-	@$(PY) -m factorlib $@
-
-clean verify: .venv/ready
-	@$(PY) -m factorlib $@ $(if $(DATASET),--dataset "$(DATASET)")
+# each reads DATASET, SET and FORCE from the environment
+all plan why status graph validate verify clean gc $(STAGES): .venv/ready
+	@$(PY) -m factorlib "$$GOAL"
 
 setup: .venv/ready
 	@:
 
 .venv/ready: requirements.lock factorlib/setup.py
-	@for python in $(PYTHON) python3.11 python3.12 python3; do \
-	  $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && exec $$python -I factorlib/setup.py; \
+	@for python in $${PYTHON:+"$$PYTHON"} python3.11 python3.12 python3; do \
+	  "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && exec "$$python" -I factorlib/setup.py; \
 	done; echo "set-up: no Python 3.11 or 3.12 was found; install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1
 
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache
 	@.venv/bin/lint-imports --no-cache
-	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider
+	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 env -u DATASET -u SET -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
 
 test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
 bench-%: .venv/ready
-	@OMP_NUM_THREADS=1 $(PY) -m benchmarks.$*
+	@OMP_NUM_THREADS=1 $(PY) -m "benchmarks.$${GOAL#bench-}"
 
 data: .venv/ready
 	@$(PY) -m factorlib.generate synthetic
@@ -54,7 +47,7 @@ help:
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
-	@echo 'make clean [DATASET=…]               delete the results of a dataset, or of all'
+	@echo 'make clean [DATASET=…]               forget the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
@@ -67,6 +60,6 @@ help:
 
 .DEFAULT:
 	@test -e .venv/ready || $(MAKE) setup
-	@$(PY) -m factorlib $@ $(OPTIONS)
+	@$(PY) -m factorlib "$$GOAL"
 
 Makefile pipeline.yaml requirements.lock factorlib/setup.py: ;

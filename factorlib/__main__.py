@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import sys
@@ -14,6 +15,7 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.stop import heed_stops
 
 
 class Verbs(typer.core.TyperGroup):
@@ -25,12 +27,13 @@ class Verbs(typer.core.TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}  # what the system refuses to this user
+
 app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-Dataset = Annotated[str, typer.Option("--dataset", "-d", envvar="DATASET", help="its name in data/, or a path to its folder")]
-MaybeDataset = Annotated[str | None, typer.Option("--dataset", "-d", help="its name in data/, or a path; all of build/ without it")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="stage.parameter=value, as in solve.lobes=64")]
-Force = Annotated[bool, typer.Option("--force", help="run again, whatever the store holds")]
+Dataset = Annotated[str | None, typer.Option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET")]
+Settings = Annotated[list[str] | None, typer.Option("--set", help="stage.parameter=value, as in solve.lobes=64; else SET")]
+Force = Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")]
 Stages = Annotated[list[str] | None, typer.Argument(help="stages; all without it")]
 
 
@@ -39,36 +42,64 @@ def project() -> Project:
     return Project(Path(os.environ.get("FACTORLIB_ROOT", LIBRARY)).resolve(), photo_sets())
 
 
+# ── what the environment says where the command line does not: make passes it on so, untouched by any shell ──────────
+
+
+def named(dataset: str | None) -> str:
+    """The dataset, by its name or path; whether it may be called so is the project's affair."""
+    if (dataset := named_if_any(dataset)) is None:
+        raise InputError("no dataset is named", key="DATASET", cure="add DATASET=<a name in data/, or a path to a folder>")
+    return dataset
+
+
+def named_if_any(dataset: str | None) -> str | None:
+    return os.environ.get("DATASET") if dataset is None else dataset
+
+
+def chosen(settings: list[str] | None) -> list[str]:
+    return settings or [os.environ.get("SET", "")]
+
+
+def forced(force: bool) -> bool:
+    word = os.environ.get("FORCE", "")
+    if not force and word not in ("", "0", "1"):
+        raise InputError(f"{word!r} is neither 1 nor 0", key="FORCE", cure="write FORCE=1 to run again, or leave it out")
+    return force or word == "1"
+
+
+# ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
 @app.command("all")
-def all_(dataset: Dataset, settings: Settings = None, force: Force = False) -> None:
+def all_(dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
     """Run the whole pipeline, as far as anything must run."""
-    raise typer.Exit(verbs.make(project(), dataset, None, settings or [], force))
+    raise typer.Exit(verbs.make(project(), named(dataset), None, chosen(settings), forced(force)))
 
 
 @app.command()
-def stage(name: str, dataset: Dataset, settings: Settings = None, force: Force = False) -> None:
+def stage(name: str, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
     """Run one stage and what it needs (`python -m factorlib solve`)."""
     known = project()
-    known_verbs = [command.name or command.callback.__name__ for command in app.registered_commands]
-    raise typer.Exit(verbs.make_stage(known, name, known_verbs, dataset, settings or [], force))
+    verbs.check_stage(known, name, [command.name or command.callback.__name__ for command in app.registered_commands])
+    raise typer.Exit(verbs.make(known, named(dataset), [name], chosen(settings), forced(force)))
 
 
 @app.command()
-def plan(dataset: Dataset, stages: Stages = None, settings: Settings = None, force: Force = False) -> None:
+def plan(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
     """What would run."""
-    raise typer.Exit(verbs.show_plan(project(), dataset, stages or None, settings or [], force))
+    raise typer.Exit(verbs.show_plan(project(), named(dataset), stages or None, chosen(settings), forced(force)))
 
 
 @app.command()
-def why(dataset: Dataset, stages: Stages = None, settings: Settings = None, force: Force = False) -> None:
+def why(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
     """Every reason why it would run."""
-    raise typer.Exit(verbs.show_why(project(), dataset, stages or None, settings or [], force))
+    raise typer.Exit(verbs.show_why(project(), named(dataset), stages or None, chosen(settings), forced(force)))
 
 
 @app.command()
-def status(dataset: Dataset, stages: Stages = None, settings: Settings = None) -> None:
+def status(stages: Stages = None, dataset: Dataset = None, settings: Settings = None) -> None:
     """How far each stage is, and what the current results warned of."""
-    raise typer.Exit(verbs.show_status(project(), dataset, stages or None, settings or []))
+    raise typer.Exit(verbs.show_status(project(), named(dataset), stages or None, chosen(settings)))
 
 
 @app.command()
@@ -78,21 +109,21 @@ def graph(mermaid: Annotated[bool, typer.Option("--mermaid", help="as a Mermaid 
 
 
 @app.command()
-def validate(dataset: Dataset, settings: Settings = None) -> None:
+def validate(dataset: Dataset = None, settings: Settings = None) -> None:
     """Check pipeline.yaml, settings and dataset without running anything."""
-    raise typer.Exit(verbs.validate(project(), dataset, settings or []))
+    raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings)))
 
 
 @app.command()
-def verify(dataset: MaybeDataset = None) -> None:
-    """Read every kept result and name what is damaged."""
-    raise typer.Exit(verbs.verify(project(), dataset))
+def verify(dataset: Dataset = None) -> None:
+    """Read every kept result, of a dataset or of all, and name what is damaged."""
+    raise typer.Exit(verbs.verify(project(), named_if_any(dataset)))
 
 
 @app.command()
-def clean(dataset: MaybeDataset = None) -> None:
-    """Delete a dataset's results, or all of build/."""
-    raise typer.Exit(verbs.clean(project(), dataset))
+def clean(dataset: Dataset = None) -> None:
+    """Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all."""
+    raise typer.Exit(verbs.clean(project(), named_if_any(dataset)))
 
 
 @app.command()
@@ -102,19 +133,24 @@ def gc() -> None:
 
 
 @app.command()
-def ship(stage: str, dataset: Dataset) -> None:
+def ship(stage: str, dataset: Dataset = None) -> None:
     """Put a stage's current result into the package (for those who change the stage)."""
-    raise typer.Exit(verbs.ship(project(), stage, dataset))
+    raise typer.Exit(verbs.ship(project(), stage, named(dataset)))
 
 
 def main() -> None:
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
-        app(prog_name="python -m factorlib")
+        with heed_stops():
+            app(prog_name="python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")
     except OSError as error:
         known = disk_error(error, project().build)
+        if known is None and error.errno in NOT_OURS:
+            cure = "check that the folder is there, and that you may read it and write to it"
+            known = InputError(error.strerror, file=error.filename, cure=cure)
         if known is None:
             raise
         sys.exit(f"error: {known}")

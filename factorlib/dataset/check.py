@@ -30,6 +30,7 @@ from factorlib.dataset.schema import (
 from factorlib.errors import InputError, did_you_mean
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
+LONGEST_NAME = 100  # characters; names of files are made of it, and file systems allow these 255 bytes
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
 MASKS = (".png", ".json")
 ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own name
@@ -138,6 +139,8 @@ def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
 def _check_name(key: str, name: str, refuse: Refusal) -> None:
     if not NAME.fullmatch(name):
         refuse(key, f"{name!r} is not a name", "names are made of A-Z a-z 0-9 _ and -, for they name files")
+    if len(name) > LONGEST_NAME:
+        refuse(key, f"the name {name[:20]}… has {len(name)} characters", f"names have at most {LONGEST_NAME}, for they name files")
 
 
 def check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:

@@ -7,6 +7,7 @@ dataset's folder.  Frames, units and directions are those of `factorlib.conventi
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -150,7 +151,7 @@ class Told(msgspec.Struct, frozen=True):
     poses: dict[str, Pose]
 
 
-class Dataset(msgspec.Struct, frozen=True):
+class Dataset(msgspec.Struct, frozen=True, dict=True):
     """A dataset that has been read and found good.
 
     companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
@@ -168,7 +169,11 @@ class Dataset(msgspec.Struct, frozen=True):
         return self.folder.name
 
     def photo(self, name: str) -> PhotoEntry:
-        return next(photo for photo in self.spec.photos if photo.name == name)
+        return self._photos[name]
+
+    @cached_property
+    def _photos(self) -> dict[str, PhotoEntry]:
+        return {photo.name: photo for photo in self.spec.photos}
 
 
 class ObjectMask(msgspec.Struct, frozen=True):

@@ -18,10 +18,14 @@ from factorlib.errors import did_you_mean
 
 
 class Slice(msgspec.Struct, frozen=True):
-    """facts: plain JSON-able values; files: the dataset-relative paths in them, sorted, each once."""
+    """facts: plain JSON-able values; files: the dataset-relative paths in them, sorted, each once.
+
+    fields: the same facts, all of them, by the names that they have in dataset.yaml, as in photos.kitchen.camera.focal_px
+    """
 
     facts: Any
     files: list[str]
+    fields: dict[str, Any]
 
 
 def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
@@ -32,15 +36,20 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
     """
     if name in _OF_SET:
         facts, files = _OF_SET[name](dataset)
+        facts = _json_able(facts)
+        fields = _fields(facts, name) if name in ("materials", "truth") else _fields_of_set(facts)
     elif name not in _OF_PHOTO:
         raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
     elif photo is not None:
         facts, files = _OF_PHOTO[name](dataset, dataset.photo(photo))
+        facts = _json_able(facts)
+        fields = _fields_of_photo(facts, photo)
     else:
         parts = {entry.name: _OF_PHOTO[name](dataset, entry) for entry in dataset.spec.photos}
-        facts = {key: part[0] for key, part in parts.items()}
+        facts = _json_able({key: part[0] for key, part in parts.items()})
         files = [file for part in parts.values() for file in part[1]]
-    return Slice(facts=_json_able(facts), files=sorted(set(files)))
+        fields = {name: value for key, part in facts.items() for name, value in _fields_of_photo(part, key).items()}
+    return Slice(facts=facts, files=sorted(set(files)), fields=fields)
 
 
 def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list[str]]:
@@ -87,6 +96,34 @@ def _object_masks(photo: PhotoEntry) -> list[str]:
 
 def _json_able(facts: Any) -> Any:
     return msgspec.json.decode(msgspec.json.encode(facts))
+
+
+# ── facts by their names in dataset.yaml ─────────────────────────────────────────────────────────────────────────────
+
+
+def _fields_of_photo(facts: dict[str, Any], photo: str) -> dict[str, Any]:
+    """Most are keys of the photo; meshes stand beside the photos, and what is told comes from the source of cameras."""
+    places = {"focal_px": f"photos.{photo}.camera.focal_px", "meshes": "meshes", "told": f"cameras.{photo}"}
+    parts = [_fields(value, places.get(key, f"photos.{photo}.{key}")) for key, value in facts.items()]
+    return {name: value for part in parts for name, value in part.items()}
+
+
+def _fields_of_set(facts: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for key, part in facts.items() for name, value in _fields(part, "the folder's name" if key == "name" else key).items()}
+
+
+def _fields(value: Any, name: str) -> dict[str, Any]:
+    """
+    >>> _fields([{"name": "a", "mask": None}], "objects")
+    {'objects[0].name': 'a', 'objects[0].mask': None}
+    """
+    if value and isinstance(value, dict):
+        items = [(f"{name}.{key}", item) for key, item in value.items()]
+    elif value and isinstance(value, list) and all(isinstance(item, dict) for item in value):
+        items = [(f"{name}[{index}]", item) for index, item in enumerate(value)]
+    else:
+        return {name: value}
+    return {key: leaf for inner, item in items for key, leaf in _fields(item, inner).items()}
 
 
 _OF_PHOTO: dict[str, Callable] = {"photo": _photo, "objects": _objects, "light": _light}

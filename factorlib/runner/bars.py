@@ -40,6 +40,7 @@ class Bars(Display):
             self._refresh(stage)
 
     def finish(self, step: Step, seconds: float) -> None:
+        self.count_off(step)
         self._running.pop(step, None)
         self._words.pop(step, None)
         self._refresh(step.stage)

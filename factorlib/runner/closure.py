@@ -37,13 +37,14 @@ KINDS = ("source:", "data:", "environment:", "program:")  # the fields of a reco
 class Source(msgspec.Struct, frozen=True):
     """What one module's text says.
 
-    digest:  of its syntax tree;  imports: dotted names as imported;  params: fields of its class Params, if it has one
+    digest:  of its syntax tree;  imports: dotted names as imported
+    params:  fields of its class Params, if it has one, and their defaults as they are written
     environment, programs: what it declares its numbers to depend on
     """
 
     digest: str
     imports: list[str]
-    params: list[str] | None
+    params: dict[str, str] | None
     environment: list[str]
     programs: dict[str, str]
 
@@ -119,10 +120,11 @@ def _imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
     return []
 
 
-def _params_of(tree: ast.Module) -> list[str] | None:
+def _params_of(tree: ast.Module) -> dict[str, str] | None:
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and node.name == "Params":
-            return [item.target.id for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
+            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
+            return {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
     return None
 
 
@@ -141,9 +143,9 @@ class Sources:
         self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
         self._found: dict[str, Path | None] = {}
 
-    def stage_params(self, package: str, stage: str, pipeline_file: Path) -> list[str]:
-        """Names of a stage's parameters, read without importing it."""
-        return self._source(f"{package}.{stage}", self._stage_file(package, stage, pipeline_file)).params or []
+    def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, str]:
+        """A stage's parameters and their defaults as they are written, read without importing it."""
+        return self._source(f"{package}.{stage}", self._stage_file(package, stage, pipeline_file)).params or {}
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
         first = f"{package}.{stage}"

@@ -40,6 +40,10 @@ class Display:
             self.totals[p.step.stage] = self.totals.get(p.step.stage, 0) + 1
             self.left[p.step.stage] = self.left.get(p.step.stage, 0) + (p.status != "current")
 
+    def count_off(self, step: Step) -> None:
+        """One is done since the plan was made."""
+        self.left[step.stage] = self.left.get(step.stage, 1) - 1
+
     def say(self, text: str) -> None:
         print(text, file=self.stream, flush=True)
 
@@ -74,6 +78,7 @@ class Display:
             self.say(f"warning: {step}: {text}")
 
     def finish(self, step: Step, seconds: float) -> None:
+        self.count_off(step)
         self._spoke.pop(step, None)
         self.say(f"{step.stage:<10} {step.photo or '':<16} {seconds:6.1f} s")
 

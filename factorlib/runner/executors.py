@@ -1,7 +1,8 @@
-"""Where steps run: `concurrent.futures` executors, one for each number of threads, all within the machine's cores.
+"""Where steps run: `concurrent.futures` executors of one process each, all within the machine's cores.
 
 The number of threads of a step is part of its spec, for numerics depend on it; how many steps run at once is the
-machine's affair.  Any executor with `submit` will do in place of a process pool.
+machine's affair.  A process pool whose process is killed gives up all its work, so each has one process and one step:
+what is killed is that step's affair alone.  Any executor with `submit` will do in place of a pool.
 """
 
 from __future__ import annotations
@@ -17,57 +18,55 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import ClassVar
 
 from factorlib import arithmetic
+from factorlib.runner.stop import whole
 from factorlib.runner.worker import limit_threads
 
 
 class Pools:
-    """Process pools by number of threads; `free` says whether a step of so many threads may start now."""
+    """Executors by number of threads; `free` says whether a step of so many threads may start now."""
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or _cores()
-        self._pools: dict[int, Executor] = {}
-        self._busy: dict[Future, int] = {}
+        self._idle: dict[int, list[Executor]] = {}
+        self._busy: dict[Future, tuple[int, Executor]] = {}
 
     def free(self, threads: int) -> bool:
-        busy = sum(self._busy.values())
+        busy = sum(taken for taken, _ in self._busy.values())
         return busy == 0 or busy + threads <= self.cores
 
     def submit(self, threads: int, function: Callable, *arguments) -> Future:
-        future = self._submit(threads, function, *arguments)
-        self._busy[future] = threads
-        return future
+        with whole(), _OfWorkers():
+            idle = self._idle.setdefault(threads, [])
+            executor = idle.pop() if idle else _executor(threads)
+            try:
+                future = executor.submit(function, *arguments)
+            except BrokenProcessPool:  # its process was killed while it had nothing to do
+                executor.shutdown(wait=False)
+                return self.submit(threads, function, *arguments)
+            self._busy[future] = threads, executor
+            return future
 
     def done(self, future: Future) -> None:
-        self._busy.pop(future, None)
-
-    def _submit(self, threads: int, function: Callable, *arguments) -> Future:
-        if threads not in self._pools:
-            self._pools[threads] = _pool(max(1, self.cores // threads), threads)
-        try:
-            with _OfWorkers():
-                return self._pools[threads].submit(function, *arguments)
-        except BrokenProcessPool:  # a worker was killed earlier: its step has failed, the others get a new pool
-            self._pools.pop(threads).shutdown(wait=False)
-            return self._submit(threads, function, *arguments)
+        threads, executor = self._busy.pop(future)
+        self._idle[threads].append(executor)
 
     def close(self, kill: bool = False) -> None:
-        for pool in self._pools.values():
-            pool.shutdown(wait=False, cancel_futures=True)
+        executors = [e for idle in self._idle.values() for e in idle] + [executor for _, executor in self._busy.values()]
+        for executor in executors:
+            executor.shutdown(wait=False, cancel_futures=True)
         if kill:
             for process in multiprocessing.active_children():
                 process.kill()
-        for pool in self._pools.values():
-            pool.shutdown(wait=True)
+        for executor in executors:
+            executor.shutdown(wait=True)
 
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _pool(workers: int, threads: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid())
-    )
+def _executor(threads: int) -> Executor:
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid()))
 
 
 class _OfWorkers:

@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from factorlib.runner.closure import Source
 
 Signature = tuple[int, int, int, int]
+Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
 FORMAT = 2  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
 
@@ -40,16 +41,25 @@ def write_cache(path: Path, tables: Any) -> None:
         replace_file(path, msgspec.json.encode(tables))
 
 
+def _known(entry: Any, now: Signature, type_: Any) -> Any:
+    """What a file's entry in the cache holds; None where it is of another state of the file, or damaged."""
+    try:
+        then, value = msgspec.convert(entry, tuple[Signature, Any])
+        return msgspec.convert(value, type_) if then == now else None
+    except (msgspec.ValidationError, OverflowError):
+        return None
+
+
 class FileHashes:
     """A cache beside the store; `save` writes it, in whole or not at all."""
 
     def __init__(self, cache: Path | None):
         self.cache = cache
-        self._contents, self._sources = self._read()
+        self._contents, self._sources = (table if isinstance(table, dict) else {} for table in self._read())
         self._changed = False
 
     def content(self, path: Path) -> str:
-        return self._remembered(self._contents, path, lambda: hash_of_file(path), str)
+        return self._remembered(self._contents, path, lambda: hash_of_file(path), Hash)
 
     def source(self, path: Path, parse: Callable[[], Source]) -> Source:
         from factorlib.runner.closure import Source
@@ -58,9 +68,9 @@ class FileHashes:
 
     def _remembered(self, table: dict, path: Path, make: Callable, type_: type):
         now = signature(path)
-        entry = table.get(str(path))
-        if entry and tuple(entry[0]) == now:
-            return entry[1] if isinstance(entry[1], type_) else msgspec.convert(entry[1], type_)
+        known = _known(table.get(str(path)), now, type_)
+        if known is not None:
+            return known
         value = make()
         if signature(path) == now and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
             table[str(path)], self._changed = (now, value), True
@@ -70,7 +80,7 @@ class FileHashes:
         try:
             tables = msgspec.json.decode(self.cache.read_bytes())
             return (tables["contents"], tables["sources"]) if tables["format"] == FORMAT else ({}, {})
-        except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError):
+        except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return {}, {}
 
     def save(self) -> None:

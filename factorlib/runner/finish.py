@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from factorlib.runner.home import claim
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.project import claim
 from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
 
@@ -15,7 +15,7 @@ def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
     planned = survey.planned(frozenset()) if more is None else []
     pipeline, spec = survey.spec.pipeline, survey.spec
     there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
-    before = survey.home.keys()
+    before = survey.home.last_keys()
     keys = {step: key for step, key in before.items() if step in there} | (more or {})
     keys |= {str(p.step): p.key for p in planned if p.status == "current"}
     if keys != before:

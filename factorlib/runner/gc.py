@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
-from factorlib.runner.project import Home, Project
+from factorlib.runner.home import Home, made_homes
+from factorlib.runner.project import Project
 from factorlib.runner.store import Store
 from factorlib.runner.tenancy import alone
+
+
+class Gone(msgspec.Struct, frozen=True):
+    """What was deleted, and what is left beside it, for the runner did not make it."""
+
+    deleted: list[Path]
+    left: list[Path]
+
+    def lines(self, shown: Callable[[Path], str]) -> list[str]:
+        said = [f"deleted {shown(path)}" for path in self.deleted] or ["nothing to delete"]
+        return said + [f"left    {shown(path)}" for path in self.left]
 
 
 class Freed(msgspec.Struct, frozen=True):
@@ -35,23 +50,49 @@ def collect(project: Project) -> Freed:
         dead += list(store.damaged.glob("*"))
         freed = sum(_size(path) for path in dead if path.parent in (store.trees, store.damaged))  # views only link to trees
         for path in unused + dead + rest:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     return Freed(len(unused), freed)
 
 
-def clean(project: Project, home: Home | None) -> None:
-    """Delete a dataset's results (those in the store go with the next gc), or all of build/."""
+def forget(project: Project, home: Home) -> Gone:
+    """Delete a dataset's links and marks; what they led to in the store goes with the next gc."""
+    with alone(Store(project.build / "store")):
+        return _forget(project, home)
+
+
+def forget_all(project: Project) -> Gone:
+    """Delete every dataset's links and marks, and the store; what else lies in build/ stays."""
+    if not project.build.is_dir():
+        return Gone([], [])
     store = Store(project.build / "store")
-    if not project.build.exists():
-        return
     with alone(store):
-        if home is None:
-            for path in project.build.iterdir():
-                if path.name in ("studies", "bench"):
-                    continue
-                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-        elif home.folder.exists():
-            shutil.rmtree(home.folder)
+        parts = [_forget(project, home) for home in made_homes(project)]
+        gone = Gone([path for part in parts for path in part.deleted], [path for part in parts for path in part.left])
+        if not store.root.is_symlink():
+            shutil.rmtree(store.root)
+            gone.deleted.append(store.root)
+        gone.left.extend(path for path in sorted(project.build.iterdir()) if not any(path in left.parents for left in gone.left))
+    return gone
+
+
+def _forget(project: Project, home: Home) -> Gone:
+    """Only what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
+    ours = [path for path in home.folder.iterdir() if _is_link_to_result(path)]
+    ours += [path for path in (home.keys_file, home.log) if path.is_symlink() or path.is_file()]
+    ours += sorted(home.folder.glob(".current.*"))
+    if not home.errors.is_symlink():
+        ours += sorted(home.errors.glob("*.txt"))
+    for path in (*ours, home.mark):
+        path.unlink()
+    for folder in (home.errors, home.folder):
+        with contextlib.suppress(OSError):  # not there, a link, or with something in it
+            folder.rmdir()
+    left = sorted(home.folder.iterdir()) if home.folder.is_dir() else []
+    return Gone([home.folder] if not left else [*ours, home.mark], left)
+
+
+def _is_link_to_result(path: Path) -> bool:
+    return path.is_symlink() and os.readlink(path).startswith("../store/")
 
 
 def _size(path: Path) -> int:

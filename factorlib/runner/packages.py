@@ -11,6 +11,13 @@ import msgspec
 from factorlib.runner.filehash import write_cache
 
 
+class _Stored(msgspec.Struct):
+    """The cache: the state of site-packages, and by import name {distribution: version}."""
+
+    state: list
+    versions: dict[str, dict[str, str]]
+
+
 class Packages:
     """Import name -> "distribution version", looked up once per state of site-packages."""
 
@@ -40,9 +47,9 @@ class Packages:
 
     def _read(self) -> dict:
         try:
-            stored = msgspec.json.decode(self.cache.read_bytes())
-            return stored["versions"] if stored["state"] == self.state else {}
-        except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError):
+            stored = msgspec.json.decode(self.cache.read_bytes(), type=_Stored)
+            return stored.versions if stored.state == self.state else {}
+        except (AttributeError, OSError, msgspec.DecodeError, RecursionError):
             return {}
 
     def save(self) -> None:

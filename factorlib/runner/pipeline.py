@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shlex
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,9 +13,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.names import check_name
 from factorlib.yamlfile import parse_yaml, read_yaml
 
 FORMAT = 1
+SHOWN = 80  # characters of a setting that messages repeat
+LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
+NAME = re.compile("[a-z][a-z0-9_]*")
+TAKEN = ("errors",)  # a folder beside the links that are called as the stages
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -98,6 +106,10 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
 
 def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
+    if not NAME.fullmatch(name) or name in TAKEN:
+        raise InputError(f"a stage cannot be called {name!r}", file=path, key="stages", cure="give it another name, of a-z, 0-9 and _")
+    if stage.gather is not None:
+        check_name(stage.gather, "a gathered file", file=path, key=f"stages.{name}.gather")
     for entry in stage.inputs:
         known = [DATASET + s for s in known_slices] + list(pipeline.stages)
         if entry not in known:
@@ -116,20 +128,59 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
     {'lobes': 64, 'tolerance': 0.001}
     """
     stages = dict(pipeline.stages)
-    for word in (word for text in settings for word in shlex.split(text)):
+    for word in (word for text in settings for word in _words(text)):
         stage, keys, value = _setting(word, stages)
         stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
     return msgspec.structs.replace(pipeline, stages=stages)
 
 
+def _words(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise InputError(f"{text[:SHOWN]!r} cannot be split into words ({error})", key="SET", cure="close every quote") from error
+
+
 def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
     target, equals, value = word.partition("=")
     stage, *keys = target.split(".")
-    if not equals or not keys or not all(keys):
-        raise InputError(f"{word!r} is no setting", key="SET", cure='write stage.parameter=value, as in SET="solve.lobes=64"')
+    shown = word if len(word) <= SHOWN else word[:SHOWN] + "…"
+    if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
+        raise InputError(f"{shown!r} is no setting", key="SET", cure='write stage.parameter=value, as in SET="solve.lobes=64"')
     if stage not in stages:
-        raise InputError(f"there is no stage {stage!r}", key=f"SET {word}", cure=did_you_mean(stage, stages))
-    return stage, keys, parse_yaml(value, f"SET {word}")
+        raise InputError(f"there is no stage {stage!r}", key=f"SET {shown}", cure=did_you_mean(stage, stages))
+    try:
+        return stage, keys, parse_yaml(value, f"SET {shown}")
+    except (ValueError, RecursionError) as error:  # thousands of digits or brackets
+        raise InputError(f"not readable as a value ({error})", key=f"SET {shown}", cure="write a number, a word, or a short list") from error
+
+
+def check_values(pipeline: Pipeline, file: Path) -> Pipeline:
+    """The pipeline, where every parameter is something that a key can hold: finite numbers of 64 bits, and text."""
+    for name, stage in pipeline.stages.items():
+        for key, value in _leaves(stage.params, f"stages.{name}.params"):
+            if wrong := _no_value(value):
+                raise InputError(f"{str(value)[:SHOWN]!r} {wrong}", file=file, key=key, cure="write a number, a word, or leave it out")
+    return pipeline
+
+
+def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
+    if items is None:
+        yield key, value
+    else:
+        for name, item in items:
+            yield from _leaves(item, f"{key}.{name}")
+
+
+def _no_value(value: Any) -> str | None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return "is not a finite number"
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return "is not a number of 64 bits"
+    if isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
+        return "is not text"
+    return None
 
 
 def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """What must run, and why: a pure function of what is declared, what it all hashes to, and what the store holds.
 
 A step's record is a flat table of everything its result depends on: its name, the source of every module it imports,
-its parameters, its inputs' content hashes, versions.  No path outside the dataset and no time is in it.  Its key is
+its parameters, what dataset.yaml says that it sees, its inputs' content hashes, versions.  No path outside the dataset and no time is in it.  Its key is
 the hash of that table, the difference of two tables is the reason for a rerun, and a step whose inputs are not made yet
 is a *maybe*: it reruns only if they come out different.
 """
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from factorlib.runner.integrity import in_short
-from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.pipeline import DATASET, Pipeline
 
 Record = dict[str, Any]
 Status = Literal["current", "to run", "maybe"]
@@ -47,9 +47,11 @@ class Spec(msgspec.Struct, frozen=True):
         return [Step(stage, photo) for photo in self.photos] if self.pipeline.stages[stage].over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:
-        """The steps whose results a step is handed."""
+        """The steps whose results a step is handed: of its own photo, or of all for a step over the whole set."""
         upstream = self.pipeline.stages[step.stage].upstream
-        return [found for name in upstream for found in self.steps_of(name) if step.photo is None or found.photo in (None, step.photo)]
+        if step.photo is None:
+            return [found for name in upstream for found in self.steps_of(name)]
+        return [Step(name, step.photo if self.pipeline.stages[name].over else None) for name in upstream]
 
 
 class Listing(msgspec.Struct, frozen=True):
@@ -134,7 +136,8 @@ def key_of(record: Record) -> str:
 _KIND = {
     "source": "source of {}",
     "param": "parameter {}",
-    "facts": "{} in the dataset's files",
+    "default": "default of parameter {}",
+    "facts": "dataset.yaml: {}",
     "file": "file {}",
     "given": "given file {}",
     "input": "result of {}",
@@ -148,23 +151,42 @@ _KIND = {
 
 def difference(before: Record, after: Record) -> list[str]:
     """What changed between two records, in words, one line per cause."""
-    lines = []
-    for name in sorted(before.keys() | after.keys()):
-        if before.get(name, _ABSENT) != after.get(name, _ABSENT):
-            lines.append(_change(name, before.get(name, _ABSENT), after.get(name, _ABSENT)))
-    return lines
+    changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
+    return [_change(name, before, after) for name in changed]
 
 
 _ABSENT = object()
+_HASHED = ("source", "file", "given", "input", "data")
+_LONGEST = 80  # characters of a value that are shown
+_NAMED = 4  # names that came or went
 
 
-def _change(name: str, before: Any, after: Any) -> str:
+def _change(name: str, before: Record, after: Record) -> str:
     kind, colon, what = name.partition(":")
-    label = _KIND.get(kind, "{}").format(what) if colon else name
-    if kind in ("source", "facts", "file", "given", "input", "data"):
-        return f"{label}: " + ("new" if before is _ABSENT else "gone" if after is _ABSENT else "changed")
-    shown = ["default" if v is _ABSENT and kind == "param" else "none" if v is _ABSENT else json.dumps(v) for v in (before, after)]
-    return f"{label}: {shown[0]} -> {shown[1]}"
+    label = _KIND.get(kind, "{}").format(what.removeprefix(DATASET) if kind == "facts" else what) if colon else name
+    old, new = before.get(name, _ABSENT), after.get(name, _ABSENT)
+    if kind in _HASHED:
+        return f"{label}: " + ("new" if old is _ABSENT else "gone" if new is _ABSENT else "changed")
+    if isinstance(old, list) and isinstance(new, list) and (moved := _come_and_gone(old, new)):
+        return f"{label}: {moved}"
+    return f"{label}: {_shown(old, before, kind, what)} -> {_shown(new, after, kind, what)}"
+
+
+def _shown(value: Any, record: Record, kind: str, what: str) -> str:
+    if value is _ABSENT and kind == "param":
+        return f"{record[f'default:{what}']} (the default)" if f"default:{what}" in record else "default"
+    if value is _ABSENT or (value is None and kind == "facts"):
+        return "not given" if kind == "facts" else "none"
+    text = value if kind == "default" else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
+
+
+def _come_and_gone(old: list, new: list) -> str:
+    """Of two lists of names, which came and which went; nothing where that does not tell them apart."""
+    came, gone = [name for name in new if name not in old], [name for name in old if name not in new]
+    if not all(isinstance(name, str) for name in came + gone):
+        return ""
+    return ", ".join([*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])])
 
 
 def names(steps: Iterable[Step]) -> str:

@@ -1,10 +1,10 @@
-"""Where everything lies: the project's root, its pipeline, its datasets by name or path, and each dataset's results."""
+"""Where everything lies: the project's root, its pipeline, its results, its datasets by name or path."""
 
 from __future__ import annotations
 
 import importlib
-import json
 import os
+import stat
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,15 +13,18 @@ from typing import Any, Protocol
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import json_text
-from factorlib.wholefile import replace_file
+from factorlib.runner.names import RESERVED, check_name
+from factorlib.runner.stop import take_sigterm_back
 
-RESERVED = ("studies", "bench", "store")  # folders of build/ that are no datasets
+HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 
 
 class Slice(Protocol):
+    """facts: JSON-able;  fields: the same by the names that they have in the dataset's file;  files: that they name."""
+
     facts: Any
+    fields: dict[str, Any]
     files: list[str]
 
 
@@ -56,6 +59,7 @@ def photo_sets() -> Provider:
 
     def read(path: Path) -> Data:
         dataset = read_dataset(path)
+        take_sigterm_back()
         photos = [photo.name for photo in dataset.spec.photos]
         return Data(dataset.folder, photos, lambda name, photo: dataset_slice(dataset, name, photo), _looking_at(dataset))
 
@@ -97,73 +101,39 @@ class Project(msgspec.Struct, frozen=True):
         return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
     def dataset_folder(self, name: str) -> Path:
-        """A dataset by its name in data/, or by its path."""
-        found = self.root / "data" / name
-        if "/" not in name and found.is_dir():
+        """A dataset by its name in data/, or by its path; InputError where it is not there."""
+        found = self.find_dataset(name)
+        if found is not None:
             return found
-        path = Path(os.path.abspath(name))
-        if path.is_dir() or path.is_file():
-            return path if path.is_dir() else path.parent
         known = [p.parent.name for p in (self.root / "data").glob("*/dataset.yaml")]
-        cure = (
-            did_you_mean(name, known)
-            if known and "/" not in name
-            else "name a folder in data/, or give a path to one with a dataset.yaml in it"
-        )
+        cure = did_you_mean(name, known) if known and not is_path(name) else HOW
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
-
-class Home(msgspec.Struct, frozen=True):
-    """build/<dataset>: links to the current results, which key each step has, and the log of all runs."""
-
-    folder: Path
-
-    @property
-    def log(self) -> Path:
-        return self.folder / "log.jsonl"
-
-    @property
-    def keys_file(self) -> Path:
-        return self.folder / "current.json"
-
-    def keys(self) -> dict[str, str]:
-        """Key by step, as the last run left it."""
-        try:
-            return json.loads(self.keys_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-
-    def write_keys(self, keys: dict[str, str]) -> None:
-        replace_file(self.keys_file, json_text(keys).encode())
+    def find_dataset(self, name: str) -> Path | None:
+        """The same, None where it is not there; InputError for what can be no dataset's name or path."""
+        if not is_path(name) or name.rstrip("/") in ("", ".", ".."):
+            check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
+            if (found := _folder_at(self.root / "data" / name, name)) is not None:
+                return found
+        found = _folder_at(Path(os.path.abspath(name)), name)
+        if found is not None:
+            check_name(found.name, "a dataset", file=found, key="DATASET", reserved=RESERVED)
+            if self.root.is_relative_to(found) or found == self.build:
+                raise InputError("a dataset cannot be the folder that holds the project", file=found, key="DATASET", cure=HOW)
+        return found
 
 
-def home_of(project: Project, dataset: Path) -> Home:
-    """build/<name of the dataset's folder>; refused where a folder of that name elsewhere has it."""
-    name = dataset.name
-    if name in RESERVED:
-        raise InputError(f"a dataset cannot be called {name!r}", file=dataset, cure="rename its folder: build/ uses that name")
-    home = Home(project.build / name)
-    owner = owner_of(project, home)
-    if owner is not None and owner.is_dir() and not owner.samefile(dataset):
-        raise InputError(
-            f"two datasets are called {name!r}: build/{name} holds the results of {owner}",
-            file=dataset,
-            cure=f"rename one of the folders, or give its results up: make clean DATASET={owner}",
-        )
-    return home
+def is_path(name: str) -> bool:
+    """Whether a dataset is named by its path, not by its name."""
+    return "/" in name
 
 
-def owner_of(project: Project, home: Home) -> Path | None:
+def _folder_at(path: Path, name: str) -> Path | None:
+    """The folder at a path, or the one that holds the file there; None where nothing is."""
     try:
-        words = (home.folder / "dataset.txt").read_text(encoding="utf-8").strip()
-    except OSError:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    return project.root / words
-
-
-def claim(project: Project, home: Home, dataset: Path) -> None:
-    """Write down whose results these are: relative to the project where the dataset lies in it, for checkouts move."""
-    home.folder.mkdir(parents=True, exist_ok=True)
-    words = str(dataset.relative_to(project.root)) if dataset.is_relative_to(project.root) else str(dataset)
-    if owner_of(project, home) != project.root / words:
-        replace_file(home.folder / "dataset.txt", f"{words}\n".encode())
+    except (OSError, ValueError) as error:  # no right to look, links in a circle, a part too long, a NUL
+        raise InputError(f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})", key="DATASET", cure=HOW) from error
+    return path if stat.S_ISDIR(mode) else path.parent

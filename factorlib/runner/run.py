@@ -1,7 +1,9 @@
 """Running a plan: start what is ready, take in what is done, plan again, until nothing is left that can run.
 
-After each result the same pure `plan` is asked anew, so an output that came out unchanged stops what follows there, and
-what another run made meanwhile is used.  A step that fails holds up only what depends on it.
+Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that came
+out unchanged stops what follows there, and what another run made meanwhile is used.  What a plan calls ready stays so, for
+all it takes is made; hence a plan for every stage is enough, not one for every result.  A step that fails holds up only
+what depends on it.
 """
 
 from __future__ import annotations
@@ -18,14 +20,15 @@ from filelock import FileLock, Timeout
 from factorlib.runner.display import Display
 from factorlib.runner.executors import Pools
 from factorlib.runner.finish import label, remember
+from factorlib.runner.home import claim
+from factorlib.runner.logs import sound_lines
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.project import claim
 from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
-from factorlib.wholefile import append_text, write_text
+from factorlib.wholefile import append_text, write_bytes, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say
 
@@ -78,10 +81,12 @@ class Run:
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()
-        self.keys: dict[Step, str | None] = {}
-        self.made: set[str] = set()  # keys
         self.tally = Tally()
         self.planned: list[Planned] = []
+        self.outputs: dict[Step, str | None] = {}  # as planned
+        self.keys: dict[Step, str | None] = {}
+        self.stale = False  # there are results that the plan does not know
+        self.made: set[str] = set()  # keys
 
     def go(self) -> None:
         self._plan()
@@ -97,13 +102,16 @@ class Run:
         self._plan()
         stages = dict.fromkeys(p.step.stage for p in self.planned if p.status != "current")
         checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
-        futures = [self.pools.submit(code.threads, check_params, code) for code in checks]
-        outcomes = [_outcome_of(future) for future in futures]
-        for future in futures:
-            self.pools.done(future)
-        for code, outcome in zip(checks, outcomes, strict=True):
-            if outcome.error:
-                self._fail(Step(code.stage), outcome)
+        running: dict[Future, Code] = {}
+        while checks or running:
+            while checks and self.pools.free(checks[0].threads):
+                code = checks.pop(0)
+                running[self.pools.submit(code.threads, check_params, code)] = code
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                outcome, code = _outcome_of(future), running.pop(future)
+                self.pools.done(future)
+                if outcome.error:
+                    self._fail(Step(code.stage), outcome)
         if self.tally.failed:
             raise Refused(self.tally.failed)
 
@@ -115,16 +123,27 @@ class Run:
 
     def _plan(self) -> None:
         self.planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        self.outputs = {planned.step: planned.output for planned in self.planned}
         self.keys = {planned.step: planned.key for planned in self.planned}
         self.display.plan(self.planned)
+        self.stale = False
 
     def _start_ready(self) -> None:
         self.waiting = set()
-        for planned in list(self.planned):
-            step = planned.step
-            if planned.status != "to run" or planned.key is None or step in self.running or step in self.tally.failed:
+        self._start_planned()
+        while self.stale and self.pools.free(1):
+            self._plan()
+            self._start_planned()
+
+    def _start_planned(self) -> None:
+        for planned in self.planned:
+            if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
-            if self.pools.free(self.survey.spec.pipeline.stages[step.stage].threads):
+            if planned.step in self.running or planned.step in self.tally.failed:
+                continue
+            if not self.pools.free(1):
+                return
+            if self.pools.free(self.survey.spec.pipeline.stages[planned.step.stage].threads):
                 self._start(planned)
 
     def _start(self, planned: Planned) -> None:
@@ -141,8 +160,7 @@ class Run:
         self.survey.outputs.forget(planned.key)
         if self.survey.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
             lock.release()  # another run has made it meanwhile
-            self.waiting.add(planned.step)
-            self._plan()
+            self.stale = True
             return
         if not self.survey.outputs.still([self.keys[above] for above in self.survey.spec.above(planned.step)]):
             lock.release()  # a run takes hours, and what is used only now is damaged by now
@@ -184,8 +202,7 @@ class Run:
 
     def _folder(self, step: Step, name: str) -> Path:
         """Where the files of the stage `name` are for this step."""
-        outputs = {planned.step: planned.output for planned in self.planned}
-        stage, store = self.survey.spec.pipeline.stages[name], self.survey.store
+        stage, store, outputs = self.survey.spec.pipeline.stages[name], self.survey.store, self.outputs
         if not stage.over:
             return store.tree(outputs[Step(name)])
         if step.photo is not None:
@@ -198,7 +215,7 @@ class Run:
         """What the steps above cost and said when their present results were made, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.survey.store.log(p.key) for p in self.planned if p.step.stage in above and p.key]
-        write_text(path, "".join(log.read_text(encoding="utf-8") for log in logs if log.exists()))
+        write_bytes(path, b"".join(line + b"\n" for log in logs for line in sound_lines(log)))
         return path
 
     # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -214,11 +231,10 @@ class Run:
             self._listen(work)
         for future in done:
             self._take(self.running.pop(futures[future]))
-        if done or self.waiting:
-            for planned in self.planned:
-                if planned.step in self.waiting:
-                    self.survey.outputs.forget(planned.key)
-            self._plan()
+        self.stale = self.stale or bool(done or self.waiting)
+        for planned in self.planned if self.waiting else []:
+            if planned.step in self.waiting:
+                self.survey.outputs.forget(planned.key)
         self.display.tick()
 
     def _listen(self, work: Running) -> None:
@@ -250,13 +266,13 @@ class Run:
         if before is not None and before != outcome.output:
             self.display.warn(step, "made again from the same inputs, it came out different")
         self.survey.outputs.forget(work.task.key)
-        self.made.add(work.task.key)
         if outcome.damaged:
             self.display.warn(
                 step, f"its kept result was damaged and is replaced; what was there: {self.survey.project.shown(outcome.damaged)}"
             )
         self.survey.previous[str(step)] = work.task.record
         self.tally.ran.append(step)
+        self.made.add(work.task.key)
         self._log(self.survey.store.log(work.task.key).read_text(encoding="utf-8"))
         remember(self.survey, {str(step): work.task.key})
         self.display.finish(step, outcome.seconds)
@@ -265,7 +281,7 @@ class Run:
         self.tally.failed[step] = outcome
         where = None
         if outcome.traceback:
-            path = self.survey.home.folder / "errors" / f"{label(step)}.txt"
+            path = self.survey.home.errors / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import contextlib
+import logging
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,14 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.closure import Closure, Sources
 from factorlib.runner.filehash import FileHashes
+from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
-from factorlib.runner.pipeline import DATASET, Pipeline, Stage, read_pipeline, with_settings
+from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import Data, Home, Project, home_of
+from factorlib.runner.project import Data, Project
 from factorlib.runner.store import Outputs, Store
+
+log = logging.getLogger("factorlib.runner")
 
 
 @dataclass
@@ -44,7 +48,7 @@ class Survey:
 
 def survey(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False) -> Survey:
     """Read everything a plan needs; every InputError there is about pipeline, settings or dataset comes from here."""
-    pipeline = with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings)
+    pipeline = check_values(with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings), project.pipeline_file)
     for name in targets or []:
         if name not in pipeline.stages:
             raise InputError(f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages))
@@ -57,10 +61,19 @@ def survey(project: Project, dataset: str, targets: list[str] | None, settings: 
         spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
     hashes, packages = FileHashes(store.cache / "files.json"), Packages(store.cache / "packages.json")
     records = _records(project, spec, data, hashes, packages)
-    hashes.save()
-    packages.save()
-    outputs, entries = Outputs(store), {step: store.entry(key) for step, key in home.keys().items()}
+    with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
+        hashes.save()
+        packages.save()
+    outputs, entries = Outputs(store), {step: store.entry(key) for step, key in _last_keys(home).items()}
     return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e})
+
+
+def _last_keys(home: Home) -> dict[str, str]:
+    try:
+        return home.keys()
+    except InputError as error:
+        log.warning("%s; nothing is lost, but it is not known what changed since the last run", error)
+        return {}
 
 
 def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages) -> dict[Step, Record]:
@@ -69,6 +82,7 @@ def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packa
     records = {}
     for name in spec.pipeline.needed(spec.targets):
         of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        of_stage |= {f"default:{param}": text for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()}
         of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
             records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
@@ -104,7 +118,7 @@ def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) 
             try:
                 record[f"given:{param}/{file}"] = hashes.content(folder / file)
             except (OSError, TypeError):
-                found = "there is no such folder" if not folder.is_dir() else f"it has no readable {file!r}"
+                found = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"
                 key, cure = f"{name}.{param}", f"name a folder with {', '.join(files)}, such as the result of an earlier run of the stage"
                 raise InputError(found, file=project.shown(folder), key=key, cure=cure) from None
     return record
@@ -112,15 +126,20 @@ def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) 
 
 def given_folder(stage: Stage, param: str) -> Path:
     """The folder that a parameter names, from where the user stands; links are followed now, for results move on."""
-    return Path(str(stage.folders[param])).resolve()
+    named = str(stage.folders[param])
+    try:
+        return Path(named).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
+        found = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
+        raise InputError(found, key=param, cure="name a folder") from error
 
 
 def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> Record:
-    """The slices of the dataset a step declares, by hash, and the files they name."""
+    """The slices of the dataset that a step declares, field by field, and the files they name, by content."""
     record: Record = {}
     for name in pipeline.stages[step.stage].slices:
         slice_ = data.slice(name, step.photo)
-        record[f"facts:{DATASET}{name}"] = hashlib.sha256(json.dumps(slice_.facts, sort_keys=True).encode()).hexdigest()[:32]
+        record |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
         for file in slice_.files:
             record[f"file:{file}"] = _hash(data.folder, file, hashes)
     return record

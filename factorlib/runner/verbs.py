@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-import json
+import fcntl
+import os
 import sys
 import time
-from pathlib import Path
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
+from factorlib.runner.home import made_home, made_homes
+from factorlib.runner.logs import warnings_in
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
-from factorlib.runner.project import Project, home_of
+from factorlib.runner.project import Project
+from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 
 
 def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
+    with heed_stops():
+        return _make(project, dataset, targets, settings, force)
+
+
+def _make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
     started = time.perf_counter()
     seen = survey(project, dataset, targets, settings, force)
     planned = seen.planned()
@@ -33,12 +41,11 @@ def make(project: Project, dataset: str, targets: list[str] | None, settings: li
     return _run(seen, targets, started)
 
 
-def make_stage(project: Project, name: str, verbs: list[str], dataset: str, settings: list[str], force: bool) -> int:
-    """The same for a word from the command line that is no verb: it must be the name of a stage."""
+def check_stage(project: Project, name: str, verbs: list[str]) -> None:
+    """A word from the command line that is no verb must be the name of a stage."""
     stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
     if name not in stages:
         raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
-    return make(project, dataset, [name], settings, force)
 
 
 def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
@@ -50,9 +57,9 @@ def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
         tally = run(seen, display)
     except Refused:
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Stopped) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
-        return 130
+        return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
     if tally.failed:
@@ -95,23 +102,22 @@ def show_status(project: Project, dataset: str, targets: list[str] | None, setti
 
 def is_running(seen: Survey, planned: Planned) -> bool:
     """Whether a run holds the lock on a step's key."""
-    from filelock import FileLock, Timeout
-
-    path = seen.store.locks / f"{planned.key}.lock"
-    if not path.exists():
+    try:
+        descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
+    except FileNotFoundError:
         return False
     try:
-        with FileLock(path, timeout=0):
-            return False
-    except Timeout:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
         return True
+    finally:
+        os.close(descriptor)
 
 
 def warnings_of(seen: Survey, planned: Planned) -> list[str]:
     """What a step said when its present result was made."""
-    log: Path = seen.store.log(planned.key)
-    events = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()] if log.exists() else []
-    return [event["text"] for event in events if event["event"] == "warning"]
+    return warnings_in(seen.store.log(planned.key))
 
 
 def show_graph(project: Project, mermaid: bool) -> int:
@@ -141,25 +147,16 @@ def _refused(seen: Survey, found: list[InputError]) -> int:
 
 
 def clean(project: Project, dataset: str | None) -> int:
-    from factorlib.runner.gc import clean as delete
+    """Forget the results of one dataset, or of all, and say what was deleted."""
+    from factorlib.runner.gc import forget, forget_all
 
-    home = None if dataset is None else home_of_name(project, dataset)
-    delete(project, home)
-    print(f"deleted {project.shown(project.build if home is None else home.folder)}")
+    home = None if dataset is None else made_home(project, dataset)
+    if dataset is not None and home is None:
+        print(f"nothing to delete: {dataset} has no results")
+        return 0
+    gone = forget_all(project) if home is None else forget(project, home)
+    print("\n".join(gone.lines(project.shown)))
     return 0
-
-
-def home_of_name(project: Project, dataset: str):
-    """build/<dataset>, also of a dataset that is no longer there."""
-    try:
-        return home_of(project, project.dataset_folder(dataset))
-    except InputError:
-        from factorlib.runner.project import Home
-
-        home = Home(project.build / Path(dataset).name)
-        if not (home.folder / "dataset.txt").exists():
-            raise
-        return home
 
 
 def collect(project: Project) -> int:
@@ -172,13 +169,15 @@ def collect(project: Project) -> int:
 
 def verify(project: Project, dataset: str | None) -> int:
     """Read every result, of a dataset or of all; 1 where any is not as it was kept."""
-    from factorlib.runner.project import Home
     from factorlib.runner.verify import verify as read_all
 
-    store = Store(project.build / "store")
-    homes = [home_of_name(project, dataset)] if dataset else [Home(p.parent) for p in sorted(project.build.glob("*/current.json"))]
+    home = None if dataset is None else made_home(project, dataset)
+    if dataset is not None and home is None:
+        print(f"nothing to read: {dataset} has no results")
+        return 0
+    homes = made_homes(project) if home is None else [home]
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    verdict = read_all(store, homes, pipeline, everything=dataset is None)
+    verdict = read_all(Store(project.build / "store"), homes, pipeline, everything=home is None)
     print("\n".join(words.damage_lines(verdict, project.shown)))
     return 1 if verdict.damaged else 0
 

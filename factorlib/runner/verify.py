@@ -13,10 +13,10 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.home import Home
 from factorlib.runner.integrity import Inspector, stamps_of
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import key_of
-from factorlib.runner.project import Home
 from factorlib.runner.store import Entry, Store
 from factorlib.runner.views import gathered
 

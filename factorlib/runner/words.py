@@ -81,12 +81,16 @@ def _alike(planned: list[Planned]) -> list[list[Planned]]:
 
 
 def _of_any_photo(reason: str, step: Step) -> str:
-    """`masks/kitchen` is `masks` to the step of the kitchen.
+    """`masks/kitchen` is `masks` to the step of the kitchen, `photos.kitchen.image` is `photos.*.image`.
 
     >>> _of_any_photo("if masks/kitchen, train comes out different", Step("align", "kitchen"))
     'if masks, train comes out different'
     """
-    return reason.replace(f"/{step.photo}", "") if step.photo and reason.startswith(("if ", "result of ")) else reason
+    if step.photo is None:
+        return reason
+    if reason.startswith(("if ", "result of ")):
+        return reason.replace(f"/{step.photo}", "")
+    return reason.replace(f" photos.{step.photo}.", " photos.*.", 1) if reason.startswith("dataset.yaml:") else reason
 
 
 def _photos(group: list[Planned]) -> str:

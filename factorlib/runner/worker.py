@@ -31,6 +31,7 @@ from factorlib.runner.integrity import Stamp, stamps_of
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shipped import copy_shipped, shipped_folder
+from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Store
 from factorlib.stage import Inputs
 from factorlib.wholefile import replace_file
@@ -120,6 +121,7 @@ def load_stage(code: Code) -> ModuleType:
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
+    take_sigterm_back()
     limit_threads(code.threads)
     return module
 

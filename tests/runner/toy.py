@@ -83,13 +83,14 @@ stages:
 class Slice(msgspec.Struct):
     facts: object
     files: list[str]
+    fields: dict
 
 
 def read(folder: Path) -> Data:
     photos = sorted(path.stem for path in folder.glob("*.txt"))
 
     def slice_(name, photo):
-        return Slice({"image": f"{photo}.txt"}, [f"{photo}.txt"])
+        return Slice({"image": f"{photo}.txt"}, [f"{photo}.txt"], {f"photos.{photo}.image": f"{photo}.txt"})
 
     return Data(folder, photos, slice_)
 

@@ -1,0 +1,65 @@
+"""SIGTERM ends a command as cleanly as Ctrl-C does: what was finished is kept, the workers are stopped, the exit code says it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
+_waiting: list[int] | None = None  # signals that came while nothing may be interrupted
+
+
+class Stopped(SystemExit):
+    """SIGTERM came."""
+
+    def __init__(self):
+        super().__init__(TERMINATED)
+
+
+@contextlib.contextmanager
+def heed_stops() -> Iterator[None]:
+    """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
+    heeded = [number for number in (signal.SIGINT, signal.SIGTERM) if _in_main_thread() and signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, _stop) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def whole() -> Iterator[None]:
+    """What begins within is finished before a stop is heeded.  Processes that are started within never see SIGINT."""
+    global _waiting
+    outer, _waiting = _waiting, [] if _waiting is None else _waiting
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        came, _waiting = _waiting, outer
+    if outer is None and came:
+        _stop(came[0])
+
+
+def take_sigterm_back() -> None:
+    """What Python does at SIGTERM holds again: pycolmap, once imported, prints a C stack instead."""
+    if _in_main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+
+
+def _in_main_thread() -> bool:
+    """Only there may Python say what a signal does."""
+    return threading.current_thread() is threading.main_thread()
+
+
+def _stop(number: int, *_) -> None:
+    if _waiting is not None:
+        _waiting.append(number)
+        return
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    raise Stopped if number == signal.SIGTERM else KeyboardInterrupt

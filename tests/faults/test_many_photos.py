@@ -1,0 +1,130 @@
+"""Planning is linear in the number of photos, by the work that is done, not by a clock."""
+
+import os
+import sys
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from factorlib.dataset.schema import Dataset, DatasetFile
+from factorlib.dataset.slices import dataset_slice
+from factorlib.runner.display import Display
+from factorlib.runner.executors import Pools
+from factorlib.runner.pipeline import read_pipeline
+from factorlib.runner.plan import Listing, Spec, plan
+from factorlib.runner.project import LIBRARY, photo_sets
+from factorlib.runner.run import run
+from factorlib.runner.survey import survey
+from tests.runner import toy
+
+
+def work(function):
+    """How many bytecodes a call executes."""
+    count = 0
+
+    def trace(frame, event, _):
+        nonlocal count
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        count += event == "opcode"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        function()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+class Everything(dict):
+    """A store that holds a result of every key."""
+
+    def get(self, key, default=None):
+        return f"output of {key}"
+
+
+def planning(photos, outputs):
+    spec = Spec(read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices), [f"p{k}" for k in range(photos)])
+    own = {step: {"stage": step.stage, "photo": step.photo} for step in spec.steps()}
+    return lambda: plan(spec, own, Listing(outputs, {str(step): own[step] for step in own}))
+
+
+def slicing(photos):
+    entry = {"image": "i.png", "masks": "m.png", "objects": [{"name": "o", "mesh": "m"}]}
+    file = {"format": 1, "materials": ["a"], "meshes": {"m": {"file": "m.obj"}}, "photos": [{"name": f"p{k}", **entry} for k in range(photos)]}
+    dataset = Dataset(Path(), msgspec.convert(file, DatasetFile))
+    return lambda: [dataset_slice(dataset, name, photo.name) for photo in dataset.spec.photos for name in ("photo", "objects", "light")]
+
+
+@pytest.mark.parametrize("outputs", [{}, Everything()], ids=["nothing made", "all made"])
+def test_a_plan_is_linear(outputs):
+    works = [work(planning(photos, outputs)) for photos in (20, 40, 80)]
+    assert works[2] - works[1] < 2.1 * (works[1] - works[0])
+
+
+def test_the_slices_of_all_photos_are_linear():
+    works = [work(slicing(photos)) for photos in (20, 40, 80)]
+    assert works[2] - works[1] < 2.1 * (works[1] - works[0])
+
+
+class Inline(Executor):
+    def submit(self, function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+
+class InlinePools(Pools):
+    """Steps in this process, one after the other."""
+
+    def submit(self, threads, function, *arguments):
+        future = Inline().submit(function, *arguments)
+        self._busy[future] = threads, None
+        return future
+
+    def done(self, future):
+        self._busy.pop(future)
+
+
+@contextmanager
+def own_modules(*packages):
+    """Whatever of these packages is imported within is forgotten, and what was there before is there again."""
+    of_these = lambda: {name: module for name, module in sys.modules.items() if name.split(".")[0] in packages}  # noqa: E731
+    before, path, environment = of_these(), list(sys.path), dict(os.environ)
+    for name in before:
+        del sys.modules[name]
+    try:
+        yield
+    finally:
+        for name in of_these():
+            del sys.modules[name]
+        sys.modules.update(before)
+        sys.path[:] = path
+        os.environ.clear()
+        os.environ.update(environment)
+
+
+def plans_of_a_run(root, photos, monkeypatch):
+    project = toy.make_project(root, **{f"p{k}": f"text {k}" for k in range(photos)})
+    seen, count = survey(project, "set", None, []), 0
+    make_plan = seen.planned
+
+    def counted(*arguments):
+        nonlocal count
+        count += 1
+        return make_plan(*arguments)
+
+    monkeypatch.setattr(seen, "planned", counted)
+    with own_modules("stages", "toylib"):
+        tally = run(seen, Display(), InlinePools(1))
+    assert not tally.failed and len(tally.ran) == 2 * photos + 2
+    return count
+
+
+def test_a_run_plans_as_often_for_many_photos_as_for_few(tmp_path, monkeypatch):
+    few, many = (plans_of_a_run(tmp_path / str(photos), photos, monkeypatch) for photos in (3, 12))
+    assert many == few
