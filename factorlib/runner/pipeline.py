@@ -24,6 +24,13 @@ TAKEN = ("errors",)  # a folder beside the links that are called as the stages
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
+class Shipping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """folder: of the package, where the result lies;  made_by: the modules that its content follows from."""
+
+    folder: str
+    made_by: list[str]
+
+
 class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One stage.
 
@@ -36,7 +43,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     optional: run it only where it is asked for, or something that is asked for takes its results
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
              the folder among its inputs, and the key has the files' contents, not where they lie
-    shipped: a folder of the package with the stage's result, taken where it was made from the same sources and parameters
+    shipped: the stage's result that comes with the source, taken where it was made by the same modules and parameters
     """
 
     inputs: list[str] = []
@@ -47,7 +54,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     logs: bool = False
     optional: bool = False
     given: dict[str, list[str]] = {}
-    shipped: str | None = None
+    shipped: Shipping | None = None
     params: dict[str, Any] = {}
 
     @property

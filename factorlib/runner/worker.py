@@ -28,6 +28,7 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.integrity import Stamp, stamps_of
+from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shipped import copy_shipped, shipped_folder
@@ -56,7 +57,7 @@ class Task(msgspec.Struct, frozen=True):
     """All a worker is told.
 
     hashes:  of the dataset's files, as they were when the key was made
-    shipped: the folder of the package that may have the result already; None where it is to be made in any case
+    shipped: where the package may have the result already; None where it is to be made in any case
     """
 
     code: Code
@@ -73,7 +74,7 @@ class Task(msgspec.Struct, frozen=True):
     record: dict[str, Any]
     temporary: Path
     events: Path
-    shipped: str | None = None
+    shipped: Shipping | None = None
 
 
 class Outcome(msgspec.Struct, frozen=True):

@@ -4,7 +4,6 @@ import os
 import shutil
 import tempfile
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,6 @@ def as_other_user():
     """A context in which files are opened with the rights of a user who owns none; only root can become one."""
     if os.geteuid() != 0:
         pytest.skip("only root can become another user")
-    import_module("pydantic")  # typer does at its first call, and another user may not read where Python lies
 
     @contextmanager
     def other():
