@@ -162,3 +162,19 @@ def verify(project: Project, dataset: str | None) -> int:
     verdict = read_all(Store(project.build / "store"), homes, pipeline, everything=home is None)
     print("\n".join(words.damage_lines(verdict, project.shown)))
     return 1 if verdict.damaged else 0
+
+
+def ship(project: Project, stage: str, dataset: str) -> int:
+    """Put the current result of a stage into the package, where pipeline.yaml says that it ships with the source."""
+    from factorlib.runner.shipped import ship as put
+
+    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
+    known = [name for name, found in stages.items() if found.shipped]
+    if stage not in known:
+        raise InputError(f"no result of {stage!r} ships with the source", key="ship", cure=did_you_mean(stage, known))
+    seen = survey(project, dataset, [stage], [])
+    planned = next(p for p in seen.planned() if p.step.stage == stage)
+    if planned.status != "current":
+        raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
+    print(f"{stage}: {project.shown(put(seen.store.tree(planned.output), planned.record, project.root, stages[stage].shipped))}")
+    return 0
