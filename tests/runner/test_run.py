@@ -296,15 +296,19 @@ def test_a_killed_run_leaves_nothing_half_made_and_resumes(project):
 
 
 def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project):
-    first = background(project, "upper.sleep=2")
+    go = project.root / "go"
+    toy.wait_for(project, go)
+    first = background(project)
     wait_until(lambda: sleepers(project))
     with pytest.raises(InputError, match="a run is going on"):
         collect(project)
-    second = background(project, "upper.sleep=2")
+    second = background(project)
+    waits = any("another run is making it" in line for line in second.stdout)
+    go.touch()
     said = second.communicate(timeout=60)[0]
+    assert waits
     assert first.wait(timeout=60) == 0 and second.returncode == 0, said
     first.stdout.close()
-    assert "another run is making it" in said
     assert sorted(ran(project)).count("upper/a") == 2  # once in the fixture, once for both
 
 

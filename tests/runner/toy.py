@@ -112,6 +112,12 @@ def toy(root: Path) -> Project:
     return Project(root, Provider(("photo",), read))
 
 
+def wait_for(project: Project, file: Path) -> None:
+    """Let the steps of `upper` end only once there is such a file."""
+    wait = f"while not __import__('os').path.exists({str(file)!r}): time.sleep(0.05)"
+    write(project.root / "stages" / "upper.py", UPPER.replace("time.sleep(params.sleep)", wait))
+
+
 def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
