@@ -39,8 +39,7 @@ class Validation:
         params: given to the stage that takes the slice, in the file `settings` or instead of what stands there
         """
         found = []
-        limits = convert(params.get("limits", {}), Limits, settings, "limits")
-        for what, check in self._checks(slice_, photo, limits):
+        for what, check in self._checks(slice_, photo, params, settings):
             if what in self._done:
                 continue
             self._done.add(what)
@@ -50,12 +49,13 @@ class Validation:
                 found.append(error)
         return found
 
-    def _checks(self, slice_: str, photo: str | None, limits: Limits) -> Iterator[tuple[str, Check]]:
+    def _checks(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> Iterator[tuple[str, Check]]:
         spec = self.dataset.spec
         entries = spec.photos if photo is None else [self.dataset.photo(photo)]
         if slice_ == "photo":
             yield from ((f"photo {entry.name}", partial(self._photo, entry)) for entry in entries)
         elif slice_ == "objects":
+            limits = convert(params.get("limits", {}), Limits, settings, "limits")
             for thing in (thing for entry in entries for thing in entry.objects):
                 yield f"mesh {thing.mesh} {thing.materials}", partial(self._object, thing, spec.meshes[thing.mesh], limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
