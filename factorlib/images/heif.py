@@ -20,6 +20,7 @@ from factorlib.images.stored import Stored
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
 VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 that are no sRGB
+SIZES = ("Exif:PixelXDimension", "Exif:PixelYDimension")
 CONVERT = "convert it: magick {0} {1}.png"
 
 
@@ -49,7 +50,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         width=width,
         height=height,
         orientation=1,
-        exif=exif_of_bytes(info.get("exif")),
+        exif=_upright(exif_of_bytes(info.get("exif")), width, height),
         profile=_profile(info.get("icc_profile")),
         white=2 ** info["bit_depth"] - 1,
         encoding="srgb",
@@ -79,6 +80,14 @@ def _decoded(picture: Any, path: str | Path, key: str | None) -> Shaped[np.ndarr
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.broadcast_to(pixels[..., :1], (*pixels.shape[:2], 3))
+
+
+def _upright(exif: dict[str, float | int], width: int, height: int) -> dict[str, float | int]:
+    """With the sizes that the camera wrote, which are of the picture before it was turned, as those of a picture lying like this one."""
+    across, down = (exif.get(name) for name in SIZES)
+    if across is None or down is None or (across > down) == (width > height):
+        return exif
+    return exif | dict(zip(SIZES, (down, across)))
 
 
 def _refuse_video(info: dict[str, Any], path: str | Path, key: str | None) -> None:

@@ -102,8 +102,6 @@ def _strips(stored: Stored, factor: int) -> Iterator[tuple[slice, Shaped[np.ndar
     turned = _reversed_axes(stored.orientation)
     top, left = (n % factor if back else 0 for n, back in zip((stored.height, stored.width), turned))
     columns, height = slice(left, left + stored.width // factor * factor), stored.height // factor
-    if top:
-        stored.rows(0, top)
     step = max(1, READ_AT_ONCE // (factor * stored.width))
     for first in range(0, height, step):
         last = min(first + step, height)

@@ -26,13 +26,15 @@ class ObjectRow(msgspec.Struct, frozen=True):
 
 
 class PoseRow(msgspec.Struct, frozen=True):
-    """An overlay picture of a photo, its focal length, and its objects."""
+    """An overlay picture of a photo, its focal length, its objects, and how far it was averaged down from what size."""
 
     photo: str
     uri: str | None
     focal_px: float | None
     focal_source: str | None
     objects: list[ObjectRow]
+    factor: int
+    original_size: list[int] | None
 
 
 def pose_rows(run: Artifacts) -> list[PoseRow]:
@@ -48,6 +50,8 @@ def _row(run: Artifacts, photo: str, entry: dict, facts: dict) -> PoseRow:
         entry["camera"].get("focal_px"),
         None if source == "estimated" else source,
         [_object(name, said) for name, said in entry["objects"].items()],
+        facts.get("factor", 1),
+        facts.get("original_size"),
     )
 
 

@@ -4,10 +4,13 @@ import json
 import math
 
 import msgspec
+import numpy as np
 import pytest
 
 from factorlib.evaluate.metrics import NO_TRUTH, Metrics, flattened
 from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
+from factorlib.images.exr import read_exr, write_exr
+from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import silent
 from stages import evaluate
 from tests.evaluate.made_artifacts import Made, make_artifacts
@@ -63,3 +66,18 @@ def test_the_table_names_what_fails(linked):
     broken = rows_of({"materials": {"worst_roughness": 0.2}}, SYNTHETIC)
     text = table_text(broken)
     assert not any(row.ok for row in broken) and "0.2" in text and "missing" in text and "NO" in text
+
+
+def test_true_normals_in_the_photos_own_pixels_are_averaged_as_the_photo_was(tmp_path):
+    inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
+    facts = read_json(inputs["masks"] / "photos.json")
+    for photo in LINKED:
+        facts[photo] |= {"factor": 3}
+        file = inputs.file(f"truth/{photo}_normal.exr")
+        write_exr(file, {name: np.repeat(np.repeat(pixels, 3, 0), 3, 1) for name, pixels in read_exr(file).items()})
+    write_json(inputs["masks"] / "photos.json", facts)
+    (tmp_path / "out").mkdir()
+    evaluate.main(evaluate.Params(), inputs, tmp_path / "out", silent)
+    (tmp_path / "plain").mkdir()
+    normals = read_json(tmp_path / "out" / "metrics.json")["normals"]
+    assert normals == metrics_of(tmp_path / "plain", seen=LINKED)["normals"] and set(normals) == set(LINKED)

@@ -69,6 +69,17 @@ def test_what_the_camera_wrote_is_read_and_averaging_is_as_for_any_file(tmp_path
     np.testing.assert_allclose(small.radiance, whole.radiance.reshape(12, 4, 16, 4, 3).mean((1, 3)), rtol=1e-5)
 
 
+def test_a_focal_plane_that_was_turned_tells_the_same_focal_length(tmp_path):
+    focal = []
+    for orientation in (1, 6):
+        exif = Image.Exif()
+        exif[0x112] = orientation
+        plane = {0x920A: IFDRational(5, 1), 0xA002: W, 0xA003: H, 0xA20E: IFDRational(1000, 1), 0xA210: 3}
+        exif.get_ifd(0x8769).update(plane)
+        focal.append(read_photo(save(tmp_path / "a.heic", SMOOTH, exif=exif.tobytes())).focal_px)
+    assert focal[0] == focal[1] == pytest.approx(5 * 1000 / 10)
+
+
 def test_the_kind_is_told_by_the_content(tmp_path):
     save(tmp_path / "a.heic", SMOOTH).rename(tmp_path / "a.jpg")
     assert is_heif(tmp_path / "a.jpg") and read_photo(tmp_path / "a.jpg").width == W

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from factorlib.images.picture import read_png
+from factorlib.jsonfile import read_json, write_json
 from factorlib.report.page import CONTENTS
 from factorlib.stage import Inputs, silent
 from stages import evaluate, report
@@ -212,3 +213,12 @@ def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
                   "pose of an earlier result, the mesh's axes times 1.000, 1.050, 0.952"):  # fmt: skip
         assert words in doubtful and words not in html, words
     assert "keypoints" in doubtful
+
+
+def test_a_photo_that_was_averaged_down_says_from_what_size(tmp_path):
+    inputs, whole = run(tmp_path, seen={"day": ["red", "white"]})
+    assert "averaged down" not in whole
+    facts = read_json(inputs["masks"] / "photos.json")
+    facts["day"] |= {"factor": 4, "original_size": [8000, 6000]}
+    write_json(inputs["masks"] / "photos.json", facts)
+    assert "averaged down 4 × 4 from 8000 × 6000 pixels" in page_of(inputs, tmp_path / "again")
