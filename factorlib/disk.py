@@ -70,4 +70,4 @@ def _folders(error: BaseException, folder: Path) -> list[Path]:
     """Those of the files that the error names (of a rename there are two), the given one where it names none; as far as they exist."""
     names = [name for name in (getattr(error, "filename", None), getattr(error, "filename2", None)) if isinstance(name, str | bytes)]
     paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names] or [folder.absolute()]
-    return [next(p for p in (path, *path.parents) if p.is_dir()) for path in paths]
+    return [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths]  # Path.is_dir raises where it may not look
