@@ -110,11 +110,11 @@ def one_line(text: str) -> str:
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> int:
+def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
     """The size in bytes of a plain file, links followed, that can be opened; nothing of it is read.
 
     Raises InputError for what is not there or may not be read, for folders, pipes and devices, which would never end,
-    and for a file of more than `most_bytes`.
+    and for a file of more than `most_bytes`; None: of any size.
     """
     with reading(what, file, key):
         found = os.stat(file)
@@ -123,9 +123,9 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
             raise InputError(f"is {kind}, not a file", file=file, key=key, cure=f"put {what} there, or correct the path")
         if not os.access(file, os.R_OK, effective_ids=os.access in os.supports_effective_ids):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    if found.st_size > most_bytes:
-        found_, cure = f"has {megabytes(found.st_size)}; {what} has {megabytes(most_bytes)} at most", "is it the right file?"
-        raise InputError(found_, file=file, key=key, cure=cure)
+    if most_bytes is not None and found.st_size > most_bytes:
+        words = f"has {megabytes(found.st_size)}; {what} has {megabytes(most_bytes)} at most"
+        raise InputError(words, file=file, key=key, cure="is it the right file?")
     return found.st_size
 
 
