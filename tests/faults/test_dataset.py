@@ -151,7 +151,7 @@ def test_a_number_that_no_camera_has(folder, path, value, key):
 
 
 @pytest.mark.parametrize("key", ["scale", "mesh_unit_mm"])
-@pytest.mark.parametrize("number", [1e300, 1e-300, 10**200])
+@pytest.mark.parametrize("number", [1e300, 1e-300, 10**200], ids=["huge", "tiny", "whole"])
 def test_a_unit_that_no_mesh_has(folder, key, number):
     cameras = {"transforms": "t.json", "world_from_object": {"vase": {"scale": number}}} if key == "scale" else {"bop": ".", "mesh_unit_mm": number}
     (folder / "t.json").write_text("{}")
