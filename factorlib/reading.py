@@ -131,9 +131,9 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
 
 def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
     """The content of a plain file of at most `most_bytes`; InputError as in `check_plain`."""
-    check_plain(file, what, key, most_bytes)
+    size = check_plain(file, what, key, most_bytes)
     with reading(what, file, key), open(file, "rb") as stream:
-        return stream.read(most_bytes)
+        return stream.read(size)  # so much memory is taken at once, whatever the file holds
 
 
 def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:

