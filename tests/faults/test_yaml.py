@@ -22,9 +22,9 @@ class Numbered(msgspec.Struct):
 
 @contextmanager
 def in_a_moment(seconds=10.0):
-    begin = time.perf_counter()
+    begin = time.process_time()
     yield
-    assert time.perf_counter() - begin < seconds
+    assert time.process_time() - begin < seconds
 
 
 @pytest.mark.parametrize(
