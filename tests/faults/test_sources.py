@@ -114,6 +114,7 @@ def test_a_model_that_is_none(folder, wrong, words):
         {"camera": "1 SIMPLE_PINHOLE " + "9" * 5000 + " 150 300 104 71"},
         {"camera": "1"},
         {"image": "1 .7 .1 -.5 .5 1 2 3 1"},
+        {"image": "1 .7 .1 -.5 .5 3 1 7.png"},
         {"image": "1 nan .1 -.2 .3 1 2 3 1 7.png"},
         {"image": "1 one .1 -.2 .3 1 2 3 1 7.png"},
         {"image": "\x00"},

@@ -150,7 +150,10 @@ def _text_images(file: Path) -> Iterator[Line]:
     """Two lines each; the second, of points, may be empty."""
     with file.open(encoding="utf-8") as lines:
         for line in filter(_says_something, lines):
-            _, *numbers, camera_id, name = line.strip().split(maxsplit=9)
+            words = line.strip().split(maxsplit=9)
+            if len(words) != 10:
+                raise ValueError(f"{one_line(line)!r} is no line of an image: it has {len(words)} words of 10")
+            _, *numbers, camera_id, name = words
             next(lines, None)
             yield Line(tuple(map(float, numbers[:4])), tuple(map(float, numbers[4:])), int(camera_id), name)
 
