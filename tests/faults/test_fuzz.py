@@ -150,7 +150,7 @@ COCO = {
     "annotations": [
         {"id": 1, "image_id": 7, "category_id": 1, "segmentation": [[1.0, 1.0, 6.0, 1.0, 6.0, 6.0], [1, 8, 4, 8, 4, 11, 1, 11]]},
         {"id": 2, "image_id": 7, "category_id": 2, "segmentation": {"size": [H, W], "counts": [120, 5, 67]}},
-        {"id": 3, "image_id": 7, "category_id": 2, "segmentation": {"size": [H, W], "counts": "P45S2"}},
+        {"id": 3, "image_id": 7, "category_id": 2, "segmentation": {"size": [H, W], "counts": "R47g1"}},
         {"id": 4, "image_id": 8, "category_id": 2, "segmentation": []},
     ],
 }
