@@ -20,7 +20,7 @@ from factorlib.reading import read_bytes, reading
 
 OVERSHOOT = 2.0  # pixels by which a polygon may leave the image
 MOST_BYTES = 512_000_000  # of a file; a hundred thousand outlines have half of it
-LONGEST, LONGEST_OF_ALL = 200, 5000  # outlines of a photo, of one polygon and all together, in half perimeters of the photo
+LONGEST, LONGEST_OF_ALL = 200, 5000  # an outline, and all of a photo together, in half perimeters of the photo
 CURE = "export the file again"
 
 
@@ -71,21 +71,32 @@ def read_coco(
     if shape != size:
         return {}, shape
     names = {category.id: category.name for category in coco.categories}
-    unions: dict[str, Union] = {}
-    budget = LONGEST_OF_ALL * sum(shape)
+    of_material: dict[str, list[tuple[str, Annotation]]] = {}
     for index, annotation in enumerate(coco.annotations):
-        if annotation.image_id != entry.id:
-            continue
-        key = f"annotations[{index}]"
-        name = _material(annotation, names, materials, path, key)
-        counts, length = _counts(annotation.segmentation, shape, path, f"{key}.segmentation")
-        budget -= length
-        if budget < 0:
+        if annotation.image_id == entry.id:
+            name = _material(annotation, names, materials, path, f"annotations[{index}]")
+            of_material.setdefault(name, []).append((f"annotations[{index}].segmentation", annotation))
+    masks: dict[str, np.ndarray] = {}
+    length = 0.0
+    for name, parts in of_material.items():
+        masks[name], length = _union(parts, shape, length, path)
+    return masks, shape
+
+
+def _union(
+    parts: list[tuple[str, Annotation]], shape: tuple[int, int], length: float, path: str | Path
+) -> tuple[Bool[np.ndarray, "h w"], float]:
+    """Of the annotations of one material; length: of all outlines of the photo so far, pixels, before and after."""
+    union = Union(*shape)
+    for key, annotation in parts:
+        counts, longer = _counts(annotation.segmentation, shape, path, key)
+        length += longer
+        if length > LONGEST_OF_ALL * sum(shape):
             raise InputError("the outlines of this photo are longer than any drawing", file=path, key=key, cure=CURE)
         for each in counts:
-            with reading("RLE", path, f"{key}.segmentation", CURE):
-                unions.setdefault(name, Union(*shape)).add(each)
-    return {name: union.mask() for name, union in unions.items()}, shape
+            with reading("RLE", path, key, CURE):
+                union.add(each)
+    return union.mask(), length
 
 
 def _decode(path: str | Path, key: str) -> Coco:
