@@ -33,7 +33,7 @@ from factorlib.solve.earlier import read_earlier as read_earlier_solution
 from factorlib.urm.observations import Observations, read_observations, write_observations
 
 LONG = float(os.environ.get("FUZZ_SECONDS", "600"))
-SHORT_EXAMPLES, LONG_EXAMPLES = 40, 1000
+SHORT_EXAMPLES, LONG_EXAMPLES = 25, 200
 MOST_SECONDS = 20  # of processor time, for one file
 H, W = 12, 16
 EYE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
