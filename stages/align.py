@@ -85,6 +85,10 @@ def things_of(
     return things
 
 
+def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
+    return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
+
+
 def hold_against(
     slice_: schema.ObjectsSlice, things: list[Thing], label: np.ndarray, materials: list[str], camera: Camera, focal: float | None, photo: str
 ) -> None:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
+from factorlib.wholefile import writing
 
 FRAME = (
     "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"

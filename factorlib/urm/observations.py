@@ -23,6 +23,7 @@ from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
+from factorlib.wholefile import writing
 
 VECTORS = ("normal", "view", "radiance", "clipped")
 UNIT_ERROR = 1e-3  # of the length of a direction
