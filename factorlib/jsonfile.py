@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from factorlib.errors import InputError
+from factorlib.reading import read_text, reading
 from factorlib.wholefile import write_text
 
 
@@ -26,7 +26,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"not readable as JSON ({error})", file=path, cure="delete it and run its stage again") from error
+    """The value; InputError for a file that is none."""
+    text = read_text(path, "JSON")
+    with reading("JSON", path, cure="delete it and run its stage again"):
+        return json.loads(text)

@@ -59,17 +59,19 @@ CURES = {
 
 
 @contextmanager
-def reading(what: str, file: str | os.PathLike | None, key: str | None = None, cure: str = COPY_AGAIN) -> Iterator[None]:
+def reading(
+    what: str, file: str | os.PathLike | None, key: str | None = None, cure: str = COPY_AGAIN, also: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
     """Whatever a parser raises within is raised as an InputError that names file and key; an InputError passes as it is.
 
     what: what the file should be, as in "not readable as {what}", with its article;  cure: unless the system's own
-    complaint (no right to read, no such file, …) has a better one
+    complaint (no right to read, no such file, …) has a better one;  also: what else the parser raises, of its own
     """
     try:
         yield
     except InputError:
         raise
-    except FAILURES as error:
+    except (*FAILURES, *also) as error:
         raise InputError(found_in(error, what), file=file, key=key, cure=cure_of(error, cure)) from error
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
-from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import open_photo
 from factorlib.labels import read_labels, read_objects
 from factorlib.meshes.limits import Limits
@@ -53,18 +54,26 @@ class Validation:
         spec = self.dataset.spec
         entries = spec.photos if photo is None else [self.dataset.photo(photo)]
         if slice_ == "photo":
-            yield from ((f"photo {entry.name}", partial(self._photo, entry)) for entry in entries)
+            most = convert(params.get("most_megapixels", MOST_MEGAPIXELS), float, settings, "most_megapixels")
+            yield from ((f"photo {entry.name}", partial(self._photo, entry, most)) for entry in entries)
         elif slice_ == "objects":
             limits = convert(params.get("limits", {}), Limits, settings, "limits")
             for thing in (thing for entry in entries for thing in entry.objects):
                 yield f"mesh {thing.mesh} {thing.materials}", partial(self._object, thing, spec.meshes[thing.mesh], limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
-            for maps, read in ((self.dataset.truth.illumination, read_rgb_exr), (self.dataset.truth.normals, read_exr)):
-                yield from ((f"map {path}", partial(read, self.folder / path)) for path in maps.values())
+            for name, path in self.dataset.truth.illumination.items():
+                yield f"light {path}", partial(read_true_light, self._file(path), name)
+            for name, path in self.dataset.truth.normals.items():
+                yield f"normals {name}", partial(self._normals, name, path)
 
-    def _photo(self, entry: PhotoEntry) -> None:
-        key = f"photos[{entry.name}]"
-        size = open_photo(self._file(entry.image), f"{key}.image").size
+    def _normals(self, name: str, path: str) -> None:
+        size = open_photo(self._file(self.dataset.photo(name).image), f"photos[{name}].image").size
+        read_true_normals(self._file(path), name, size[::-1])
+
+    def _photo(self, entry: PhotoEntry, most_megapixels: float) -> None:
+        key, path = f"photos[{entry.name}]", self._file(entry.image)
+        size = open_photo(path, f"{key}.image").size
+        check_pixels(size, most_megapixels, path, f"{key}.image")
         read_labels(entry.masks, self._file, self.dataset.spec.materials, size, entry.image, f"{key}.masks")
         read_objects([(thing.name, thing.mask) for thing in entry.objects], self._file, size, f"{key}.objects")
 

@@ -12,6 +12,7 @@ from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.earlier import EarlierPhoto, read_earlier
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
+from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
@@ -49,7 +50,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
     earlier = read_earlier(inputs["poses"]).get(name) if "poses" in inputs.folders else None
     things = things_of(slice_, channels, inputs, params, facts["factor"], earlier)
-    result = placed(things, *camera_of(slice_, facts, name), name, params.search, earlier.focal(facts["factor"]) if earlier else None)
+    camera, focal, focal_source = camera_of(slice_, facts, name)
+    hold_against(slice_, things, channels["label"], inputs.facts["dataset.materials"], camera, focal, name)
+    result = placed(things, camera, focal, focal_source, name, params.search, earlier.focal(facts["factor"]) if earlier else None)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
@@ -84,6 +87,17 @@ def things_of(
 
 def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
     return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
+
+
+def hold_against(
+    slice_: schema.ObjectsSlice, things: list[Thing], label: np.ndarray, materials: list[str], camera: Camera, focal: float | None, photo: str
+) -> None:
+    """What dataset.yaml and its source of cameras give, against the photo: what cannot be is refused, what is odd is told."""
+    for thing, said in zip(things, slice_.objects, strict=True):
+        if thing.pose is not None:
+            check_before_camera(thing.caster.mesh, thing.pose, photo, thing.name, "dataset" if said.pose else slice_.told.source)
+    warn_of_materials(label, [thing.caster.mesh.labels for thing in things], materials, photo)
+    warn_of_camera(focal, camera.centre, (camera.width, camera.height), photo)
 
 
 def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:

@@ -21,6 +21,7 @@ from factorlib.evaluate.materials import Material, compare_materials
 from factorlib.evaluate.metrics import Counts, Metrics, reasons_of
 from factorlib.evaluate.relighting import compare_relighting
 from factorlib.evaluate.resynthesis import Resynthesis, Shot, compare_photos, shot_of
+from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, Progress
@@ -57,7 +58,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def _against_truth(inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
     materials = {n: Material(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
     estimates = _estimated_materials(inputs)
-    true_lights = {n: _light(inputs.file(path)) for n, path in truth.illumination.items()}
+    true_lights = {n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()}
     paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
     found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
     _write_lights(inputs, out, truth, found_lights, true_lights)
@@ -125,17 +126,11 @@ def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) ->
     found, photos = {}, read_json(inputs["masks"] / "photos.json")
     for name in lights:
         if name in truth.normals:
-            true = _true_normals(inputs.file(truth.normals[name]), photos[name]["factor"])
+            true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name]["original_size"])
+            true = averaged_normals(true, photos[name]["factor"])  # as the photo was
             normal, _, pixels = _geometry(inputs, name)
             found[name] = normal_error(normal, true, pixels)
     return {name: error for name, error in found.items() if error} or None
-
-
-def _true_normals(path: Path, factor: int) -> np.ndarray:
-    """Averaged down as the photo was, [h w 3]."""
-    channels = read_exr(path)
-    keys = [f"normal.{a}" for a in "xyz"] if "normal.x" in channels else list("RGB")
-    return averaged_normals(np.stack([channels[k] for k in keys], axis=-1), factor)
 
 
 def _poses(inputs: Inputs, truth: TruthFile) -> dict | None:

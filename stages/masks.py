@@ -13,6 +13,7 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
+from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, decoded, open_photo
 from factorlib.jsonfile import write_json
 from factorlib.labels import Labels, read_labels, read_objects
@@ -24,11 +25,13 @@ log = logging.getLogger("factorlib.masks")
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A photo that has more pixels than these is averaged down by the least whole factor that makes it fit.
 
-    pixels: that show a material;  frame: of the whole photo, whatever they show.
+    pixels: that show a material;  frame: of the whole photo, whatever they show;  most_megapixels: of a photo's file, by its
+    header: a larger one is refused before it is read.
     """
 
     pixels: Annotated[int, msgspec.Meta(ge=100)] = 1_000_000
     frame: Annotated[int, msgspec.Meta(ge=100)] = 4_000_000
+    most_megapixels: Annotated[float, msgspec.Meta(gt=0)] = MOST_MEGAPIXELS
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:
@@ -42,6 +45,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     name = inputs.photo
     path, key = inputs.file(facts.image), f"photos[{name}].image"
     stored = open_photo(path, key)
+    check_pixels(stored.size, params.most_megapixels, path, key)
     progress(0, 3, f"{name}: masks")  # before the photo: they say how far it is averaged down while it is read
     labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, f"photos[{name}].masks")
     objects = read_objects([(o.name, o.mask) for o in facts.objects], inputs.file, stored.size, f"photos[{name}].objects")

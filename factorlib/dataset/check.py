@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NoReturn
 
-import msgspec
-
+from factorlib.dataset.numbers import check_centre, check_focal, check_numbers, check_rotation, check_share, check_unit
+from factorlib.dataset.paths import Refusal, check_folder, check_path
 from factorlib.dataset.schema import (
     ENCODINGS,
     FORMAT,
@@ -25,9 +24,10 @@ from factorlib.dataset.schema import (
     MeshEntry,
     ObjectEntry,
     PhotoEntry,
+    TrueMaterial,
     TruthFile,
 )
-from factorlib.errors import InputError, did_you_mean
+from factorlib.errors import did_you_mean
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 LONGEST_NAME = 100  # characters; names of files are made of it, and file systems allow these 255 bytes
@@ -37,19 +37,8 @@ ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own nam
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
-ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1: matrices typed with four digits pass
 LEAST_KEYPOINTS, GOOD_KEYPOINTS = 4, 6
 LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
-
-
-class Refusal:
-    """The file that is being checked, the folder its paths stay in, and how to refuse a key of it."""
-
-    def __init__(self, file: Path, folder: Path):
-        self.file, self.folder = file, folder
-
-    def __call__(self, key: str, found: str, cure: str) -> NoReturn:
-        raise InputError(found, file=self.file, key=key, cure=cure)
 
 
 def check_dataset(spec: DatasetFile, file: Path) -> None:
@@ -78,8 +67,9 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
     check_numbers(truth, refuse)
     photos = {photo.name: photo for photo in spec.photos}
     lights = {photo.illumination or photo.name for photo in spec.photos}
-    for name in truth.materials:
+    for name, material in truth.materials.items():
         check_known(f"materials.{name}", name, spec.materials, "material", refuse)
+        _check_true_material(f"materials.{name}", material, refuse)
     for group, known, kind in (("illumination", lights, "illumination"), ("normals", photos, "photo")):
         for name, path in getattr(truth, group).items():
             check_known(f"{group}.{name}", name, known, kind, refuse)
@@ -91,49 +81,11 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
             check_rotation(f"poses.{name}.{thing}.rotation", pose.rotation, refuse)
 
 
-def check_path(key: str, path: str, suffixes: Iterable[str], refuse: Refusal, must_exist: bool = True) -> None:
-    """A path of a known suffix that leads to a file inside the dataset's folder, links followed."""
-    target = _inside(key, path, refuse, "file")
-    if target.suffix.lower() not in suffixes:
-        refuse(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
-    if must_exist and not target.is_file():
-        refuse(key, f"there is no file {path!r}", _nearby(target))
-
-
-def check_folder(key: str, path: str, refuse: Refusal) -> None:
-    """A path that leads to a folder inside the dataset's, links followed."""
-    if not _inside(key, path, refuse, "folder").is_dir():
-        refuse(key, f"there is no folder {path!r}", "copy it there, or correct the path")
-
-
-def _inside(key: str, path: str, refuse: Refusal, kind: str) -> Path:
-    target, root = refuse.folder / path, refuse.folder.resolve()
-    if not path or Path(path).is_absolute() or not target.resolve().is_relative_to(root):
-        refuse(key, f"{path!r} leads outside the dataset", f"copy the {kind} into {root} and name it relative to that folder")
-    return target
-
-
-def _nearby(target: Path) -> str:
-    names = [entry.name for entry in target.parent.iterdir() if entry.is_file()] if target.parent.is_dir() else []
-    cure = did_you_mean(target.name, names)
-    return cure if cure.startswith("did") else f"put it at {target}, or correct the path"
-
-
-def check_numbers(value: Any, refuse: Refusal) -> None:
-    for key, number in _numbers(msgspec.to_builtins(value), ""):
-        if not math.isfinite(number):
-            refuse(key, f"{number} is not a finite number", "give a number, or leave the key out")
-
-
-def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
-    if isinstance(value, float):
-        yield key, value
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _numbers(item, f"{key}.{name}" if key else name)
-    elif isinstance(value, (list, tuple)):
-        for index, item in enumerate(value):
-            yield from _numbers(item, f"{key}[{index}]")
+def _check_true_material(key: str, material: TrueMaterial, refuse: Refusal) -> None:
+    for name in ("diffuse", "specular"):
+        for channel, share in enumerate(getattr(material, name)):
+            check_share(f"{key}.{name}[{channel}]", share, refuse)
+    check_share(f"{key}.roughness", material.roughness, refuse)
 
 
 def _check_name(key: str, name: str, refuse: Refusal) -> None:
@@ -199,8 +151,10 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
         _check_name(f"{key}.illumination", photo.illumination, refuse)
     if photo.world_from_camera is not None:
         check_rotation(f"{key}.world_from_camera", photo.world_from_camera, refuse)
-    if photo.camera is not None and photo.camera.focal_px is not None and photo.camera.focal_px <= 0:
-        refuse(f"{key}.camera.focal_px", f"a focal length of {photo.camera.focal_px}", "give pixels, more than 0, or leave it out")
+    if photo.camera is not None and photo.camera.focal_px is not None:
+        check_focal(f"{key}.camera.focal_px", photo.camera.focal_px, refuse)
+    if photo.camera is not None and photo.camera.principal_point is not None:
+        check_centre(f"{key}.camera.principal_point", photo.camera.principal_point, refuse)
     _check_masks(f"{key}.masks", photo, spec.materials, refuse)
     if not photo.objects:
         refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", "add {name: …, mesh: …}: a mesh gives its pixels their normals")
@@ -248,9 +202,10 @@ def _check_keypoints(key: str, thing: ObjectEntry, refuse: Refusal) -> None:
 
 
 def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: Refusal) -> None:
+    first: dict[tuple[float, ...], int] = {}
     for index, place in enumerate(places):
-        if place in places[:index]:
-            other = places.index(place)
+        other = first.setdefault(place, index)
+        if other != index:
             refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
     arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
     longest = max(arms, key=lambda arm: math.hypot(*arm))
@@ -259,19 +214,6 @@ def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: 
     off = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
     if max(off) < LEAST_OFF_LINE * math.hypot(*longest):
         refuse(key, f"every {name} lies on one line", "name places in different directions: about a line the object could turn")
-
-
-def check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
-    gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
-    worst = max(abs(entry) for row in gram for entry in row)
-    if worst > ROTATION_TOLERANCE:
-        refuse(key, f"not a rotation: RᵀR differs from 1 by {worst:.3g}", "its columns must be unit vectors at right angles (no scale)")
-    a, b, c = rows
-    determinant = sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3))
-    if determinant < 0:
-        refuse(
-            key, "not a rotation but a reflection (determinant −1)", "one axis is flipped: the camera frame is x right, y down, z forward"
-        )
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
@@ -294,15 +236,10 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
         key = f"cameras.world_from_object.{name}"
         check_known(key, name, {thing.name: None for photo in spec.photos for thing in photo.objects}, "object", refuse)
         check_rotation(f"{key}.rotation", similarity.rotation, refuse)
-        _check_positive(f"{key}.scale", similarity.scale, refuse)
+        check_unit(f"{key}.scale", similarity.scale, refuse)
     for name in source.obj_ids:
         check_known(f"cameras.obj_ids.{name}", name, spec.meshes, "mesh", refuse)
-    _check_positive("cameras.mesh_unit_mm", source.mesh_unit_mm, refuse)
-
-
-def _check_positive(key: str, number: float, refuse: Refusal) -> None:
-    if number <= 0:
-        refuse(key, f"{number} is not more than 0", "give how many units of the one are one of the other")
+    check_unit("cameras.mesh_unit_mm", source.mesh_unit_mm, refuse)
 
 
 def check_lights(photos: list[PhotoEntry], file: Path) -> None:

@@ -10,10 +10,12 @@ import logging
 import os
 from pathlib import Path
 
-from factorlib.dataset.check import Refusal, check_dataset, check_lights, check_truth
+from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.companions import companions_of_mesh
+from factorlib.dataset.paths import Refusal, is_there
 from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
 from factorlib.errors import InputError
+from factorlib.reading import reading
 from factorlib.yamlfile import read_yaml
 
 FILE = "dataset.yaml"
@@ -27,8 +29,9 @@ def read_dataset(path: str | Path) -> Dataset:
     A missing truth.yaml, or one that names missing maps, is a warning: only what compares with the truth needs it.
     Anything else that is wrong is an InputError that names file, key and cure.
     """
-    file = Path(path) / FILE if Path(path).is_dir() else Path(path)
-    if not file.is_file():
+    with reading("a dataset", path, "DATASET"):
+        file = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    if not is_there(file, "DATASET"):
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
@@ -53,13 +56,13 @@ def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
     if spec.truth is None:
         return None
     truth_file = file.parent / spec.truth
-    if not truth_file.is_file():
+    if not is_there(truth_file, "truth"):
         log.warning("%s: truth: there is no %s: nothing is compared with the truth", file, spec.truth)
         return None
     truth = read_yaml(truth_file, TruthFile)
     check_truth(truth, spec, truth_file, file.parent)
     for path in truth_paths(truth):
-        if not (file.parent / path).is_file():
+        if not is_there(file.parent / path, "truth"):
             log.warning("%s: there is no %s: nothing is compared with the truth", truth_file, path)
             return None
     return truth

@@ -1,23 +1,27 @@
 """COCO annotations as masks: polygons, and RLE as counts or compressed, by category and file name.
 
-Polygons are filled by pycocotools.  RLE is decoded here, and checked first: its counts must fill the image exactly.
+Polygons are filled by pycocotools, which takes memory for every pixel of an outline: how long one may be is checked first.
+RLE is decoded by `rle`.  The shapes of other photos in the file are left as text.
 """
 
 from __future__ import annotations
 
 import math
-from itertools import accumulate
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.labels.rle import Union
+from factorlib.reading import read_bytes, reading
 
 OVERSHOOT = 2.0  # pixels by which a polygon may leave the image
+MOST_BYTES = 512_000_000  # of a file; a hundred thousand outlines have half of it
+LONGEST, LONGEST_OF_ALL = 200, 5000  # an outline, and all of a photo together, in half perimeters of the photo
+CURE = "export the file again"
 
 
 class Rle(msgspec.Struct, frozen=True):
@@ -30,7 +34,7 @@ class Rle(msgspec.Struct, frozen=True):
 class Annotation(msgspec.Struct, frozen=True):
     image_id: int | str
     category_id: int | str
-    segmentation: list[list[float]] | Rle | None = None
+    segmentation: msgspec.Raw = msgspec.Raw(b"null")
     id: int | str | None = None
 
 
@@ -64,63 +68,41 @@ def read_coco(
     coco = _decode(path, key)
     entry = _entry(coco, image, path)
     shape = (entry.height or size[0], entry.width or size[1])
-    names = {category.id: category.name for category in coco.categories}
-    masks: dict[str, np.ndarray] = {}
     if shape != size:
-        return masks, shape
+        return {}, shape
+    names = {category.id: category.name for category in coco.categories}
+    of_material: dict[str, list[tuple[str, Annotation]]] = {}
     for index, annotation in enumerate(coco.annotations):
-        if annotation.image_id != entry.id:
-            continue
-        key = f"annotations[{index}]"
-        name = _material(annotation, names, materials, path, key)
-        inside = _inside(annotation.segmentation, shape, path, f"{key}.segmentation")
-        masks[name] = masks[name] | inside if name in masks else inside
+        if annotation.image_id == entry.id:
+            name = _material(annotation, names, materials, path, f"annotations[{index}]")
+            of_material.setdefault(name, []).append((f"annotations[{index}].segmentation", annotation))
+    masks: dict[str, np.ndarray] = {}
+    length = 0.0
+    for name, parts in of_material.items():
+        masks[name], length = _union(parts, shape, length, path)
     return masks, shape
 
 
-def decode_rle(counts: list[int] | str, height: int, width: int) -> Bool[np.ndarray, "height width"]:
-    """The mask of run lengths, column by column; raises ValueError unless they fill it exactly.
-
-    >>> decode_rle([1, 2, 1], 2, 2).astype(int).tolist()
-    [[0, 1], [1, 0]]
-    """
-    runs = decompress(counts) if isinstance(counts, str) else counts
-    if min(runs, default=0) < 0 or sum(runs) != height * width:
-        raise ValueError(f"its runs fill {sum(runs)} of {height * width} pixels")
-    inside = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    return np.ascontiguousarray(inside.reshape(width, height).T)
-
-
-def decompress(text: str) -> list[int]:
-    """Run lengths of COCO's string: 5 bits a character (+48), the sixth says "more follows", the sign in the last;
-    from the third run on each is the difference to the run two before.  Raises ValueError."""
-    values, value, shift = [], 0, 0
-    for character in text:
-        bits = ord(character) - 48
-        if not 0 <= bits < 64:
-            raise ValueError(f"{character!r} is no character of a compressed RLE")
-        value |= (bits & 31) << shift
-        shift += 5
-        if not bits & 32:
-            values.append(value - (1 << shift) if bits & 16 else value)
-            value, shift = 0, 0
-    if shift:
-        raise ValueError("its compressed RLE ends in the middle of a number")
-    return values[:1] + _undifferenced(values[1::2], values[2::2])
-
-
-def _undifferenced(odd: list[int], even: list[int]) -> list[int]:
-    runs = [0] * (len(odd) + len(even))
-    runs[0::2], runs[1::2] = accumulate(odd), accumulate(even)
-    return runs
+def _union(
+    parts: list[tuple[str, Annotation]], shape: tuple[int, int], length: float, path: str | Path
+) -> tuple[Bool[np.ndarray, "h w"], float]:
+    """Of the annotations of one material; length: of all outlines of the photo so far, pixels, before and after."""
+    union = Union(*shape)
+    for key, annotation in parts:
+        counts, longer = _counts(annotation.segmentation, shape, path, key)
+        length += longer
+        if length > LONGEST_OF_ALL * sum(shape):
+            raise InputError("the outlines of this photo are longer than any drawing", file=path, key=key, cure=CURE)
+        for each in counts:
+            with reading("RLE", path, key, CURE):
+                union.add(each)
+    return union.mask(), length
 
 
 def _decode(path: str | Path, key: str) -> Coco:
-    try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=Coco)
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        cure = "it needs images, annotations and categories"
-        raise InputError(f"not readable as COCO ({error})", file=path, key=key, cure=cure) from error
+    content = read_bytes(path, "COCO", key, MOST_BYTES)
+    with reading("COCO", path, key, "it needs images, annotations and categories"):
+        return msgspec.json.decode(content, type=Coco)
 
 
 def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
@@ -150,7 +132,10 @@ def _material(annotation: Annotation, names: dict, materials: list[str], path: s
     return name
 
 
-def _inside(segmentation: Any, shape: tuple[int, int], path: str | Path, key: str) -> np.ndarray:
+def _counts(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: str) -> tuple[list, float]:
+    """Run lengths of the parts of a shape, and how long its outlines are."""
+    with reading("a COCO segmentation", path, key, CURE):
+        segmentation = msgspec.json.decode(text, type=list[list[float]] | Rle | None)
     if not segmentation:
         raise InputError("is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it")
     if not isinstance(segmentation, Rle):
@@ -158,26 +143,33 @@ def _inside(segmentation: Any, shape: tuple[int, int], path: str | Path, key: st
     if tuple(segmentation.size) != shape:
         found = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
         raise InputError(found, file=path, key=key, cure="export it at the photo's own size")
-    try:
-        return decode_rle(segmentation.counts, *shape)
-    except ValueError as error:
-        raise InputError(f"damaged RLE: {error}", file=path, key=key, cure="export the file again") from error
+    return [segmentation.counts], 0.0
 
 
-def _filled(polygons: list[list[float]], shape: tuple[int, int], path: str | Path, key: str) -> np.ndarray:
+def _filled(polygons: list[list[float]], shape: tuple[int, int], path: str | Path, key: str) -> tuple[list[str], float]:
     height, width = shape
-    clipped = []
+    clipped, length = [], 0.0
     for index, polygon in enumerate(polygons):
-        if len(polygon) < 6 or len(polygon) % 2 or not all(map(math.isfinite, polygon)):
-            found, cure = "is no polygon", "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
-            raise InputError(found, file=path, key=f"{key}[{index}]", cure=cure)
-        corners = np.reshape(polygon, (-1, 2))
-        if (corners < -OVERSHOOT).any() or (corners > np.array([width, height]) + OVERSHOOT).any():
-            found, cure = f"leaves the image of {_wh(shape)} pixels", "was it drawn at another size? cut it at the image's edge"
-            raise InputError(found, file=path, key=f"{key}[{index}]", cure=cure)
-        clipped.append(np.clip(corners, 0, [width, height]).ravel().tolist())
-    union = pycocomask.merge(pycocomask.frPyObjects(clipped, height, width))
-    return decode_rle(union["counts"].decode("ascii"), height, width)
+        corners = _corners(polygon, shape, path, f"{key}[{index}]")
+        longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
+        if longer > LONGEST * (height + width):
+            raise InputError(f"its outline is {longer:.3g} pixels long", file=path, key=f"{key}[{index}]", cure="draw it again, with fewer corners")
+        clipped.append(corners.ravel().tolist())
+        length += longer
+    return [each["counts"].decode("ascii") for each in pycocomask.frPyObjects(clipped, height, width)], length
+
+
+def _corners(polygon: list[float], shape: tuple[int, int], path: str | Path, key: str) -> Float[np.ndarray, "n 2"]:
+    """x, y of each corner, cut at the edge of the image."""
+    height, width = shape
+    if len(polygon) < 6 or len(polygon) % 2 or not all(map(math.isfinite, polygon)):
+        found, cure = "is no polygon", "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
+        raise InputError(found, file=path, key=key, cure=cure)
+    corners = np.reshape(polygon, (-1, 2))
+    if (corners < -OVERSHOOT).any() or (corners > np.array([width, height]) + OVERSHOOT).any():
+        found, cure = f"leaves the image of {_wh(shape)} pixels", "was it drawn at another size? cut it at the image's edge"
+        raise InputError(found, file=path, key=key, cure=cure)
+    return np.clip(corners, 0, [width, height])
 
 
 def _wh(shape: tuple[int, int]) -> str:

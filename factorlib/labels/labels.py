@@ -17,6 +17,7 @@ from jaxtyping import Bool, UInt8, UInt16
 from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
 from factorlib.labels.png import read_inside, read_values
+from factorlib.labels.size import check_size
 
 LEFT_OUT = 255
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
@@ -45,7 +46,7 @@ def read_labels(
     elif masks.lower().endswith(".json"):
         labels = _of_coco(file(masks), materials, size, image, key)
     else:
-        labels = _of_values(read_values(file(masks), key), file(masks), materials, size, key)
+        labels = _of_values(read_values(file(masks), key, size), file(masks), materials, key)
     if not labels.label.any():
         where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
         raise InputError(
@@ -63,8 +64,7 @@ def read_objects(
         if path is None:
             continue
         where = f"{key}[{index}].mask"
-        inside = read_inside(file(path), where)
-        _check_size(inside.shape, size, file(path), where)
+        inside = read_inside(file(path), where, size)
         if not inside.any():
             raise InputError(f"the mask of object {name!r} is empty", file=file(path), key=where, cure="paint it, or leave the key out")
         if objects[inside].any():
@@ -76,8 +76,7 @@ def read_objects(
     return objects
 
 
-def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], size: tuple[int, int], key: str) -> Labels:
-    _check_size(values.shape, size, path, key)
+def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
     found, counts = np.unique(values, return_counts=True)
     if set(found.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in found:
         cure = f"if 255 means inside, write masks: {{{materials[0]}: <this file>}}: in a label mask it means leave out"
@@ -95,15 +94,14 @@ def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[st
 def _of_materials(masks: Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], key: str) -> Labels:
     inside = {}
     for material in sorted(masks, key=materials.index):
-        inside[material] = read_inside(file(masks[material]), f"{key}.{material}")
-        _check_size(inside[material].shape, size, file(masks[material]), f"{key}.{material}")
+        inside[material] = read_inside(file(masks[material]), f"{key}.{material}", size)
     where = {material: (file(masks[material]), f"{key}.{material}") for material in inside}
     return _merged(inside, materials, size, where, edge=0)
 
 
 def _of_coco(path: Path, materials: list[str], size: tuple[int, int], image: str, key: str) -> Labels:
     inside, shape = read_coco(path, image, materials, size, key)
-    _check_size(shape, size, path, key)
+    check_size(shape, size, path, key)
     return _merged(inside, materials, size, {material: (path, key) for material in inside}, edge=DRAWN_EDGE)
 
 
@@ -140,13 +138,3 @@ def _is_wider(region: Bool[np.ndarray, "h w"], width: int) -> bool:
         rows = [np.take(region, range(k, k + length), axis=axis) for k in range(width + 1)]
         region = np.logical_and.reduce(rows)
     return bool(region.any())
-
-
-def _check_size(found: tuple[int, ...], size: tuple[int, int], path: Path, key: str) -> None:
-    if tuple(found) == tuple(size):
-        return
-    cure = "save the mask with the photo's own pixels"
-    if tuple(found) == tuple(size)[::-1]:
-        cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
-    message = f"the mask is {found[1]} × {found[0]} pixels, the photo {size[1]} × {size[0]}"
-    raise InputError(message, file=path, key=key, cure=cure)

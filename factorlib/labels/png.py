@@ -9,21 +9,26 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, UInt16
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from factorlib.errors import InputError
+from factorlib.labels.size import check_size
+from factorlib.reading import check_plain, reading
 
 _STRETCH = {2: 85, 4: 17}  # what 1 becomes when grey of so many bits is stretched to 8
 _GREY, _PALETTE = 0, 3  # PNG colour types
+Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; here a mask is as large as its photo, whose size has its own limit
 
 
-def read_values(path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
-    """The stored values of the PNG at `path`.  RGB is read only where R = G = B, alpha only where it is opaque."""
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            values = np.asarray(image)
-    except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"not readable as a PNG ({error})", file=path, key=key, cure="save the mask again, as PNG") from error
+def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
+    """The stored values of the PNG at `path`.  RGB is read only where R = G = B, alpha only where it is opaque.
+
+    size: (height, width) that it should have; a picture of another size is refused by its header.
+    """
+    check_plain(path, "a PNG", key)
+    with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
+        check_size(image.size[::-1], size or image.size[::-1], path, key)
+        values = np.asarray(image)
     depth, colour_type = _depth_and_type(path)
     if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow would keep the upper byte alone
         found = "has several channels of 16 bits"
@@ -33,9 +38,9 @@ def read_values(path: str | Path, key: str) -> UInt16[np.ndarray, "h w"]:
     return (values // (_STRETCH.get(depth, 1) if colour_type == _GREY else 1)).astype(np.uint16)
 
 
-def read_inside(path: str | Path, key: str) -> Bool[np.ndarray, "h w"]:
+def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
     """A mask of one thing: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
-    values = read_values(path, key)
+    values = read_values(path, key, size)
     return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
 
 

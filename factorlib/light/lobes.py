@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float
 
-from factorlib.errors import InputError
+from factorlib.parquetfile import read_columns
+from factorlib.reading import reading
 from factorlib.wholefile import writing
 
 FRAME = (
@@ -24,6 +25,7 @@ FRAME = (
 )
 COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
 SMALL_SHARPNESS = 1e-3
+WHAT, CURE = "a table of lobes", "run the stage `solve` again"
 
 
 class Lobes(msgspec.Struct, frozen=True):
@@ -97,12 +99,12 @@ def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
 
 def read_lobes(path: str | Path) -> dict[str, Lobes]:
     """Lobes by illumination; raises InputError for a file that `write_lobes` did not write."""
-    try:
-        table = pq.read_table(path)
-        names = json.loads(table.schema.metadata[b"factorlib"])["illuminations"]
-        values = np.column_stack([table[c].to_numpy() for c in COLUMNS]).reshape(-1, len(COLUMNS))
-        illumination = np.array(table["illumination"].to_pylist(), dtype=object)
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"not a table of lobes ({error})", file=path, cure="run the stage `solve` again") from error
+    columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=CURE)
+    with reading(WHAT, path, cure=CURE):
+        names = msgspec.convert(about["illuminations"], list[str])
+        values = np.column_stack([columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]).reshape(-1, len(COLUMNS))
+        illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
+        if not set(illumination) <= set(names):
+            raise ValueError("a lobe of an illumination that its metadata do not name")
     parts = {name: values[illumination == name] for name in names}
     return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}

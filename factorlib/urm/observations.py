@@ -21,9 +21,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
+from factorlib.parquetfile import read_columns
+from factorlib.reading import reading
 from factorlib.wholefile import writing
 
-VECTORS = ("normal", "half", "view", "radiance")
+VECTORS = ("normal", "view", "radiance", "clipped")
+UNIT_ERROR = 1e-3  # of the length of a direction
+WHAT, CURE = "a reflectance map", "run the stage `urm` again"
 VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
     "azimuth about z from x toward y = k π (3 − √5)"
@@ -92,15 +96,33 @@ def write_observations(path: str | Path, observations: Observations) -> None:
 
 def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
-    try:
-        table = pq.read_table(path)
-        names = json.loads(table.schema.metadata[b"factorlib"])
-        columns = {name: _array(table[name].combine_chunks(), DTYPES[name]) for name in COLUMNS}
-        columns["visibility"] = _of_bytes(table["visibility"].combine_chunks()) if "visibility" in table.column_names else None
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"not a reflectance map ({error})", file=path, cure="run the stage `urm` again") from error
-    named = {k: tuple(names[k]) for k in ("materials", "photos", "illuminations")}
-    return Observations(**columns, **named, exposures=tuple(names.get("exposures", ())))
+    parts, about = read_columns(path, WHAT, COLUMNS, ("visibility",), CURE)
+    with reading(WHAT, path, cure=CURE):
+        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in COLUMNS}
+        columns["visibility"] = _of_bytes(parts["visibility"]) if "visibility" in parts else None
+        named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")}
+        exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
+        observations = Observations(**columns, **named, exposures=exposures)
+        _check(observations)
+    return observations
+
+
+def _check(observations: Observations) -> None:
+    """Raise ValueError where a number cannot be meant: no solve survives a single NaN."""
+    for name in ("normal", "view", "radiance", "weight"):
+        if not np.isfinite(getattr(observations, name)).all():
+            raise ValueError(f"column {name!r} holds what is not finite")
+    for name in ("normal", "view"):
+        if (np.abs(np.linalg.norm(getattr(observations, name), axis=1) - 1) > UNIT_ERROR).any():
+            raise ValueError(f"column {name!r} holds what is no direction")
+    if (observations.weight < 0).any():
+        raise ValueError("column 'weight' holds negative weights")
+    for name, known in (("material", observations.materials), ("photo", observations.photos), ("illumination", observations.illuminations)):
+        index = getattr(observations, name)
+        if len(index) and not 0 <= index.min() <= index.max() < len(known):
+            raise ValueError(f"column {name!r} points beyond the names of the metadata")
+    if observations.exposures and len(observations.exposures) != len(observations.photos):
+        raise ValueError("its exposures are not one a photo")
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -147,7 +169,10 @@ def _of_bytes(column: pa.Array) -> UInt8[np.ndarray, "n k"]:
     return np.frombuffer(column.buffers()[1], "u1").reshape(-1, k)[column.offset : column.offset + len(column)].copy()
 
 
-def _array(column: pa.Array, dtype: str) -> np.ndarray:
-    if pa.types.is_fixed_size_list(column.type):
-        return column.flatten().to_numpy(zero_copy_only=False).astype(dtype).reshape(-1, column.type.list_size)
-    return column.to_numpy(zero_copy_only=False).astype(dtype)
+def _array(column: pa.Array, dtype: str, is_vector: bool) -> np.ndarray:
+    """Of the type that it is written in; ValueError for values that do not fit into it."""
+    if pa.types.is_fixed_size_list(column.type) != is_vector or pa.types.is_string(column.type):
+        raise ValueError(f"a column is of type {column.type}")
+    flat = column.flatten() if is_vector else column
+    values = flat.cast(pa.from_numpy_dtype(np.dtype(dtype))).to_numpy(zero_copy_only=False)
+    return values.reshape(-1, 3) if is_vector else values

@@ -10,8 +10,8 @@ from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError
 from factorlib.labels import read_labels, read_objects
-from factorlib.labels.coco import decode_rle, decompress
 from factorlib.labels.png import read_values
+from factorlib.labels.rle import decode_rle, decompress
 
 MATERIALS = ["red", "white", "wood"]
 H, W = 20, 30

@@ -50,5 +50,5 @@ def test_table_round_trip_is_exact_and_byte_equal(tmp_path):
 
 def test_something_else_is_refused_by_name(tmp_path):
     (tmp_path / "x.parquet").write_text("no table")
-    with pytest.raises(InputError, match="not a table of lobes"):
+    with pytest.raises(InputError, match="not readable as a table of lobes"):
         read_lobes(tmp_path / "x.parquet")

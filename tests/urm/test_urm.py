@@ -60,7 +60,7 @@ def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path):
 
 def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
     (tmp_path / "x.parquet").write_bytes(b"PAR1 nonsense")
-    with pytest.raises(InputError, match="not a reflectance map"):
+    with pytest.raises(InputError, match="not readable as a reflectance map"):
         read_observations(tmp_path / "x.parquet")
 
 

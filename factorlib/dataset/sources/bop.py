@@ -6,14 +6,20 @@ of a depth map into the ray through (0, 0)), here they are at 0.5.  It does not 
 
 from __future__ import annotations
 
+import re
+
 import msgspec
 import pycolmap
 
-from factorlib.dataset.check import Refusal, check_rotation
+from factorlib.dataset.numbers import check_rotation
+from factorlib.dataset.paths import Refusal, file_of
 from factorlib.dataset.schema import Pose, Vec3
-from factorlib.dataset.sources.shot import Shot
+from factorlib.dataset.sources.shot import Shot, colmap_camera
 from factorlib.dataset.sources.transforms import read_source
+from factorlib.reading import one_line
 
+KEY = "cameras.bop"
+ID = re.compile("[0-9]{1,18}")
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
 Nine = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -34,29 +40,29 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The images of the scene in the dataset's folder `path`, by id."""
-    folder = refuse.folder / path
-    if not (folder / CAMERAS).is_file():
-        refuse("cameras.bop", f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
-    cameras = read_source(folder / CAMERAS, dict[str, SceneCamera])
-    poses = read_source(folder / POSES, dict[str, list[SceneObject]]) if (folder / POSES).is_file() else {}
+    camera_file, pose_file = (file_of(KEY, path, name, refuse) for name in (CAMERAS, POSES))
+    if camera_file is None:
+        refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
+    cameras = read_source(camera_file, dict[str, SceneCamera], KEY)
+    poses = read_source(pose_file, dict[str, list[SceneObject]], KEY) if pose_file else {}
+    of_cameras, of_poses = (Refusal(refuse.folder / path / name, refuse.folder) for name in (CAMERAS, POSES))
     for image in cameras:
-        if not image.isdigit():
-            Refusal(folder / CAMERAS, refuse.folder)(image, "is not the id of an image", "ids are whole numbers")
-    of_file = Refusal(folder / POSES, refuse.folder)
+        if not ID.fullmatch(image):
+            of_cameras(one_line(image), "is not the id of an image", "ids are whole numbers, of 18 digits at most")
     return [
-        Shot(int(image), _camera(image, camera, refuse, folder), None, f"{CAMERAS}: {image}", poses=_poses(image, poses, of_file))
+        Shot(int(image), _camera(image, camera, of_cameras), None, f"{CAMERAS}: {image}", poses=_poses(image, poses, of_poses))
         for image, camera in sorted(cameras.items(), key=lambda item: int(item[0]))
     ]
 
 
-def _camera(image: str, camera: SceneCamera, refuse: Refusal, folder) -> pycolmap.Camera:
+def _camera(image: str, camera: SceneCamera, refuse: Refusal) -> pycolmap.Camera:
     """Its image is taken to be as large as twice the principal point."""
     fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
     if skew != 0 or min(fx, fy, cx, cy) <= 0:
         cure = "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
-        Refusal(folder / CAMERAS, refuse.folder)(f"{image}.cam_K", "is not the camera of square axes", cure)
+        refuse(f"{image}.cam_K", "is not the camera of square axes", cure)
     centre = cx + 0.5, cy + 0.5
-    return pycolmap.Camera(model="PINHOLE", width=round(2 * centre[0]), height=round(2 * centre[1]), params=[fx, fy, *centre])
+    return colmap_camera(f"{image}.cam_K", "PINHOLE", 2 * centre[0], 2 * centre[1], [fx, fy, *centre], refuse)
 
 
 def _poses(image: str, poses: dict[str, list[SceneObject]], refuse: Refusal) -> dict[int, list[Pose]]:

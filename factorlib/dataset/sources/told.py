@@ -10,7 +10,8 @@ from pathlib import Path, PurePosixPath
 
 import msgspec
 
-from factorlib.dataset.check import IMAGES, Refusal
+from factorlib.dataset.check import IMAGES
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ObjectEntry, PhotoEntry, Pose, Told
 from factorlib.dataset.sources.bop import bop_shots
 from factorlib.dataset.sources.colmap import colmap_shots
@@ -43,8 +44,7 @@ def told_by_source(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str
 
 def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) -> dict[str, Shot]:
     """photo -> its image in the source: as `images` says; else by path, by file name, or by that without suffix; BOP: by id."""
-    by_name, result = {shot.image: shot for shot in shots}, {}
-    named = [(PurePosixPath(str(shot.image).replace("\\", "/")), shot) for shot in shots]
+    by_name, named, result = {shot.image: shot for shot in shots}, _Named(shots), {}
     for photo in spec.photos:
         key = f"cameras.images.{photo.name}"
         if photo.name in spec.cameras.images:
@@ -53,7 +53,7 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
                 refuse(key, f"the source has no image {image!r}", did_you_mean(str(image), by_name))
             result[photo.name] = by_name[image]
             continue
-        alike = _alike(PurePosixPath(photo.image), named)
+        alike = named.alike(PurePosixPath(photo.image))
         if len(alike) > 1:
             names = ", ".join(repr(shot.image) for shot in alike[:3])
             refuse(key, f"{photo.image!r} could be {names}", f"say which: cameras.images: {{{photo.name}: …}}")
@@ -66,15 +66,28 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
     return result
 
 
-def _alike(photo: PurePosixPath, named: list[tuple[PurePosixPath, Shot]]) -> list[Shot]:
-    """By the strictest way in which any is."""
-    ways = (
-        lambda path, shot: isinstance(shot.image, int) and photo.stem.isdigit() and int(photo.stem) == shot.image,
-        lambda path, shot: photo.parts[-len(path.parts) :] == path.parts,
-        lambda path, shot: photo.name == path.name,
-        lambda path, shot: photo.stem == (path.stem if path.suffix.lower() in SUFFIXES else path.name),
-    )
-    return next((found for way in ways if (found := [shot for path, shot in named if way(path, shot)])), [])
+class _Named:
+    """Shots by everything that a photo's path may have in common with their names, so that a photo need not ask each."""
+
+    def __init__(self, shots: list[Shot]):
+        self.by_id, self.by_path, self.by_file, self.by_stem = ({} for _ in range(4))
+        for shot in shots:
+            path = PurePosixPath(str(shot.image).replace("\\", "/"))
+            stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
+            for table, key in ((self.by_id, shot.image), (self.by_path, path.parts), (self.by_file, path.name), (self.by_stem, stem)):
+                table.setdefault(key, []).append(shot)
+
+    def alike(self, photo: PurePosixPath) -> list[Shot]:
+        """Those by the strictest way in which any is."""
+        number = int(photo.stem) if photo.stem.isascii() and photo.stem.isdigit() else None
+        tails = (photo.parts[-length:] for length in range(1, len(photo.parts) + 1))
+        ways = (
+            self.by_id.get(number, []),
+            [shot for tail in tails for shot in self.by_path.get(tail, [])],
+            self.by_file.get(photo.name, []),
+            self.by_stem.get(photo.stem, []),
+        )
+        return next((found for found in ways if found), [])
 
 
 def _told(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Told:

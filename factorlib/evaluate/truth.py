@@ -1,0 +1,43 @@
+"""The maps of a truth, read and held against what they are of: a true light is radiance, true normals have the photo's pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr, read_rgb_exr
+
+LEAST = -1e-3  # of the mean magnitude: resampling leaves a little below 0
+
+
+def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
+    """The lat-long map of illumination `name`; InputError where a texel is no radiance."""
+    radiance, key = read_rgb_exr(path), f"illumination.{name}"
+    finite = np.isfinite(radiance)
+    if not finite.all():
+        found = f"{int((~finite).any(axis=-1).sum())} texels are NaN or infinite"
+        raise InputError(found, file=path, key=key, cure="render the map again")
+    if radiance.min() < LEAST * np.abs(radiance).mean():
+        found = f"a radiance of {radiance.min():.4g} is less than 0"
+        raise InputError(found, file=path, key=key, cure="give linear radiance: was a filter with negative lobes used? cut it at 0")
+    return radiance
+
+
+def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
+    """Of photo `name`, whose file has `size` (width, height): normal.x/y/z, or R, G, B; zero or NaN where none is known."""
+    channels, key = read_exr(path), f"normals.{name}"
+    names = [f"normal.{axis}" for axis in "xyz"] if "normal.x" in channels else list("RGB")
+    missing = [channel for channel in names if channel not in channels]
+    if missing:
+        found = f"has no channel {missing[0]}, only {', '.join(channels)}"
+        raise InputError(found, file=path, key=key, cure="normals are normal.x, normal.y, normal.z, or R, G, B")
+    normals = np.stack([channels[channel] for channel in names], axis=-1)
+    if normals.shape[1::-1] != tuple(size):
+        found = f"the normals have {normals.shape[1]} × {normals.shape[0]} pixels, the photo {size[0]} × {size[1]}"
+        raise InputError(found, file=path, key=key, cure="render them with the photo's own pixels")
+    if np.isinf(normals).any():
+        raise InputError("a normal is infinite", file=path, key=key, cure="write 0 where there is none")
+    return normals

@@ -1,0 +1,66 @@
+"""Parquet on disk: named columns of numbers, and what this project writes about them in the schema's metadata.
+
+What a file announces is looked at before its columns are read: a kilobyte of Parquet can stand for gigabytes of one number.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from factorlib.reading import check_plain, reading
+
+MOST_ROWS = 100_000_000
+MOST_BYTES = 4096  # of one value: a visibility has as many directions
+
+
+def read_columns(
+    path: str | Path, what: str, needed: Iterable[str], optional: Iterable[str] = (), cure: str = "", most_rows: int = MOST_ROWS
+) -> tuple[dict[str, pa.Array], dict[str, Any]]:
+    """The columns by name, without nulls, and the metadata `factorlib`; what else stands in the file is not read.
+
+    what: what the file should be, with its article, for messages.  Raises InputError for a file that is no Parquet, has more
+    than `most_rows` rows, or lacks a needed column.
+    """
+    check_plain(path, what, most_bytes=None)
+    with reading(what, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
+        if file.metadata.num_rows > most_rows:
+            raise ValueError(f"{file.metadata.num_rows:,} rows, more than {most_rows:,}")
+        schema = file.schema_arrow
+        names = [*needed, *(name for name in optional if name in schema.names)]
+        for name in names:
+            _check_type(name, schema)
+        table = file.read(columns=names)
+        columns = {name: table[name].combine_chunks() for name in names}
+        for name, column in columns.items():
+            if column.null_count or (pa.types.is_fixed_size_list(column.type) and column.flatten().null_count):
+                raise ValueError(f"column {name!r} has empty places")
+            column.validate(full=True)
+        about = json.loads((schema.metadata or {})[b"factorlib"])
+        if not isinstance(about, dict):
+            raise ValueError("its metadata `factorlib` is no table")
+    return columns, about
+
+
+def _check_type(name: str, schema: pa.Schema) -> None:
+    """Numbers, text, bytes, or short lists of numbers."""
+    if schema.names.count(name) != 1:
+        raise ValueError(f"it has {schema.names.count(name)} columns {name!r}")
+    kind = schema.field(name).type
+    if pa.types.is_fixed_size_list(kind):
+        good = kind.list_size == 3 and _is_number(kind.value_type)
+    elif pa.types.is_fixed_size_binary(kind):
+        good = 0 < kind.byte_width <= MOST_BYTES
+    else:
+        good = _is_number(kind) or pa.types.is_string(kind)
+    if not good:
+        raise ValueError(f"column {name!r} is of type {kind}")
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
