@@ -205,6 +205,7 @@ def restore(folder: Path, source: str | None = None) -> None:
     good = DATASET | ({"cameras": SOURCES[source]} if source else {})
     (folder / "dataset.yaml").write_text(yaml.safe_dump(good))
     (folder / "truth.yaml").write_text(yaml.safe_dump(TRUTH))
+    (folder / "m.png").write_bytes(png(HEADER, PALETTE, PIXELS))
     for name, value in (("t.json", TRANSFORMS), ("coco.json", COCO), ("model/scene_camera.json", SCENE_CAMERA), ("model/scene_gt.json", SCENE_GT)):
         (folder / name).write_text(json.dumps(value))
     for name, content in (("cameras.bin", CAMERAS_BIN), ("images.bin", IMAGES_BIN), ("cameras.txt", CAMERAS_TXT), ("images.txt", IMAGES_TXT)):
