@@ -43,6 +43,7 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Refine the poses of one photo's objects, and write its entry of poses.json with what decided."""
     name, table = inputs.photo, inputs["solve"] / "materials.json"
     photo, entry = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["align"] / f"{name}.json")
     materials, known = known_materials(table, inputs.facts["dataset.materials"])

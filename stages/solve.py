@@ -198,6 +198,7 @@ def _rounds_to(progress: Progress, bundle: Bundle, models: int) -> Report:
     total, fitted, round_ = models * bundle.rounds + 1, 0, 0  # of the models to choose from, those that are done
 
     def report(event: Event) -> None:
+        """Say how many of all rounds are done."""
         nonlocal fitted, round_
         fitted, round_ = fitted + (event.round < round_), event.round
         of_round = (event.iteration + 1) / bundle.iterations if event.phase == "descent" else 1.0

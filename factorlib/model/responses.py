@@ -101,6 +101,7 @@ class UnitReflection(torch.autograd.Function):
     def forward(
         ctx: torch.autograd.function.FunctionCtx, operator: Operator, roughness: Tensor, log_sharpness: Tensor, *cosines: Tensor
     ) -> tuple[Tensor, Tensor]:
+        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
         no, nz, oz = cosines
         inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), no, nz, oz)]
         response = operator.response(*inputs)
@@ -111,6 +112,7 @@ class UnitReflection(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
         by_roughness, diffuse_by_sharpness, specular_by_sharpness, diffuse_by_nz, specular_by_nz, specular_by_oz = ctx.saved_tensors
         by_sharpness = (diffuse * diffuse_by_sharpness + specular * specular_by_sharpness).sum(0)
         by_nz = diffuse * diffuse_by_nz + specular * specular_by_nz

@@ -70,6 +70,7 @@ def moving_object(photographed: Photographed, poses: Sequence[Pose], surfaces: S
     caster = view.casters[number]
 
     def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, "n"]]:
+        """All pixels with the object in a state, visibility as in `like`; which of them show what the mask does."""
         own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
         seen = view.seen(own, posed)
         return view.block(own, seen, like, posed), seen.agrees

@@ -55,6 +55,7 @@ def from_nothing(materials: int) -> Start:
     """Materials 0 … `materials`−1 and lights from mean radiances alone, nothing decided."""
 
     def point(problem: JointProblem, bundle: Bundle) -> Point:
+        """Materials whose diffuse part explains mean radiances, one broad lobe a light."""
         start = starting_materials(problem.blocks, materials, bundle.start_specular_share, bundle.start_roughness)
         return Point(start, [starting_light(block, start) for block in problem.blocks])
 
