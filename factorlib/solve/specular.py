@@ -5,8 +5,8 @@ least specular first, loses its specular part; the rest of the problem is brough
 A material that reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out
 highlights better than the right one, and a dark glossy material would lose all it shows.
 
-Both sides of a comparison are judged where their descents explain held-out observations best: with these out of its sight, a lobe may
-grow in the part of the light that they alone mirror, and what is lost there says nothing about a specular part.
+Iterations that do harm to what is held out decide nothing: with it out of their sight, a lobe may grow in the part of the light that
+it alone mirrors, and what is lost there says nothing about a specular part.
 
 What is fitted again for a trial are the `LIGHTS` lights that show most of the material, so that a trial costs the same
 however large the set.
@@ -57,19 +57,17 @@ class Trials:
     def near_optimum(
         self, lights: Sequence[int], materials: Materials, lambertian: Bool[np.ndarray, "m"], most: float = np.inf
     ) -> Point:
-        """Materials and the `lights`, at that point of a descent which explains held-out observations best.
+        """Materials and the `lights` some iterations on, or as they are where those did harm to what is held out.
 
-        most: the descent ends early where the held-out loss exceeds it after the `FIRST` iterations
+        most: only the `FIRST` iterations where the held-out loss then exceeds it
         """
         own, judge, fixed = self.fitting.restricted(lights), self.problem.restricted(lights), specular_unknowns(lambertian)
-        iterates = [evaluate(own, Point(materials, self.start.restricted(lights).lights))]
-        losses = [judge.held_out_loss(iterates[0].point)]
-        for iterations in (FIRST, ITERATIONS):
-            iterates.append(descend(own, iterates[-1], Descent(iterations), fixed=fixed))
-            losses.append(judge.held_out_loss(iterates[-1].point))
-            if losses[-1] > most:
-                break
-        return iterates[int(np.argmin(losses))].point
+        before = evaluate(own, Point(materials, self.start.restricted(lights).lights))
+        after = descend(own, before, Descent(FIRST), fixed=fixed)
+        if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):
+            after = descend(own, after, Descent(ITERATIONS), fixed=fixed)
+        harmless = (1 + SPECULAR.harm) * judge.held_out_loss(before.point)
+        return after.point if judge.held_out_loss(after.point) <= harmless else before.point
 
     def lights_of(self, m: int) -> Int[np.ndarray, "k"]:
         """The lights that show most of material m."""
