@@ -26,19 +26,26 @@ from benchmarks.solve.workers import threaded
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
+from factorlib.model.blocks import Block
+from factorlib.model.cells import mirror_cells
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations, usable
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Joint, candidates, solve
-from factorlib.solve.descent import Descent, Solution, descend
-from factorlib.solve.held_out import held_out_loss
+from factorlib.reflection.operator import Operator
+from factorlib.solve.bundle import Solution, models, solve
+from factorlib.solve.descent import Descent, descend
+from factorlib.solve.history import Run
 from factorlib.solve.insertion import blurred, pruned
-from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block, Noise, blocks_of_observations, mirror_cells, of_rows, usable
 from factorlib.solve.rounds import Start, from_nothing, with_new_lobes
 from factorlib.solve.start import starting_light
-from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.warm import with_exposures
-from factorlib.stage import serial_map
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate, read_observations
 
@@ -51,9 +58,9 @@ VARIANTS: dict[str, dict] = {
     "no tone curves": {"tone": "off"},
     "no self-shadowing": {"self_shadowing": "off"},
     "every material specular": {"specular": "on"},
-    "no material specular": {"matte": True},
-    "no tint prior": {"loss": Loss(prior=0.0)},
-    "tint prior .1, the paper's": {"loss": Loss(prior=0.1)},
+    "no material specular": {"lambertian": True},
+    "no tint prior": {"prior": 0.0},
+    "tint prior .1, the paper's": {"prior": 0.1},
 }
 
 
@@ -80,19 +87,24 @@ def _split(block: Block) -> Split:
     names, cell = np.unique(mirror_cells(block.normal, block.view, CELL), return_inverse=True)
     asked = (np.random.default_rng(17).random(len(names)) < SHARE)[cell.reshape(-1)]
     asked &= np.isin(block.material, block.material[~asked])
-    return Split(of_rows(block, ~asked), of_rows(block, asked))
+    return Split(block.take(~asked), block.take(asked))
 
 
-def solved(blocks: Sequence[Block], materials: int, operator, how: dict) -> Joint:
+def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
     how = dict(how)
-    all_matte = np.full(materials, how.pop("matte", False))
-    start = Start(from_nothing(materials).point, all_matte, all_matte)
-    return solve(blocks, materials, operator, msgspec.structs.replace(DEFAULT, **how), threaded, lambda event: None, start=start)
+    none_specular, loss = np.full(materials, how.pop("lambertian", False)), Loss(prior=how.pop("prior", Loss().prior))
+    start = Start(from_nothing(materials).point, none_specular, none_specular)
+    return solve(JointProblem(list(blocks), operator, loss, threaded), start, Run(msgspec.structs.replace(DEFAULT, **how)))
 
 
-def shown(joint: Joint, block: Block) -> Block:
+def shown(solution: Solution, block: Block, operator: Operator) -> Block:
     """With what the solve took of visibility."""
-    return candidates([block], "on" if joint.self_shadowing else "off").popitem()[1][0]
+    return models(JointProblem([block], operator), "on" if solution.shadows.kept else "off").popitem()[1].blocks[0]
+
+
+def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> np.ndarray:
+    """Radiance of a block's observations in a light, by the materials and the model of a solution."""
+    return Illumination(shown(solution, block, operator), light, solution.point.materials, operator).radiance()
 
 
 def decibels(of: Block, radiance: np.ndarray, whole: Block) -> float:
@@ -101,9 +113,9 @@ def decibels(of: Block, radiance: np.ndarray, whole: Block) -> float:
     return -10 * float(np.log10(max(np.mean(error**2), 1e-12) / np.quantile(whole.radiance, 0.999) ** 2))
 
 
-def unseen(splits: Sequence[Split], joint: Joint, operator) -> list[float]:
-    found = zip(splits, joint.solution.lights, strict=True)
-    return [decibels(s.asked, predicted_radiance(shown(joint, s.asked), li, joint.solution.materials, operator), s.seen) for s, li in found]
+def unseen(splits: Sequence[Split], solution: Solution, operator: Operator) -> list[float]:
+    found = zip(splits, solution.point.lights, strict=True)
+    return [decibels(s.asked, predicted(solution, s.asked, light, operator), s.seen) for s, light in found]
 
 
 def flat(split: Split) -> float:
@@ -115,22 +127,23 @@ def flat(split: Split) -> float:
     return decibels(split.asked, guess, split.seen)
 
 
-def light_of(block: Block, materials: Materials, operator) -> Light:
-    """The light of one block, its materials held: rounds of insertion and descent while held-out observations gain."""
+def light_of(block: Block, materials: Materials, operator: Operator) -> Light:
+    """The light of one block, its materials fixed: rounds of insertion and descent while held-out observations gain."""
+    problem = JointProblem([block], operator)
     bundle, light, best, least = DEFAULT, starting_light(block, materials), None, np.inf
     every = np.ones(7 * len(materials), bool)
     for number in range(bundle.rounds):
-        at = with_new_lobes([block], Solution(materials, [light], []), operator, bundle.loss, bundle, number, serial_map)
-        at = descend([block], at, operator, bundle.loss, Descent(bundle.iterations, bundle.tolerance), serial_map, held=every)
-        light = blurred(pruned(at.lights[0]), materials.sharpest)
-        held_out = held_out_loss([block], materials, [light], operator, bundle.loss)
+        at = with_new_lobes(problem, Point(materials, [light]), bundle, number)
+        at = descend(problem, at, Descent(bundle.iterations, bundle.tolerance), fixed=every)
+        light = blurred(pruned(at.point.lights[0]), materials.sharpest)
+        held_out = problem.held_out_loss(Point(materials, [light]))
         if held_out > (1 - bundle.least_gain) * least:
             break
         best, least = light, held_out
     return best or light
 
 
-def left_out(splits: Sequence[Split], whole: Joint, materials: int, operator, report: Callable[[], None]) -> dict[str, dict[str, float]]:
+def left_out(splits: Sequence[Split], whole: Solution, materials: int, operator: Operator, report: Callable[[], None]) -> dict[str, dict[str, float]]:
     """Decibels of each light or photo on the observations it is asked for, by where its materials come from."""
     found = {}
     for k, split in enumerate(splits):
@@ -147,29 +160,31 @@ def left_out(splits: Sequence[Split], whole: Joint, materials: int, operator, re
         }
         report()
         row = {}
-        for name, joint in sources.items():
-            of, asked = shown(whole, split.seen), shown(whole, split.asked)
-            light = light_of(of, joint.solution.materials, operator)
-            row[name] = decibels(asked, predicted_radiance(asked, light, joint.solution.materials, operator), split.seen)
+        for name, source in sources.items():
+            of, asked = shown(whole, split.seen, operator), shown(whole, split.asked, operator)
+            materials_ = source.point.materials
+            light = light_of(of, materials_, operator)
+            row[name] = decibels(asked, Illumination(asked, light, materials_, operator).radiance(), split.seen)
         found[split.seen.name] = row | {"flat": flat(split)}
     return found
 
 
-def _photos_left_out(splits: Sequence[Split], k: int, whole: Joint, materials: int, operator, report: Callable[[], None]) -> dict:
+def _photos_left_out(splits: Sequence[Split], k: int, whole: Solution, materials: int, operator: Operator, report: Callable[[], None]) -> dict:
     """Of photos that share a light: all of each, in the light and of the materials that the others tell."""
     found = {}
     for f, photo in enumerate(splits[k].seen.photos):
-        of = [s.seen if i != k else of_rows(s.seen, s.seen.photo != f) for i, s in enumerate(splits)]
-        joint = solved(of, materials, operator, {})
+        of = [s.seen if i != k else s.seen.take(s.seen.photo != f) for i, s in enumerate(splits)]
+        others = solved(of, materials, operator, {})
         report()
         row = {}
-        for name, answer in (("others", joint), ("all", whole)):
-            exposure = np.where(np.arange(len(splits[k].seen.photos)) == f, np.nan, answer.solution.lights[k].log_exposure)
-            known = msgspec.structs.replace(answer.solution.lights[k], log_exposure=exposure)
-            light = with_exposures(known, shown(answer, splits[k].seen), answer.solution.materials, operator)
-            asked = of_rows(splits[k].asked, splits[k].asked.photo == f)
-            row[name] = decibels(asked, predicted_radiance(shown(answer, asked), light, answer.solution.materials, operator), splits[k].seen)
-        own = Split(of_rows(splits[k].seen, splits[k].seen.photo == f), asked)
+        for name, answer in (("others", others), ("all", whole)):
+            exposure = np.where(np.arange(len(splits[k].seen.photos)) == f, np.nan, answer.point.lights[k].log_exposure)
+            known = msgspec.structs.replace(answer.point.lights[k], log_exposure=exposure)
+            own = Illumination(shown(answer, splits[k].seen, operator), known, answer.point.materials, operator)
+            light = with_exposures(own)
+            asked = splits[k].asked.take(splits[k].asked.photo == f)
+            row[name] = decibels(asked, predicted(answer, asked, light, operator), splits[k].seen)
+        own = Split(splits[k].seen.take(splits[k].seen.photo == f), asked)
         found[photo] = row | {"flat": flat(own)}
     return found
 
@@ -182,11 +197,11 @@ def measured(dataset: str, photos: bool) -> dict:
     result: dict = {"parts": {"flat": _summary([flat(split) for split in splits])}}
     with tqdm(total=len(VARIANTS) + leaving, desc=dataset) as bar:
         for name, how in VARIANTS.items():
-            joint = whole if how and not _differs(how, whole) else solved(seen, count, operator, how)
-            lobes = [len(light) for light in joint.solution.lights]
-            result["parts"][name] = _summary(unseen(splits, joint, operator)) | {"lobes": [min(lobes), max(lobes)]}
+            solution = whole if how and not _differs(how, whole) else solved(seen, count, operator, how)
+            lobes = [len(light) for light in solution.point.lights]
+            result["parts"][name] = _summary(unseen(splits, solution, operator)) | {"lobes": [min(lobes), max(lobes)]}
             if not how:
-                whole, found = joint, joint.solution.materials
+                whole, found = solution, solution.point.materials
                 result["materials"] = {
                     n: {
                         "diffuse": found.diffuse[m].round(3).tolist(),
@@ -195,16 +210,16 @@ def measured(dataset: str, photos: bool) -> dict:
                     }
                     for m, n in enumerate(names)
                 }
-                result["tone"] = {b.name: np.exp(light.log_tone).round(3).tolist() for b, light in zip(seen, joint.solution.lights, strict=True)}
-                result["self_shadowing"] = joint.self_shadowing
+                result["tone"] = {b.name: np.exp(light.log_tone).round(3).tolist() for b, light in zip(seen, solution.point.lights, strict=True)}
+                result["self_shadowing"] = solution.shadows.kept
             bar.update()
         result["left_out"] = left_out(splits, whole, count, operator, bar.update) if photos else {}
     return result
 
 
-def _differs(how: dict, whole: Joint) -> bool:
+def _differs(how: dict, whole: Solution) -> bool:
     """Whether the solve as it is has what a variant goes without."""
-    has = {"tone": any(told.kept for told in whole.tone), "self_shadowing": whole.self_shadowing, "specular": whole.matte.any()}
+    has = {"tone": any(one.kept for one in whole.tone), "self_shadowing": whole.shadows.kept, "specular": whole.lambertian.any()}
     return all(has.get(part, True) for part in how)
 
 

@@ -29,15 +29,22 @@ from factorlib.align.target import target_of
 from factorlib.generate.chair import chair, labelled
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
-from factorlib.refine.photo import Refined, Scene, Thing, refined_photo
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.problem import JointProblem
+from factorlib.refine.light import Surfaces
+from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.operator import Operator
 from factorlib.solve.bundle import solve
-from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block, Noise, blocks_of_observations
-from factorlib.solve.unknowns import Light, Materials
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
@@ -82,7 +89,7 @@ def random_light(rng: np.random.Generator, lobes: int = 40) -> Light:
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
 
 
-def photographed(kind: str, number: int, rng: np.random.Generator, operator) -> Photo:
+def photographed(kind: str, number: int, rng: np.random.Generator, operator: Operator) -> Photo:
     shape, materials = (AMBIGUOUS if kind == "front/back" else OBJECTS)[number]
     caster = Caster(mesh_of(shape, materials))
     given = Caster(mesh_of(shape, materials, number)) if kind == "rough" else caster
@@ -117,7 +124,7 @@ def by_contours(caster: Caster, evidence: Evidence, camera: Camera, start: State
     return refined(caster, target, camera, start, FocalPrior(camera.focal, 0.0), 12).state
 
 
-def rendered(caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.random.Generator, operator) -> dict:
+def rendered(caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.random.Generator, operator: Operator) -> dict:
     """The channels that `masks` would write."""
     maps = rasterise(caster, camera, pose)
     y, x = np.nonzero(maps.label)
@@ -128,7 +135,7 @@ def rendered(caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.r
         "light", ("photo",), 1.0, maps.normal[y, x], maps.view[y, x], np.zeros((n, 3)), np.zeros((n, 3), bool), np.ones((n, 3)),
         material.astype(int), np.zeros(n, int), np.zeros(n, bool),
     )  # fmt: skip
-    radiance = predicted_radiance(block, light, TRUE, operator)
+    radiance = Illumination(block, light, TRUE, operator).radiance()
     picture = np.zeros((HEIGHT, WIDTH, 3))
     picture[y, x] = radiance / np.quantile(radiance.max(1), 0.99) * 0.9
     picture += NOISE * rng.normal(size=picture.shape)
@@ -137,7 +144,7 @@ def rendered(caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.r
     return channels | {"label": maps.label.astype(float), "valid": np.ones(maps.label.shape)}
 
 
-def solved_materials(photos: list[Photo], operator) -> Materials:
+def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
     """As the pipeline would, with the poses that are had."""
     seen = []
     for k, photo in enumerate(photos):
@@ -147,7 +154,8 @@ def solved_materials(photos: list[Photo], operator) -> Materials:
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, name=name, illumination=name, materials=["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
-    return solve(blocks, 3, operator, Bundle(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3), serial_map, lambda event: None).solution.materials
+    bundle = Bundle(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
+    return solve(JointProblem(blocks, operator), from_nothing(3), Run(bundle)).point.materials
 
 
 def normal_error(photo: Photo, pose: Pose) -> float:
@@ -168,10 +176,10 @@ def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> 
             "ruled_out": verdict and verdict.ruled_out, "seconds": seconds, "candidates": each}  # fmt: skip
 
 
-def refined_of(photo: Photo, materials: Materials, operator) -> Refined:
+def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
-    thing = Thing(photo.given, Evidence(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
-    return refined_photo(Scene(photo.camera, [thing], FocalPrior(photo.camera.focal, 0.0)), pixels, materials, operator)[0]
+    own = PosedObject(photo.given, Evidence(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
+    return refined_photo(Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator))[0]
 
 
 def table(rows: list[dict]) -> str:

@@ -24,8 +24,9 @@ from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
 from factorlib.refine.choice import Standards
+from factorlib.refine.light import Surfaces
 from factorlib.refine.materials import known_materials
-from factorlib.refine.photo import Refined, Scene, Thing, refined_photo
+from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
 from factorlib.stage import Inputs, Progress
@@ -42,6 +43,7 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Refine the poses of one photo's objects, and write its entry of poses.json with what decided."""
     name, table = inputs.photo, inputs["solve"] / "materials.json"
     photo, entry = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["align"] / f"{name}.json")
     materials, known = known_materials(table, inputs.facts["dataset.materials"])
@@ -53,11 +55,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     pixels, operator = pixels_of(photo, known, params.pixels, params.seed), reflection_operator("network", weights=inputs["train"])
     if pixels is None:
         log.warning("%s: too few pixels of known materials to tell poses by: they stay as they were found", name)
-    results = refined_photo(scene, pixels, materials, operator, params, lambda done, total: progress(done, total, name))
-    for (thing, said), each, of in zip(entry["objects"].items(), results, scene.things, strict=True):
-        said |= told(of, each, scene.camera)
+    results = refined_photo(scene, pixels, Surfaces(materials, operator), params, lambda done, total: progress(done, total, name))
+    for (own, said), each, of in zip(entry["objects"].items(), results, scene.objects, strict=True):
+        said |= decided(of, each, scene.camera)
         if each.moved:
-            log.warning("%s: shading moves %s by %.1f°", name, thing, said["refined"]["moved"]["rotation_deg"])
+            log.warning("%s: shading moves %s by %.1f°", name, own, said["refined"]["moved"]["rotation_deg"])
             entry["camera"]["focal_px"] = float(each.after.camera(scene.camera).focal)
     write_json(out / f"{name}.json", entry)
 
@@ -65,22 +67,22 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def scene_of(inputs: Inputs, photo: dict, entry: dict, shadows: int) -> Scene:
     """The photo as `align` left it."""
     slice_, found = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), msgspec.convert(entry, EarlierPhoto)
-    things = []
-    for number, thing in enumerate(slice_.objects, start=1):
-        mesh, said, pose = slice_.meshes[thing.mesh], entry["objects"][thing.name], found.objects[thing.name]
+    objects = []
+    for number, own in enumerate(slice_.objects, start=1):
+        mesh, said, pose = slice_.meshes[own.mesh], entry["objects"][own.name], found.objects[own.name]
         file = inputs.file(mesh.file)
-        read = read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials, limits=NO_LIMITS)
+        read = read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, own.materials, limits=NO_LIMITS)
         caster = Caster(scaled(read, pose.scale))
-        evidence, other = object_evidence(photo, number, caster.mesh.labels, thing.mask is not None), pose.runner_up
+        evidence, other = object_evidence(photo, number, caster.mesh.labels, own.mask is not None), pose.runner_up
         moves = said["source"] in SEARCHED
-        things.append(Thing(caster, evidence, pose.pose(), other.pose() if other else None, moves, not said["left_out"]))
+        objects.append(PosedObject(caster, evidence, pose.pose(), other.pose() if other else None, moves, not said["left_out"]))
     height, width = photo["label"].shape
     camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
     facts = read_json(inputs["masks"] / f"{inputs.photo}.json")
-    return Scene(camera, things, prior_before(camera.focal, entry["camera"]["focal_source"], facts["focal_px"], width, height), shadows)
+    return Scene(camera, objects, prior_before(camera.focal, entry["camera"]["focal_source"], facts["focal_px"], width, height), shadows)
 
 
-def told(thing: Thing, result: Refined, camera: Camera) -> dict:
+def decided(own: PosedObject, result: Refined, camera: Camera) -> dict:
     """What changes in the object's entry of poses.json, and in `refined` what decided."""
     entry, verdict = {}, result.settled
     if verdict is None:
@@ -88,13 +90,13 @@ def told(thing: Thing, result: Refined, camera: Camera) -> dict:
     if verdict.chosen == "runner_up" or verdict.ruled_out:
         entry["runner_up"] = None  # shading has decided between the two
     if result.moved:
-        pose, seen = result.after.pose(thing.caster), result.after.camera(camera)
+        pose, seen = result.after.pose(own.caster), result.after.camera(camera)
         entry |= {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-        entry["silhouette_iou"] = silhouette_iou(thing.evidence, rasterise(thing.caster, seen, pose).label)
-    target = target_of(thing.evidence, thing.caster.mesh.labels, 200, 0.1)
+        entry["silhouette_iou"] = silhouette_iou(own.evidence, rasterise(own.caster, seen, pose).label)
+    target = target_of(own.evidence, own.caster.mesh.labels, 200, 0.1)
     moved = {
         "rotation_deg": angle_between(result.after.rotation, result.before.rotation),
-        "normals_deg": normal_difference(thing.caster, target, camera, result.before, result.after),
+        "normals_deg": normal_difference(own.caster, target, camera, result.before, result.after),
     }
     candidates = {
         name: {"held_out_loss": c.held_out_loss, "gain": c.gain, "gain_stderr": c.gain_stderr, "score": c.score}

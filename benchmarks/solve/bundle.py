@@ -14,10 +14,16 @@ from benchmarks.solve.clock import Clock, Taken
 from benchmarks.solve.scores import EVERY, Answer, answer_of, material_scores, picture_scores, pictures_of
 from benchmarks.solve.sets import SphereSet
 from benchmarks.solve.workers import threaded
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.operator import Operator
 from factorlib.solve.bundle import solve
+from factorlib.solve.history import Event, Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Noise, blocks_of_observations
+from factorlib.solve.rounds import from_nothing
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
 
@@ -71,13 +77,13 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
     merged = concatenate(threaded(partial(merge, degrees=variant.merge_degrees), photos))
     blocks = blocks_of_observations(merged, Noise())
 
-    def keep(event, solution) -> None:
-        answer = answer_of(blocks, solution.materials, solution.lights)
+    def keep(event: Event, point: Point) -> None:
+        answer = answer_of(blocks, point.materials, point.lights)
         found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
 
     options = Bundle(lobes=variant.lobes, sample=variant.sample)
-    joint = solve(blocks, len(seen.materials), operator, options, threaded, lambda event: None, keep)
-    result = joint.solution
+    problem = JointProblem(blocks, operator, spread=threaded)
+    result = solve(problem, from_nothing(len(seen.materials)), Run(options, snapshot=keep)).point
     answer = answer_of(blocks, result.materials, result.lights)
     return [*found, Snapshot(clock.taken(), "result", sum(map(len, result.lights)), answer)]
 
@@ -92,7 +98,7 @@ def run(spheres: SphereSet, variant: Variant, relight: bool) -> dict:
     return row
 
 
-def points(spheres: SphereSet, found: list[Snapshot], judge) -> list[dict]:
+def points(spheres: SphereSet, found: list[Snapshot], judge: Operator) -> list[dict]:
     rows = []
     for snapshot in thinned(found):
         scores = picture_scores(pictures_of(snapshot.answer, spheres, judge, EVERY), spheres, EVERY)

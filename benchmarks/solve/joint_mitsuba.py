@@ -23,7 +23,8 @@ from factorlib.align.camera import Camera
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.generate.tracing import rgb, rigid, sensor
-from factorlib.solve.unknowns import ROUGHNESS, Materials
+from factorlib.model.bounds import ROUGHNESS
+from factorlib.model.materials import Materials
 
 RATES = (0.003, 0.01, 0.03)
 ROWS, SPP, SCORE_SPP, FLAT, SMALL = 16, 16, 256, 60, 64

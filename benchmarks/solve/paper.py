@@ -13,9 +13,13 @@ from benchmarks.solve.clock import Clock
 from benchmarks.solve.scores import answer_of
 from benchmarks.solve.sets import SphereSet
 from benchmarks.solve.workers import threaded
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.solve.history import Event
 from factorlib.solve.paper import Paper, solve
-from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.urm.merge import merge
 
 OPERATORS = ("paper_network", "network")
@@ -29,11 +33,12 @@ def snapshots(spheres: SphereSet, operator: str, share: float, without: frozense
     kept = np.random.default_rng(0).random(len(merged)) < share
     blocks = blocks_of_observations(merged.take(kept), Noise(), held_out=0.0)
 
-    def keep(event, solution) -> None:
-        answer = answer_of(blocks, solution.materials, solution.lights)
+    def keep(event: Event, point: Point) -> None:
+        answer = answer_of(blocks, point.materials, point.lights)
         found.append(Snapshot(clock.taken(), f"{event.phase} {event.iteration}", event.lobes, answer))
 
-    solve(blocks, len(seen.materials), reflection_operator(operator), Paper(), threaded, lambda event: None, keep)
+    problem = JointProblem(blocks, reflection_operator(operator), spread=threaded)
+    solve(problem, len(seen.materials), Paper(), snapshot=keep)
     return found
 
 

@@ -11,12 +11,19 @@ import numpy as np
 
 from benchmarks.solve.clock import Clock
 from benchmarks.solve.workers import threaded
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.operator import Operator
 from factorlib.solve.bundle import solve
-from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block, Noise, blocks_of_observations
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
 
 PIXELS, LOBES = 12, 6
@@ -35,9 +42,9 @@ def run(sides=SIDES, limit_s: float = 600.0) -> dict:
 
 def timed(n: int):
     operator = reflection_operator("network")
-    blocks = problem(n, operator)
+    joint = JointProblem(problem(n, operator), operator, spread=threaded)
     clock = Clock()
-    solve(blocks, n, operator, OPTIONS, threaded, lambda event: None)
+    solve(joint, from_nothing(n), Run(OPTIONS))
     return clock.taken()
 
 
@@ -52,7 +59,7 @@ def exponent(seconds: dict[int, float]) -> float | None:
     return float(np.polyfit(np.log(list(seconds)), np.log(list(seconds.values())), 1)[0])
 
 
-def problem(n: int, operator) -> list[Block]:
+def problem(n: int, operator: Operator) -> list[Block]:
     """n materials in n lights, each pair observed."""
     rng = np.random.default_rng(n)
     gloss = rng.uniform(0.05, 0.4, n)
@@ -81,8 +88,8 @@ def random_light(rng: np.random.Generator) -> Light:
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
 
 
-def lit(block: Block, light: Light, materials: Materials, operator) -> Block:
+def lit(block: Block, light: Light, materials: Materials, operator: Operator) -> Block:
     """The block with the radiance of its light, mean 1."""
-    radiance = predicted_radiance(block, light, materials, operator)
+    radiance = Illumination(block, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
     return msgspec.structs.replace(block, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled))

@@ -20,9 +20,12 @@ from jaxtyping import Float
 from benchmarks.solve.sets import SphereSet
 from factorlib.evaluate.materials import Material as Estimate
 from factorlib.evaluate.materials import compare_materials
-from factorlib.solve.normal_equations import predicted_radiance
-from factorlib.solve.problem import Block, Noise, blocks_of_observations, of_rows
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
 
 EVERY = 37  # pixels, for operators too slow for all
 Pictures = Mapping[tuple[str, str], Float[np.ndarray, "n 3"]]
@@ -48,8 +51,8 @@ def pictures_of(answer: Answer, spheres: SphereSet, operator, every: int = 1, on
         for m, name in enumerate(names):
             if only is not None and (name, block.name) not in only:
                 continue
-            own = of_rows(block, np.flatnonzero(block.material == m)[::every])
-            found[name, block.name] = predicted_radiance(own, answer.lights[block.name], answer.materials, operator)
+            own = block.take(np.flatnonzero(block.material == m)[::every])
+            found[name, block.name] = Illumination(own, answer.lights[block.name], answer.materials, operator).radiance()
     return found
 
 

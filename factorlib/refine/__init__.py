@@ -1,4 +1,4 @@
 """Poses by shading: which pose of an object the solved materials explain a photo from.
 
-from factorlib.refine.choice import Shown, refined_pose
+from factorlib.refine.photo import Scene, refined_photo
 """

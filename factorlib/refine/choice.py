@@ -18,11 +18,9 @@ from jaxtyping import Float, Int
 
 from factorlib.align.refine import refined
 from factorlib.align.state import State
+from factorlib.model.loss import Loss
 from factorlib.refine.descent import Moving, descended
-from factorlib.refine.light import pursued_light, robust_scale, together, whitened_residuals, with_weights
-from factorlib.solve.normal_equations import robust_losses
-from factorlib.solve.problem import of_rows
-from factorlib.solve.unknowns import Materials
+from factorlib.refine.light import pursued_light, robust_scale, together, with_weights
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 SURE = 2.0
@@ -62,12 +60,12 @@ class Settled(msgspec.Struct, frozen=True):
     ruled_out: bool | None
 
 
-def settled(
-    moving: Moving, found: State, runner_up: State | None, materials: Materials, operator, cell: Int[np.ndarray, "n"], standards: Standards
-) -> Settled | None:
-    """None where the candidates share too few pixels to be told apart."""
-    states = candidates(moving, found, runner_up, materials, operator, standards)
-    verdicts = judged(moving, states, materials, operator, cell)
+def settled(moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, "n"], standards: Standards) -> Settled | None:
+    """Which candidate to use; None where the candidates share too few pixels to compare them.
+
+    cell: number of each pixel's cell
+    """
+    verdicts = judged(moving, candidates(moving, found, runner_up, standards), cell)
     return choice_of(verdicts, standards) if verdicts else None
 
 
@@ -82,33 +80,33 @@ def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
     return Settled(best.name, named, ruled_out)
 
 
-def candidates(moving: Moving, found: State, runner_up: State | None, materials: Materials, operator, standards: Standards) -> dict[str, State]:
+def candidates(moving: Moving, found: State, runner_up: State | None, standards: Standards) -> dict[str, State]:
     """`found` stays as it is; the others move, first by contours, then by shading too."""
     result = {"found": found}
     for name, start in (("moved", found), ("runner_up", runner_up)):
         if start is not None:
             start = refined(moving.caster, moving.target, moving.camera, start, moving.prior, standards.steps).state
-            result[name] = descended(moving, start, materials, operator, standards.steps, standards.most_lost)
+            result[name] = descended(moving, start, standards.steps, standards.most_lost)
     if runner_up is not None and moving.score(result["runner_up"]) < moving.score(found) - standards.rival:
         del result["runner_up"]
     return result
 
 
-def judged(moving: Moving, states: dict[str, State], materials: Materials, operator, cell: Int[np.ndarray, "n"]) -> list[Judged]:
+def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, "n"]) -> list[Judged]:
     """Every candidate, the first being the one that gains are relative to; empty where too few pixels are shown by all."""
     seen = {name: moving.block(state, None) for name, state in states.items()}
     common = np.logical_and.reduce([agrees for _, agrees in seen.values()])
     held_out = next(iter(seen.values()))[0].held_out
     if min((common & held_out).sum(), (common & ~held_out).sum()) < LEAST_SHOWN:
         return []
-    fitted = {name: of_rows(block, agrees & ~held_out) for name, (block, agrees) in seen.items()}
-    lobes = together([pursued_light(block, materials, operator) for block in fitted.values()])
-    residual = {}
+    surfaces, residual = moving.surfaces, {}
+    fitted = {name: block.take(agrees & ~held_out) for name, (block, agrees) in seen.items()}
+    lobes = together([pursued_light(block, surfaces) for block in fitted.values()])
     for name, (block, _) in seen.items():
-        light = with_weights(fitted[name], lobes, materials, operator)
-        residual[name] = whitened_residuals(of_rows(block, common & held_out), light, materials, operator)
-    scale = min(robust_scale(r) for r in residual.values())
-    losses = {name: robust_losses(r, scale).mean(1) for name, r in residual.items()}
+        light = with_weights(surfaces.under(lobes, fitted[name]))
+        residual[name] = surfaces.under(light, block.take(common & held_out)).residuals()
+    loss = Loss(min(robust_scale(r) for r in residual.values()))
+    losses = {name: loss.of_residuals(r).mean(1) for name, r in residual.items()}
     first, of_cell = next(iter(losses.values())), cell[common & held_out]
     return [
         Judged(name, state, moving.score(state), float(losses[name].mean()), *gain_of(first, losses[name], of_cell))

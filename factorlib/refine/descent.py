@@ -25,12 +25,11 @@ from factorlib.align.raster import Caster
 from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
-from factorlib.refine.light import pursued_light, robust_scale, whitened_residuals, with_weights
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.refine.light import Surfaces, pursued_light, robust_loss, robust_scale, with_weights
 from factorlib.refine.pixels import View
-from factorlib.solve.insertion import whitened_atoms
-from factorlib.solve.normal_equations import predicted_radiance, robust_losses
-from factorlib.solve.problem import Block, of_rows
-from factorlib.solve.unknowns import Light, Materials
 
 RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as of `factorlib.align.target`
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
@@ -40,12 +39,13 @@ MOST = 0.1  # of a step
 
 
 class Moving(msgspec.Struct, frozen=True):
-    """The object that moves: what its contours are compared with, and observations of the photo with it in a state."""
+    """The object that moves: what its contours are compared with, how all reflects, and observations of the photo with it in a state."""
 
     caster: Caster
     target: Target
     camera: Camera
     prior: FocalPrior
+    surfaces: Surfaces
     block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]  # all pixels, and which of them agree
 
     def score(self, state: State) -> float:
@@ -54,75 +54,102 @@ class Moving(msgspec.Struct, frozen=True):
         return labelled_iou(self.target.evidence, self.caster.labels(hits))
 
 
-def moving_object(view: View, number: int, poses: Sequence[Pose], camera: Camera, evidence: Evidence, prior: FocalPrior) -> Moving:
-    """Object `number` of a photo, the others staying at their `poses`."""
+class Photographed(msgspec.Struct, frozen=True):
+    """One object of a photo: the meshes over its pixels, the object's number, what its contours are, the camera and its focal length."""
+
+    view: View
+    number: int
+    camera: Camera
+    evidence: Evidence
+    prior: FocalPrior
+
+
+def moving_object(photographed: Photographed, poses: Sequence[Pose], surfaces: Surfaces) -> Moving:
+    """The object, the others of the photo staying at their `poses`."""
+    view, number, camera = photographed.view, photographed.number, photographed.camera
     caster = view.casters[number]
 
     def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, "n"]]:
+        """All pixels with the object in a state, visibility as in `like`; which of them show what the mask does."""
         own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
         seen = view.seen(own, posed)
         return view.block(own, seen, like, posed), seen.agrees
 
-    return Moving(caster, target_of(evidence, caster.mesh.labels, RESOLUTION, MARGIN), camera, prior, block)
+    target = target_of(photographed.evidence, caster.mesh.labels, RESOLUTION, MARGIN)
+    return Moving(caster, target, camera, photographed.prior, surfaces, block)
 
 
-def descended(moving: Moving, start: State, materials: Materials, operator, steps: int, most_lost: float) -> State:
+def descended(moving: Moving, start: State, steps: int, most_lost: float) -> State:
     """The state, of those met in `steps` steps from `start`, whose fitted pixels are explained best while the labelled
     IoU is at most `most_lost` below that of the start."""
     state, best, least, floor = start, start, np.inf, moving.score(start) - most_lost
-    shadows, light = None, None
+    shadows, light, surfaces = None, None, moving.surfaces
     for k in range(steps + 1):
         every, agrees = moving.block(state, shadows)
         shadows = every  # visibility hardly changes on the way
-        fit = of_rows(every, agrees & ~every.held_out)
+        fit = every.take(agrees & ~every.held_out)
         if len(fit) == 0:
             break
-        light = pursued_light(fit, materials, operator) if k in (0, steps // 2) else with_weights(fit, light, materials, operator)
-        residual = whitened_residuals(fit, light, materials, operator)
-        scale = robust_scale(residual) if k == 0 else scale
-        loss = float(robust_losses(residual, scale).mean())
+        light = pursued_light(fit, surfaces) if k in (0, steps // 2) else with_weights(surfaces.under(light, fit))
+        lit = surfaces.under(light, fit)
+        residual = lit.residuals()
+        robust = robust_loss(residual) if k == 0 else robust
+        loss = float(robust.of_residuals(residual).mean())
         if loss < least and moving.score(state) >= floor:
             best, least = state, loss
         if k < steps:
-            state = state.moved(_step(moving, state, every, agrees, fit, light, residual, materials, operator))
+            state = state.moved(_step(moving, state, Seen(every, agrees & ~every.held_out), lit, residual))
     return best
 
 
-def _step(moving: Moving, state: State, every: Block, agrees, fit: Block, light: Light, residual, materials, operator) -> np.ndarray:
+class Seen(msgspec.Struct, frozen=True):
+    """All pixels of a photo with the object in a state, and which of them are fitted."""
+
+    every: Block
+    fitted: Bool[np.ndarray, "m"]
+
+
+def _step(
+    moving: Moving, state: State, seen: Seen, lit: Illumination, residual: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "7"]:
+    """The step of a state; lit: the fitted pixels in their light, whose whitened residual is `residual`."""
     window = moving.target.camera(state.camera(moving.camera))
     hits = moving.caster.cast(window, state.pose(moving.caster))
     contours = normal_equations(moving.caster, moving.target, window, hits, state, moving.prior)
     free = 7 if moving.prior.sigma > 0 else 6
-    jacobian = photometric_jacobian(moving, state, every, agrees & ~every.held_out, light, materials, operator, free)
-    information, gradient = projected_equations(jacobian, residual, fit, light, materials, operator)
+    jacobian = photometric_jacobian(moving, state, seen, lit.light, free)
+    information, gradient = projected_equations(jacobian, residual, lit)
     hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
     step = np.zeros(7)
     step[:free] = -np.linalg.solve(hessian, contours.gradient[:free] + gradient)
     return np.clip(step, -MOST, MOST)
 
 
-def photometric_jacobian(
-    moving: Moving, state: State, every: Block, rows: Bool[np.ndarray, "m"], light: Light, materials: Materials, operator, free: int
-) -> Float[np.ndarray, "n 3 k"]:
-    """∂r/∂θ at the n pixels `rows`, by central differences; 0 where the two sides show different things."""
+def photometric_jacobian(moving: Moving, state: State, seen: Seen, light: Light, free: int) -> Float[np.ndarray, "n 3 k"]:
+    """∂r/∂θ at the n pixels that are fitted, by the first `free` of θ, by central differences; 0 where the two sides show
+    different surfaces."""
+    rows, surfaces = seen.fitted, moving.surfaces
     result = np.zeros((int(rows.sum()), 3, free))
     for k in range(free):
         sides = []
         for sign in (-1, 1):
-            block, agrees = moving.block(state.moved(sign * ASIDE[k] * np.eye(7)[k]), every)
-            sides.append((of_rows(block, rows), agrees[rows]))
+            block, agrees = moving.block(state.moved(sign * ASIDE[k] * np.eye(7)[k]), seen.every)
+            sides.append((block.take(rows), agrees[rows]))
         (low, low_agrees), (high, high_agrees) = sides
         smooth = low_agrees & high_agrees & (np.sum(low.normal * high.normal, axis=1) > EDGE_TURN)
-        difference = predicted_radiance(high, light, materials, operator) - predicted_radiance(low, light, materials, operator)
+        difference = surfaces.under(light, high).radiance() - surfaces.under(light, low).radiance()
         result[..., k] = np.where(smooth[:, None], difference * low.precision / (2 * ASIDE[k]), 0.0)
     return result
 
 
-def projected_equations(jacobian, residual, fit: Block, light: Light, materials: Materials, operator) -> tuple[np.ndarray, np.ndarray]:
+def projected_equations(
+    jacobian: Float[np.ndarray, "n 3 k"], residual: Float[np.ndarray, "n 3"], lit: Illumination
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
     """H and g of equation (1), over the residuals' own spread and their correlation."""
-    atoms = whitened_atoms(fit, np.arange(len(fit)), materials, operator, light.axis, light.sharpness, light)
+    light = lit.light
+    atoms = lit.atoms(np.arange(len(lit.block)), light.unit_lobes)
     scale, k = robust_scale(residual), jacobian.shape[-1]
-    trust = 1 / np.sqrt(1 + (residual / scale) ** 2)
+    trust = robust_loss(residual).trust(residual)
     hessian, gradient = np.zeros((k, k)), np.zeros(k)
     for c in range(3):
         shining = atoms[c][:, light.weight[:, c] > 0]

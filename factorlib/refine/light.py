@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.solve.insertion import lobes_inserted, pruned, whitened_atoms
-from factorlib.solve.normal_equations import predicted_radiance, residuals
-from factorlib.solve.problem import Block, of_rows
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.reflection.operator import Operator
+from factorlib.solve.insertion import lobes_inserted, pruned
 from factorlib.solve.start import starting_light
-from factorlib.solve.unknowns import Light, Materials
 from factorlib.solve.weights import nonnegative_minimum
 
 ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each
@@ -23,13 +27,24 @@ REWEIGHTED = 3  # times, for outliers
 RIDGE = 1e-4  # of the squared response of each lobe
 
 
-def pursued_light(block: Block, materials: Materials, operator) -> Light:
+class Surfaces(msgspec.Struct, frozen=True):
+    """How all that a photo shows reflects: what is known before any pose is refined."""
+
+    materials: Materials
+    operator: Operator
+
+    def under(self, light: Light, block: Block) -> Illumination:
+        """Their observations in a light."""
+        return Illumination(block, light, self.materials, self.operator)
+
+
+def pursued_light(block: Block, surfaces: Surfaces) -> Light:
     """Explains what of the block is not held out."""
-    block = of_rows(block, ~block.held_out)
-    light = starting_light(block, materials)
+    block = block.take(~block.held_out)
+    light = starting_light(block, surfaces.materials)
     for number in range(ROUNDS):
-        light = lobes_inserted(block, light, materials, operator, INSERTED, number)
-        light = pruned(with_weights(block, light, materials, operator))
+        light = lobes_inserted(surfaces.under(light, block), INSERTED, number)
+        light = pruned(with_weights(surfaces.under(light, block)))
     return light
 
 
@@ -39,15 +54,16 @@ def together(lights: Sequence[Light]) -> Light:
     return Light(*parts, lights[0].log_exposure)
 
 
-def with_weights(block: Block, light: Light, materials: Materials, operator) -> Light:
-    """The light with the weights ≥ 0 that explain best, robustly, what is not held out."""
+def with_weights(illumination: Illumination) -> Light:
+    """Its light with the weights ≥ 0 that explain best, robustly, what is not held out."""
+    block, light = illumination.block, illumination.light
     rows = np.flatnonzero(~block.held_out)
-    atoms = whitened_atoms(block, rows, materials, operator, light.axis, light.sharpness, light)
+    atoms = illumination.atoms(rows, light.unit_lobes)
     target = block.radiance[rows] * block.precision[rows]
     weight = light.weight.copy()
     for _ in range(REWEIGHTED):
         residual = np.einsum("cnp,pc->nc", atoms, weight) - target
-        trust = 1 / np.sqrt(1 + (residual / robust_scale(residual)) ** 2)
+        trust = robust_loss(residual).trust(residual)
         for c in range(3):
             weighted = atoms[c] * trust[:, c, None]
             weight[:, c] = nonnegative_minimum(weighted.T @ atoms[c] + _ridge(atoms[c]), weighted.T @ target[:, c])
@@ -61,9 +77,10 @@ def _ridge(atoms: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
 
 def robust_scale(residual: Float[np.ndarray, "n 3"]) -> float:
     """Three robust standard deviations, never below one σ of the noise model; channels that are not compared are exactly 0."""
-    told = np.abs(residual[residual != 0])
-    return max(3 * 1.4826 * float(np.median(told)), 1.0) if len(told) else 1.0
+    compared = np.abs(residual[residual != 0])
+    return max(3 * 1.4826 * float(np.median(compared)), 1.0) if len(compared) else 1.0
 
 
-def whitened_residuals(block: Block, light: Light, materials: Materials, operator) -> Float[np.ndarray, "n 3"]:
-    return residuals(block, predicted_radiance(block, light, materials, operator))
+def robust_loss(residual: Float[np.ndarray, "n 3"]) -> Loss:
+    """The loss of that scale, without priors."""
+    return Loss(robust_scale(residual), prior=0.0)

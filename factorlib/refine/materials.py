@@ -10,7 +10,7 @@ from jaxtyping import Bool
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
-from factorlib.solve.unknowns import Materials
+from factorlib.model.materials import Materials
 
 UNKNOWN = 0.7  # standard error of a diffuse reflectance, in its range of 1: one that no photo shows has at least this
 

@@ -12,14 +12,14 @@ from factorlib.align.raster import Caster
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import State, state_of
 from factorlib.refine.choice import Settled, Standards, settled
-from factorlib.refine.descent import moving_object
+from factorlib.refine.descent import Photographed, moving_object
+from factorlib.refine.light import Surfaces
 from factorlib.refine.pixels import Pixels, View
-from factorlib.solve.unknowns import Materials
 
 
-class Thing(msgspec.Struct, frozen=True):
+class PosedObject(msgspec.Struct, frozen=True):
     """An object: its pose as it was found, the pose that came second, whether it moves (a given pose does not), and whether its
-    pixels tell the light while others move (those of a doubtful pose do not)."""
+    pixels count for the light while others move (those of a doubtful pose do not)."""
 
     caster: Caster
     evidence: Evidence
@@ -34,7 +34,7 @@ class Scene(msgspec.Struct, frozen=True):
     number of directions in which objects shadow (0: they do not)."""
 
     camera: Camera
-    things: list[Thing]
+    objects: list[PosedObject]
     prior: FocalPrior
     shadows: int = 0
 
@@ -48,37 +48,38 @@ class Refined(msgspec.Struct, frozen=True):
 
     @property
     def moved(self) -> bool:
+        """Whether another pose than the one found is used."""
         return self.settled is not None and self.settled.chosen != "found"
 
 
 def refined_photo(
     scene: Scene,
     pixels: Pixels | None,
-    materials: Materials,
-    operator,
+    surfaces: Surfaces,
     standards: Standards = Standards(),
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Refined]:
     """Every object, in order; `pixels` is None where the photo shows too few."""
-    things, camera, poses = scene.things, scene.camera, [thing.pose for thing in scene.things]
-    before = [state_of(thing.pose, camera, thing.caster) for thing in things]
+    objects, camera, poses = scene.objects, scene.camera, [one.pose for one in scene.objects]
+    before = [state_of(one.pose, camera, one.caster) for one in objects]
     results = [Refined(state, state, None) for state in before]
-    prior = scene.prior if len(things) == 1 else FocalPrior(camera.focal, 0.0)
-    for done, k in enumerate(by_pixels(things)):
-        report(done, len(things))
-        if pixels is None or not things[k].moves or not things[k].evidence.inside.any():
+    prior = scene.prior if len(objects) == 1 else FocalPrior(camera.focal, 0.0)
+    for done, k in enumerate(by_pixels(objects)):
+        report(done, len(objects))
+        own = objects[k]
+        if pixels is None or not own.moves or not own.evidence.inside.any():
             continue
-        view = View(pixels, [thing.caster for thing in things], [j == k or thing.trusted for j, thing in enumerate(things)], scene.shadows)
-        moving = moving_object(view, k, poses, camera, things[k].evidence, prior)
-        rival = state_of(things[k].runner_up, camera, things[k].caster) if things[k].runner_up else None
-        verdict = settled(moving, before[k], rival, materials, operator, pixels.cell, standards)
+        view = View(pixels, [one.caster for one in objects], [j == k or one.trusted for j, one in enumerate(objects)], scene.shadows)
+        moving = moving_object(Photographed(view, k, camera, own.evidence, prior), poses, surfaces)
+        rival = state_of(own.runner_up, camera, own.caster) if own.runner_up else None
+        verdict = settled(moving, before[k], rival, pixels.cell, standards)
         if verdict is not None:
             results[k] = Refined(before[k], verdict.candidates[verdict.chosen].state, verdict)
         if results[k].moved:
-            poses[k] = results[k].after.pose(things[k].caster)
+            poses[k] = results[k].after.pose(own.caster)
     return results
 
 
-def by_pixels(things: Sequence[Thing]) -> list[int]:
+def by_pixels(objects: Sequence[PosedObject]) -> list[int]:
     """Their numbers, the one with most pixels first."""
-    return sorted(range(len(things)), key=lambda k: (-int(things[k].evidence.inside.sum()), k))
+    return sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k))

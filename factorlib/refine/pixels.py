@@ -16,7 +16,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from factorlib.align.camera import Camera, Pose
 from factorlib.align.raster import Caster, face_normals, unit
 from factorlib.light.sphere import fibonacci_sphere
-from factorlib.solve.problem import Block, Noise
+from factorlib.model.blocks import Block
+from factorlib.model.noise import Noise
 from factorlib.urm.extract import GRAZING
 from factorlib.urm.visibility import Occluders, visibility
 

@@ -2,184 +2,140 @@
 
     rounds    on a sample of the observations find the lobes (rounds); where observations see past something, they are run with and
               without that (self_shadowing = auto), and what explains the held-out pixels better goes on
-    choices   tone curves and specular parts that held-out pixels ask for (tone_choice, choice)
-    polish    brings the answer to rest on many observations, then on all
+    choices   tone curves and specular parts that held-out pixels ask for (curves, specular)
+    polish    brings the answer to its optimum on many observations, then on all
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from factorlib.solve.choice import Specular, matte_where_it_may_be, untried, without_specular
-from factorlib.solve.descent import Solution, descend, evaluated
-from factorlib.solve.held_out import Judge, held_out_of, losses_of, none_held_out
-from factorlib.solve.history import Event, Report, Snapshot, recorder, unwatched
-from factorlib.solve.normal_equations import Loss
-from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block
-from factorlib.solve.resume import Journal
-from factorlib.solve.rounds import Fit, Start, answer_of, bare, best_round, descent_of, from_nothing, further_rounds, sampled_for
-from factorlib.solve.shadowing import without_shadows
-from factorlib.solve.step import specular_unknowns
-from factorlib.solve.tone_choice import Tone, rested, toned_where_it_pays
-from factorlib.solve.unknowns import Materials
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.bounds import specular_unknowns
+from factorlib.solve.curves import Curves, near_optimum, with_curves_where_needed
+from factorlib.solve.descent import Descent, descend
+from factorlib.solve.evidence import Evidence, decide
+from factorlib.solve.history import Event, Recorder, Run
+from factorlib.solve.iterate import evaluate
+from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
+from factorlib.solve.specular import Specular, undecided, without_needless_specular
+from factorlib.solve.thresholds import SHADOWS
 
-MANY = 4  # times `sample` observations bring the best round to rest, before all of them settle it
+MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
 
 
-class Joint(msgspec.Struct, frozen=True):
-    """The answer, in the gauge of `solve.gauge`: materials, one light per block, how it was reached, and the last loss.
+class Solution(msgspec.Struct, frozen=True):
+    """The answer, in the gauge of `factorlib.model.gauge`: a point, how it was reached, and the last loss.
 
-    self_shadowing: whether visibility was used;  held_out: the held-out loss with and without it, of what was tried;
-    matte: materials without specular part;  specular: what decided about each;  tone: what decided about each light's curves
+    shadows: whether visibility was used, and what decided;  lambertian: materials without specular part;
+    specular: what decided about each material, tone about each light's curves; none where nothing was tried
     """
 
-    solution: Solution
+    point: Point
     history: list[Event]
     loss: Loss
-    self_shadowing: bool = False
-    held_out: dict[str, float] = {}
-    matte: Bool[np.ndarray, "m"] | None = None
-    specular: list[Specular] = []
-    tone: list[Tone] = []
+    lambertian: Bool[np.ndarray, "m"]
+    shadows: Evidence = Evidence(False)
+    specular: list[Evidence] = []
+    tone: list[Evidence] = []
 
-
-class Chosen(msgspec.Struct, frozen=True):
-    """Without needless specular parts; which materials have none, and what decided about each."""
-
-    solution: Solution
-    matte: Bool[np.ndarray, "m"]
-    specular: list[Specular]
-
-
-class Toned(msgspec.Struct, frozen=True):
-    """With the tone curves that it needs, and what decided about each light."""
-
-    solution: Solution
-    tone: list[Tone]
+    def shown(self, problem: JointProblem) -> JointProblem:
+        """The problem as the answer explains it: with shadows or without, its loss the last one."""
+        return (problem if self.shadows.kept else problem.without_shadows()).with_loss(self.loss)
 
 
 class Polished(msgspec.Struct, frozen=True):
-    """At rest after a phase of the polish, and all events so far."""
+    """The point after a phase of the polish, and all events so far."""
 
-    solution: Solution
+    point: Point
     history: list[Event]
 
 
-def solve(
-    blocks: Sequence[Block],
-    materials: int,
-    operator,
-    bundle: Bundle,
-    map_: Callable,
-    report: Report,
-    snapshot: Snapshot = unwatched,
-    start: Start | None = None,
-    journal: Journal | None = None,
-) -> Joint:
-    """Materials 0 … `materials`−1 and one light per block; `map_` spreads illuminations over workers.
+def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Solution:
+    """One reflectance per material and one light per block.
 
-    start: `from_nothing` unless given;  journal: what is done already, and what to keep of the rest
+    problem: its loss judges held-out observations and, made robust, is what is lowered;  start: `from_nothing(materials)`, or an
+    earlier solution;  run: options and company, the defaults where it is None
     """
-    models, start, journal = candidates(blocks, bundle.self_shadowing), start or from_nothing(materials), journal or Journal()
-    fits: dict[str, Fit] = {}
-    for name, model in models.items():
-        fits[name] = best_round(model, start, operator, bundle, map_, report, list(fits.values()), snapshot, journal, f"rounds {name}")
-    chosen = min(fits, key=lambda name: fits[name].held_out)
-    fit = fits[chosen]
-    toned = with_tone_chosen(models[chosen], fit, operator, bundle, map_, journal)
-    if any(of_light.kept for of_light in toned.tone):  # what the curves explain had stopped the rounds early
-        fit = further_rounds(models[chosen], fit, toned.solution, operator, bundle, map_, report, snapshot, journal)
-    choice = with_specular_chosen(models[chosen], fit, start, operator, bundle, map_, journal)
-    fit, matte = msgspec.structs.replace(fit, solution=choice.solution), choice.matte
-    solution, history = polished(models[chosen], fit, operator, bundle, map_, report, matte, snapshot, journal)
-    found = solution.materials
-    specular_or_none = np.where(matte[:, None], 0.0, found.specular)
-    solution = msgspec.structs.replace(solution, materials=Materials(found.diffuse, specular_or_none, found.roughness))
-    held_out = {name: fit.held_out for name, fit in fits.items()}
-    return Joint(solution, history, fit.loss, chosen == "with", held_out, matte, choice.specular, toned.tone)
+    run, fits = run or Run(), dict[str, Fit]()
+    for name, model in models(problem, run.options.self_shadowing).items():
+        fits[name] = best_round(model, start, run, f"rounds {name}", list(fits.values()))
+    shadows = _shadows(fits)
+    problem = problem if shadows.kept else problem.without_shadows()
+    fit = fits["with" if shadows.kept else "without"]
+    curves = with_tone_chosen(problem, fit, run)
+    if any(of_light.kept for of_light in curves.evidence):  # what the curves explain had stopped the rounds early
+        fit = further_rounds(problem, fit, curves.point, run)
+    chosen = with_specular_chosen(problem, fit, start, run)
+    end = polished(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
+    found = end.point.materials
+    materials = Materials(found.diffuse, np.where(chosen.lambertian[:, None], 0.0, found.specular), found.roughness)
+    point = Point(materials, end.point.lights)
+    return Solution(point, end.history, fit.loss, chosen.lambertian, shadows, chosen.evidence, curves.evidence)
 
 
-def with_tone_chosen(blocks: Sequence[Block], fit: Fit, operator, bundle: Bundle, map_: Callable, journal: Journal) -> Toned:
-    """The fit nearer to rest, with a tone curve for the photos that held-out observations ask for one."""
-    if kept := journal.kept("tone", Toned):
-        return kept
-    if none_held_out(blocks):
-        return Toned(fit.solution, [])
-    blocks = sampled_for(blocks, fit.solution.lights, bundle)
-    at = rested(blocks, fit.solution, fit.solution.lights, operator, fit.loss, map_)
-    if bundle.tone == "off":
-        return journal.keep("tone", Toned(bare(at), []))
-    solution, evidence = toned_where_it_pays(blocks, at, operator, fit.loss, judged_by(bundle, operator), map_)
-    return journal.keep("tone", Toned(bare(solution), evidence))
-
-
-def judged_by(bundle: Bundle, operator) -> Judge:
-    """Held-out losses by the loss that the solve began with."""
-
-    def losses(blocks: Sequence[Block], at: Solution) -> list[Float[np.ndarray, "n"]]:
-        return losses_of([held_out_of(block, False) for block in blocks], at.materials, at.lights, operator, bundle.loss)
-
-    return losses
-
-
-def with_specular_chosen(
-    blocks: Sequence[Block], fit: Fit, start: Start, operator, bundle: Bundle, map_: Callable, journal: Journal
-) -> Chosen:
-    """The fit without needless specular parts: those decided before, and those that held-out observations do not ask for."""
-    if kept := journal.kept("choice", Chosen):
-        return kept
-    materials = fit.solution.materials
-    for m in np.flatnonzero(start.matte):
-        materials = without_specular(materials, m)
-    before = msgspec.structs.replace(fit.solution, materials=materials)
-    if bundle.specular == "on" or start.decided.all() or none_held_out(blocks):
-        return journal.keep("choice", Chosen(before, start.matte, untried(start.matte) if start.decided.any() else []))
-    blocks = sampled_for(blocks, before.lights, bundle)
-    at = evaluated(blocks, materials, before.lights, operator, fit.loss, map_)
-    solution, matte, evidence = matte_where_it_may_be(
-        blocks, at, operator, fit.loss, judged_by(bundle, operator), map_, decided=start.decided, matte=start.matte
-    )
-    return journal.keep("choice", Chosen(bare(solution), matte, evidence))
-
-
-def candidates(blocks: Sequence[Block], self_shadowing: str) -> dict[str, list[Block]]:
+def models(problem: JointProblem, self_shadowing: str) -> dict[str, JointProblem]:
     """The models to choose from: `with` self-shadowing, `without`, or both.  Where nothing is hidden they are one."""
-    shadows = self_shadowing != "off" and any(block.visibility is not None for block in blocks)
-    models = {"without": [without_shadows(block) for block in blocks]} if not shadows or self_shadowing == "auto" else {}
-    return models | ({"with": list(blocks)} if shadows else {})
+    shadows = self_shadowing != "off" and any(block.visibility is not None for block in problem.blocks)
+    found = {"without": problem.without_shadows()} if not shadows or self_shadowing == "auto" else {}
+    return found | ({"with": problem} if shadows else {})
 
 
-def polished(
-    blocks: Sequence[Block],
-    fit: Fit,
-    operator,
-    bundle: Bundle,
-    map_: Callable,
-    report: Report,
-    matte=None,
-    snapshot: Snapshot = unwatched,
-    journal: Journal | None = None,
-) -> tuple[Solution, list[Event]]:
-    """The best round brought to rest on many observations, then on all, and the whole history."""
-    everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
-    many = sampled_for(everything, fit.solution.lights, bundle, times=MANY)
-    number, loss, journal = fit.history[-1].round, fit.loss, journal or Journal()
-    held = None if matte is None else specular_unknowns(matte)
-    phases = [(many, bundle.polish), (everything, min(bundle.settle, bundle.polish))]
-    at = Polished(fit.solution, fit.history)
-    for phase, (of, iterations) in enumerate(phases if sum(map(len, many)) < sum(map(len, everything)) else phases[:1]):
-        if kept := journal.kept(f"polish {phase}", Polished):
+def _shadows(fits: dict[str, Fit]) -> Evidence:
+    """Which model of `fits` explains held-out observations better, of its rounds."""
+    losses = {name: fit.held_out for name, fit in fits.items()}
+    if len(losses) == 2:
+        return decide(losses["without"], losses["with"], SHADOWS)
+    return Evidence("with" in losses, losses.get("with"), losses.get("without"))
+
+
+def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:
+    """The fit nearer to its optimum, with a tone curve for the photos that held-out observations ask for one."""
+    if kept := run.journal.kept("tone", Curves):
+        return kept
+    if problem.none_held_out:
+        return Curves(fit.point, [])
+    sample = sampled_for(problem, fit.point, run.options)
+    at = near_optimum(sample.with_loss(fit.loss), fit.point)
+    curves = Curves(at.point, []) if run.options.tone == "off" else with_curves_where_needed(sample, at, fit.loss)
+    return run.journal.keep("tone", curves)
+
+
+def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run) -> Specular:
+    """The fit without needless specular parts: those decided before, and those that held-out observations do not ask for."""
+    if kept := run.journal.kept("choice", Specular):
+        return kept
+    materials = fit.point.materials
+    for m in np.flatnonzero(start.lambertian):
+        materials = materials.lambertian(m)
+    before = Point(materials, fit.point.lights)
+    if run.options.specular == "on" or start.decided.all() or problem.none_held_out:
+        evidence = undecided(start.lambertian) if start.decided.any() else []
+        return run.journal.keep("choice", Specular(before, start.lambertian, evidence))
+    sample = sampled_for(problem, before, run.options)
+    return run.journal.keep("choice", without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian))
+
+
+def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, "m"], run: Run) -> Polished:
+    """The best round brought to its optimum on many observations, then on all, and the whole history."""
+    everything = problem.with_none_held_out().with_loss(fit.loss)
+    many = sampled_for(everything, fit.point, run.options, times=MANY)
+    number, fixed = fit.history[-1].round, specular_unknowns(lambertian)
+    phases = [(many, run.options.polish), (everything, min(run.options.settle, run.options.polish))]
+    at = Polished(fit.point, fit.history)
+    for phase, (of, iterations) in enumerate(phases if many.fitted_values < everything.fitted_values else phases[:1]):
+        if kept := run.journal.kept(f"polish {phase}", Polished):
             at = kept
             continue
         history = list(at.history)
-        record = recorder(of, history, operator, loss, report, snapshot)
-        best = evaluated(of, at.solution.materials, at.solution.lights, operator, loss, map_)
-        best = descend(of, best, operator, loss, descent_of(bundle, iterations), map_, partial(record, number, "polish"), held)
-        at = journal.keep(f"polish {phase}", Polished(bare(best), history))
-    return answer_of(everything, at.solution, operator, loss, map_), at.history
+        record = partial(Recorder(of, history, run).record, number, "polish")
+        found = descend(of, evaluate(of, at.point), Descent(iterations, run.options.tolerance), record, fixed)
+        at = run.journal.keep(f"polish {phase}", Polished(found.point, history))
+    return Polished(answer_of(everything, at.point), at.history)

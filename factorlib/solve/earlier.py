@@ -11,7 +11,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes, read_lobes
-from factorlib.solve.unknowns import TONE
+from factorlib.model.bounds import TONE
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")
 AT_LEAST_0 = Annotated[float, msgspec.Meta(ge=0)]
@@ -27,6 +27,8 @@ class Reflectance(msgspec.Struct, frozen=True):
 
 
 class Gauge(msgspec.Struct, frozen=True):
+    """component: number of each material's connected component; a factor per channel is free in each."""
+
     component: dict[str, int]
 
 
@@ -63,7 +65,7 @@ class Earlier(msgspec.Struct, frozen=True):
 
     @property
     def self_shadowing(self) -> str | None:
-        """`on` or `off` where both were tried."""
+        """`on` or `off`, as it was decided, where both were tried; else None."""
         return ("on" if self.table.model.self_shadowing else "off") if len(self.table.model.self_shadowing_chosen_by) == 2 else None
 
 

@@ -1,16 +1,17 @@
-"""What a solve says on its way: every accepted point."""
+"""What accompanies a solve: its options, who hears of its points, and what is kept of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
 
-from factorlib.solve.descent import Solution
-from factorlib.solve.held_out import held_out_loss
-from factorlib.solve.normal_equations import Loss
-from factorlib.solve.problem import Block
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.iterate import Iterate
+from factorlib.solve.options import Bundle
+from factorlib.solve.resume import Journal
 
 
 class Event(msgspec.Struct, frozen=True):
@@ -25,20 +26,38 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Snapshot = Callable[[Event, Solution], None]  # is handed every accepted point itself
+Snapshot = Callable[[Event, Point], None]  # is handed every accepted point itself
 
 
-def unwatched(event: Event, solution: Solution) -> None:
+def unreported(event: Event) -> None:
+    """Nobody asked for reports."""
+
+
+def unwatched(event: Event, point: Point) -> None:
     """Nobody asked for snapshots."""
 
 
-def recorder(blocks: Sequence[Block], history: list[Event], operator, loss: Loss, report: Report, snapshot: Snapshot) -> Callable:
-    def record(round_: int, phase: str, iteration: int, solution: Solution) -> float:
-        held = held_out_loss(blocks, solution.materials, solution.lights, operator, loss) if iteration < 0 else np.nan
-        fitted = sum(int((~b.held_out).sum()) * 3 for b in blocks)
-        history.append(Event(round_, phase, iteration, solution.loss / fitted, held, sum(map(len, solution.lights))))
-        report(history[-1])
-        snapshot(history[-1], solution)
-        return held
+class Run(msgspec.Struct, frozen=True):
+    """options: how to solve;  report, snapshot: called at every accepted point;  journal: what is done already, and what to keep."""
 
-    return record
+    options: Bundle = Bundle()
+    report: Report = unreported
+    snapshot: Snapshot = unwatched
+    journal: Journal = msgspec.field(default_factory=Journal)
+
+
+class Recorder:
+    """Appends events to `history` and passes them on; `problem`: its observations and loss give the held-out loss."""
+
+    def __init__(self, problem: JointProblem, history: list[Event], run: Run):
+        self.problem, self.history, self.run = problem, history, run
+
+    def record(self, round_: int, phase: str, iteration: int, iterate: Iterate) -> float:
+        """The held-out loss of the iterate where it ends a round (iteration −1), NaN on the way there."""
+        point = iterate.point
+        held_out = self.problem.held_out_loss(point) if iteration < 0 else np.nan
+        loss = iterate.loss / self.problem.fitted_values
+        self.history.append(Event(round_, phase, iteration, loss, held_out, sum(map(len, point.lights))))
+        self.run.report(self.history[-1])
+        self.run.snapshot(self.history[-1], point)
+        return held_out

@@ -13,66 +13,48 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from factorlib.light.lobes import lobe_integral
 from factorlib.light.sphere import fibonacci_sphere
-from factorlib.solve.normal_equations import operator_inputs, predicted_radiance, residuals
-from factorlib.solve.problem import Block
-from factorlib.solve.shadowing import shadowed
-from factorlib.solve.tone import slope_at
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light, UnitLobes
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations that vote
 TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
 
 
-def dictionary() -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "j"]]:
+def dictionary(sharpest: float = np.inf) -> UnitLobes:
+    """The lobes to choose from, those no sharper than `sharpest`; the widest always."""
     axes = [fibonacci_sphere(count) for count in DICTIONARY.values()]
-    return np.vstack(axes), np.repeat(list(DICTIONARY), list(DICTIONARY.values()))
+    axis, sharpness = np.vstack(axes), np.repeat(list(DICTIONARY), list(DICTIONARY.values()))
+    resolved = sharpness <= max(sharpest, sharpness.min())
+    return UnitLobes(axis[resolved], sharpness[resolved])
 
 
-def lobes_inserted(block: Block, light: Light, materials: Materials, operator, count: int, seed: int) -> Light:
-    """`light` with up to `count` further lobes that explain what it leaves unexplained."""
-    rows = _sampled_rows(block, seed)
-    residual = -residuals(block, predicted_radiance(block, light, materials, operator))[rows]
-    axis, sharpness = dictionary()
-    told = sharpness <= max(materials.sharpest, sharpness.min())
-    axis, sharpness = axis[told], sharpness[told]
-    atoms = whitened_atoms(block, rows, materials, operator, axis, sharpness, light)
-    chosen, weights = _pursuit(atoms, residual, axis, sharpness, count)
-    return light.joined(axis[chosen], np.log(sharpness[chosen]), np.array(weights).reshape(-1, 3))
+def lobes_inserted(illumination: Illumination, count: int, seed: int) -> Light:
+    """The light with up to `count` further lobes that explain what it leaves unexplained."""
+    rows = _sampled_rows(illumination.block, seed)
+    residual = -illumination.residuals()[rows]
+    lobes = dictionary(illumination.materials.sharpest)
+    chosen, weights = _pursuit(illumination.atoms(rows, lobes), residual, lobes, count)
+    return illumination.light.joined(UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3))
 
 
-def _sampled_rows(block: Block, seed: int) -> np.ndarray:
+def _sampled_rows(block: Block, seed: int) -> Int[np.ndarray, "n"]:
     fit = np.flatnonzero(~block.held_out)
     if len(fit) <= SAMPLE:
         return fit
     return np.sort(np.random.default_rng(seed).choice(fit, SAMPLE, replace=False))
 
 
-def whitened_atoms(block: Block, rows, materials: Materials, operator, axis, sharpness, light: Light) -> Float[np.ndarray, "3 n j"]:
-    with torch.no_grad():
-        _, lambdas, _, nz, _ = operator_inputs(block, rows, axis, sharpness, 0.5, operator)
-        diffuse = operator.diffuse(lambdas, nz).double().numpy()
-        specular = np.empty_like(diffuse)
-        for m in np.unique(block.material[rows]):
-            of = block.material[rows] == m
-            inputs = operator_inputs(block, rows[of], axis, sharpness, materials.roughness[m], operator)
-            parts = torch.from_numpy(diffuse[of]), operator.specular(*inputs).double()
-            diffuse[of], specular[of] = shadowed(parts, block, rows[of], axis, sharpness, materials.roughness[m])
-    material = block.material[rows]
-    scale = block.precision[rows] * slope_at(block.radiance[rows], light, block.photo[rows])
-    scale *= np.exp(light.log_exposure)[block.photo[rows]][:, None]
-    return np.stack([
-        scale[:, c, None] * (materials.diffuse[material, c, None] * diffuse + materials.specular[material, c, None] * specular)
-        for c in range(3)
-    ])  # fmt: skip
-
-
-def _pursuit(atoms, residual, axis, sharpness, count: int) -> tuple[list[int], list[np.ndarray]]:
+def _pursuit(
+    atoms: Float[np.ndarray, "3 n j"], residual: Float[np.ndarray, "n 3"], lobes: UnitLobes, count: int
+) -> tuple[list[int], list[Float[np.ndarray, "3"]]]:
+    """Numbers and weights of the chosen lobes."""
+    axis, sharpness = lobes.axis, lobes.sharpness
     norm = np.maximum(np.sum(atoms**2, axis=1), 1e-12)  # [3, j]
     correlation = np.einsum("cnj,nc->cj", atoms, residual)
     allowed = norm.sum(0) > 1e-6 * norm.sum(0).max()

@@ -2,8 +2,9 @@
 
     minimise  mean over observations and channels of (y − radiance)² / σ²  +  π · mean over lights of Var_c(W_c) / W̄²
 
-with y the prediction of `normal_equations`, σ its noise model, W_c the summed lobe weights of channel c and W̄ their mean.  Wang, Ritschel and Mitra say: L-BFGS; another random subset at every iteration; each
-observation sampled 5 times on average; n_p = 32 lobes an illumination; π = 0.1.  This is the baseline of every comparison.
+with y the prediction of `factorlib.model.illumination`, σ its noise model, W_c the summed lobe weights of channel c and W̄ their
+mean.  Wang, Ritschel and Mitra say: L-BFGS; another random subset at every iteration; each observation sampled 5 times on average;
+n_p = 32 lobes an illumination; π = 0.1.  This is the baseline of every comparison.
 
 Left open by the paper, or by what is known of it here, and chosen:
 
@@ -28,6 +29,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -36,16 +38,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.light.sphere import fibonacci_sphere
-from factorlib.solve.bundle import Joint
-from factorlib.solve.descent import Solution, evaluated
-from factorlib.solve.gauge import in_gauge
-from factorlib.solve.held_out import held_out_loss
-from factorlib.solve.history import Event, Report, Snapshot, unwatched
-from factorlib.solve.normal_equations import Loss
-from factorlib.solve.problem import Block
-from factorlib.solve.shadowing import without_shadows
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import ROUGHNESS, SHARPNESS
+from factorlib.model.gauge import in_gauge
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.responses import UnitReflection, cosines, radiance_of
+from factorlib.solve.bundle import Solution
+from factorlib.solve.history import Event, Report, Snapshot, unreported, unwatched
+from factorlib.solve.options import Lobes, Seed
 from factorlib.solve.start import starting_materials
-from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
+
+Objective = Callable[[Tensor], tuple[float, Tensor]]  # value and gradient at a point
+Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along them
 
 MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
@@ -53,41 +61,42 @@ SUFFICIENT, HALVINGS = 1e-4, 12
 REPORTS = 20  # in a run
 
 
+Samplings = Annotated[float, msgspec.Meta(gt=0)]
+Prior = Annotated[float, msgspec.Meta(ge=0)]
+
+
 class Paper(msgspec.Struct, frozen=True):
     """lobes: an illumination;  samplings: of each observation, on average over the run;  prior: π."""
 
-    lobes: int = 32
-    samplings: float = 5.0
+    lobes: Lobes = 32
+    samplings: Samplings = 5.0
     subset: int = 512
-    prior: float = 0.1
+    prior: Prior = 0.1
     start_roughness: float = 0.4
     start_specular_share: float = 0.2
-    seed: int = 0
+    seed: Seed = 0
 
 
 def solve(
-    blocks: Sequence[Block], materials: int, operator, paper: Paper, map_: Callable, report: Report, snapshot: Snapshot = unwatched
-) -> Joint:
-    """As of the bundle solver: materials 0 … `materials`−1 and one light per block, in the gauge of `solve.gauge`."""
-    blocks = [without_shadows(block) for block in blocks]
-    problem, history, loss = Problem(blocks, materials, operator, paper), [], Loss(prior=paper.prior)
+    problem: JointProblem, materials: int, paper: Paper, report: Report = unreported, snapshot: Snapshot = unwatched
+) -> Solution:
+    """As of the bundle solver: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.model.gauge`."""
+    problem = problem.without_shadows().with_loss(Loss(prior=paper.prior))
+    objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / paper.subset)
     every = max(1, iterations // REPORTS)
-    x, pairs, random = problem.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
+    x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
     for iteration in range(iterations):
         subset = drawn(rows, paper.subset, random)
-        x, value = stepped(lambda at, s=subset: problem.objective(at, s), x, pairs)
+        x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
-            solution = problem.solution(x)
-            held = held_out_loss(blocks, solution.materials, solution.lights, operator, loss)
-            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held, paper.lobes * len(blocks)))
+            point = objective.point(x)
+            held_out = problem.held_out_loss(point)
+            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, paper.lobes * len(blocks)))
             report(history[-1])
-            snapshot(history[-1], solution)
-    found = problem.solution(x)
-    everything = [msgspec.structs.replace(block, held_out=np.zeros(len(block), bool)) for block in blocks]
-    final = evaluated(everything, *in_gauge(found.materials, found.lights, blocks), operator, loss, map_)
-    return Joint(final, history, loss, matte=np.zeros(materials, bool))
+            snapshot(history[-1], point)
+    return Solution(in_gauge(objective.point(x), blocks), history, problem.loss, np.zeros(materials, bool))
 
 
 def drawn(rows: Sequence[Int[np.ndarray, "_"]], count: int, random: np.random.Generator) -> list[Int[np.ndarray, "_"]]:
@@ -97,7 +106,7 @@ def drawn(rows: Sequence[Int[np.ndarray, "_"]], count: int, random: np.random.Ge
     return [own[chosen[(chosen >= a) & (chosen < b)] - a] for own, a, b in zip(rows, starts[:-1], starts[1:], strict=True)]
 
 
-def stepped(objective: Callable, x: Tensor, pairs: deque) -> tuple[Tensor, float]:
+def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """x after one step on one subset, and the objective there; the pair that was measured joins `pairs`."""
     value, gradient = objective(x)
     direction = -inverse_hessian_times(gradient, pairs)
@@ -131,12 +140,13 @@ def inverse_hessian_times(gradient: Tensor, pairs: Sequence[tuple[Tensor, Tensor
     return q
 
 
-class Problem:
+class PaperObjective:
     """The objective as a function of one unbounded vector: 7 a material, then 7 a lobe (axis 3, sharpness, weight 3) and
     the exposures of each light in turn; float64."""
 
-    def __init__(self, blocks: Sequence[Block], materials: int, operator, paper: Paper):
-        self.blocks, self.operator, self.paper = blocks, operator, paper
+    def __init__(self, problem: JointProblem, materials: int, paper: Paper):
+        blocks = problem.blocks
+        self.blocks, self.operator, self.paper = blocks, problem.operator, paper
         self.begin = starting_materials(blocks, materials, paper.start_specular_share, paper.start_roughness)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
@@ -168,13 +178,13 @@ class Problem:
         exposure = torch.cat([part.new_zeros(1), part[7 * self.paper.lobes :]])
         return axis, low + (high - low) * torch.sigmoid(rows[:, 3]), torch.nn.functional.softplus(rows[:, 4:]), exposure
 
-    def solution(self, x: Tensor) -> Solution:
-        """As the bundle solver has it, without normal equations."""
+    def point(self, x: Tensor) -> Point:
+        """The materials and lights that x stands for."""
         materials, lights = self.unpacked(x)
         vector = torch.cat([materials[0], materials[1], materials[2][:, None]], 1).reshape(-1).numpy()
-        return Solution(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights], [])
+        return Point(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights])
 
-    def objective(self, x: Tensor, subset: Sequence[Int[np.ndarray, "_"]]) -> tuple[float, Tensor]:
+    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, "_"]]) -> tuple[float, Tensor]:
         """Value and gradient on the subset."""
         x = x.detach().requires_grad_()
         (diffuse, specular, roughness), lights = self.unpacked(x)
@@ -183,7 +193,7 @@ class Problem:
             prior = prior + _variance(light[2].sum(0))
             for m in np.unique(block.material[rows]).tolist():
                 own = rows[block.material[rows] == m]
-                predicted = self._predicted(block, own, light, diffuse[m], specular[m], roughness[m])
+                predicted = self._predicted(block, own, light, (diffuse[m], specular[m], roughness[m]))
                 difference = (predicted - torch.from_numpy(block.radiance[own])) * torch.from_numpy(block.precision[own])
                 satisfied = torch.from_numpy(block.clipped[own]) & (difference > 0)
                 squares = squares + (difference.masked_fill(satisfied, 0.0) ** 2).sum()
@@ -192,33 +202,16 @@ class Problem:
         value.backward()
         return value.item(), x.grad
 
-    def _predicted(self, block: Block, rows, light, diffuse: Tensor, specular: Tensor, roughness: Tensor) -> Float[Tensor, "n 3"]:
+    def _predicted(
+        self, block: Block, rows: Int[np.ndarray, "n"], light: tuple[Tensor, ...], material: tuple[Tensor, ...]
+    ) -> Float[Tensor, "n 3"]:
+        """`factorlib.model.responses`, equation (1), on autograd's graph."""
         axis, log_sharpness, weight, log_exposure = light
-        normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
-        no, nz, oz = (normal * view).sum(1), normal @ axis.T, view @ axis.T
-        matte, glossy = Reflected.apply(self.operator, roughness, log_sharpness, no, nz, oz)
+        diffuse, specular, roughness = material
+        seen = cosines(torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows]), axis)
+        parts = UnitReflection.apply(self.operator, roughness, log_sharpness, *seen)
         exposure = torch.exp(log_exposure)[torch.from_numpy(block.photo[rows])]
-        return exposure[:, None] * (diffuse * (matte @ weight) + specular * (glossy @ weight))
-
-
-class Reflected(torch.autograd.Function):
-    """Responses of unit lobes [n, p], diffuse and specular, differentiated by the operator's own `response`."""
-
-    @staticmethod
-    def forward(ctx, operator, roughness, log_sharpness, no, nz, oz):
-        inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), no, nz, oz)]
-        response = operator.response(*inputs)
-        r = {name: getattr(response, name).to(nz.dtype) for name in response.__struct_fields__}
-        slopes = ("specular_by_roughness", "diffuse_by_log_sharpness", "specular_by_log_sharpness", "diffuse_by_nz", "specular_by_nz")
-        ctx.save_for_backward(*(r[name] for name in (*slopes, "specular_by_oz")))
-        return r["diffuse"], r["specular"]
-
-    @staticmethod
-    def backward(ctx, diffuse, specular):
-        by_roughness, matte_by_sharpness, glossy_by_sharpness, matte_by_nz, glossy_by_nz, glossy_by_oz = ctx.saved_tensors
-        by_sharpness = (diffuse * matte_by_sharpness + specular * glossy_by_sharpness).sum(0)
-        by_nz = diffuse * matte_by_nz + specular * glossy_by_nz
-        return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * glossy_by_oz
+        return radiance_of(exposure[:, None], diffuse, specular, *(part @ weight for part in parts))
 
 
 def _variance(sums: Float[Tensor, "3"]) -> Tensor:
@@ -226,11 +219,13 @@ def _variance(sums: Float[Tensor, "3"]) -> Tensor:
     return ((sums / sums.mean() - 1) ** 2).mean()
 
 
-def _share(value, bounds):
+def _share(value: Float[np.ndarray, "*n"] | float, bounds: tuple[float, float]) -> Float[np.ndarray, "*n"]:
+    """Where between its bounds a value lies, 0 to 1."""
     low, high = bounds
     return (np.asarray(value) - low) / (high - low)
 
 
-def _logit(share):
+def _logit(share: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """The inverse of the sigmoid, of shares that are kept off 0 and 1."""
     share = np.clip(share, 1e-4, 1 - 1e-4)
     return np.log(share / (1 - share))

@@ -19,8 +19,11 @@ T = TypeVar("T")
 class Keeper(Protocol):
     """Keeps one state of tensors, numbers, strings, lists and dictionaries, as `factorlib.checkpoint.Checkpoint` does."""
 
-    def load(self) -> dict[str, Any] | None: ...
-    def save(self, state: dict[str, Any]) -> None: ...
+    def load(self) -> dict[str, Any] | None:
+        """What was saved last, None where nothing was."""
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Keep the state instead of what was saved before."""
 
 
 class Journal:

@@ -1,4 +1,4 @@
-"""A roughness that stands in a wrong valley, found by a search over all of them, the lights held.
+"""A roughness that stands in a wrong valley, found by a search over all of them, the lights as they are.
 
 Given the lights, radiance is linear in k_d and k_s, and only roughness is not: for each of `GRID` the two are solved for per
 channel (non-negative least squares), which leaves a curve of one variable for each material.  Its minimum replaces the
@@ -7,78 +7,87 @@ material where it lies far enough below the loss of the present roughness, solve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.optimize import nnls
 
-from factorlib.solve.normal_equations import Loss, operator_inputs, predicted_radiance, residuals, robust_loss
-from factorlib.solve.problem import Block, of_rows
-from factorlib.solve.shadowing import shadowed
-from factorlib.solve.tone import slope_at, straightened
-from factorlib.solve.unknowns import LEAST_REFLECTANCE, Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import LEAST_REFLECTANCE
+from factorlib.model.illumination import Illumination
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.tone import slope_at, straightened
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
 ROWS = 300  # observations of each material in each light that vote
 BETTER = 0.95  # of the present loss
 
 
-def materials_out_of_valleys(
-    blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator, loss: Loss, map_: Callable
-) -> Materials:
+class Material(NamedTuple):
+    """k_d and k_s [3], and roughness."""
+
+    diffuse: Float[np.ndarray, "3"]
+    specular: Float[np.ndarray, "3"]
+    roughness: float
+
+
+def materials_out_of_valleys(problem: JointProblem, point: Point) -> Materials:
     """The materials, those replaced for which another roughness explains the sampled observations better."""
-    searched = partial(_searched, materials=materials, lights=lights, operator=operator, loss=loss)
-    voters = [[_voters(block, m) for block in blocks] for m in range(len(materials))]  # so that no worker is handed all observations
-    found = list(map_(searched, list(enumerate(voters))))
+    searched = partial(_searched, materials=point.materials, loss=problem.loss)
+    found = list(problem.spread(searched, [(m, _voters(problem, point, m)) for m in range(len(point.materials))]))
     diffuse, specular, roughness = (np.array(values) for values in zip(*found, strict=True))
     return Materials(diffuse, specular, roughness)
 
 
-def _searched(of: tuple[int, list[Block]], materials: Materials, lights: Sequence[Light], operator, loss: Loss):
-    m, blocks = of
-    present = materials.diffuse[m], materials.specular[m], float(materials.roughness[m])
-    pairs = [(voters, light) for voters, light in zip(blocks, lights, strict=True) if len(voters)]
-    if not pairs:
+def _voters(problem: JointProblem, point: Point, m: int) -> list[Illumination]:
+    """What some fitted observations of material m see, light by light, so that no worker is handed all observations."""
+    voting = [block.take(_voting_rows(block, m)) for block in problem.blocks]
+    pairs = zip(voting, point.lights, strict=True)
+    return [Illumination(block, light, point.materials, problem.operator) for block, light in pairs if len(block)]
+
+
+def _voting_rows(block: Block, m: int) -> np.ndarray:
+    rows = np.flatnonzero((block.material == m) & ~block.held_out)
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), ROWS)).astype(int)]
+
+
+def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Loss) -> Material:
+    m, voters = of
+    present = Material(materials.diffuse[m], materials.specular[m], float(materials.roughness[m]))
+    if not voters:
         return present
-    weight = np.concatenate([_weight(voters, light, materials, operator, loss) for voters, light in pairs])
-    radiance = np.concatenate([straightened(voters.radiance, light, voters.photo) for voters, light in pairs])
+    weight = np.concatenate([_weight(one, loss) for one in voters])
+    radiance = np.concatenate([straightened(one.block.radiance, one.light, one.block.photo) for one in voters])
     trials = []
-    for roughness in (present[2], *GRID):
-        diffuse, specular = (np.concatenate(part) for part in zip(*(_lit(*pair, roughness, operator) for pair in pairs), strict=True))
+    for roughness in (present.roughness, *GRID):
+        diffuse, specular = (np.concatenate(part) for part in zip(*(_exposed(one, roughness) for one in voters), strict=True))
         trials.append((*reflectances(diffuse, specular, radiance, weight), roughness))
     best = min(trials, key=lambda trial: trial[0])
-    return best[1:] if best[0] < BETTER * trials[0][0] else present
+    return Material(*best[1:]) if best[0] < BETTER * trials[0][0] else present
 
 
-def _voters(block: Block, m: int) -> Block:
-    rows = np.flatnonzero((block.material == m) & ~block.held_out)
-    return of_rows(block, rows[np.linspace(0, len(rows) - 1, min(len(rows), ROWS)).astype(int)])
-
-
-def _weight(voters: Block, light: Light, materials: Materials, operator, loss: Loss) -> Float[np.ndarray, "n 3"]:
+def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:
     """Roots of weights of linear radiance: outliers of the present model count little, clipped channels not at all."""
-    _, robust = robust_loss(residuals(voters, predicted_radiance(voters, light, materials, operator)), loss.robust_scale)
-    precision = voters.precision * slope_at(voters.radiance, light, voters.photo)
-    return np.where(voters.clipped, 0.0, precision * np.sqrt(robust))
+    block = voters.block
+    precision = block.precision * slope_at(block.radiance, voters.light, block.photo)
+    return np.where(block.clipped, 0.0, precision * np.sqrt(loss.trust(voters.residuals())))
 
 
-def _lit(voters: Block, light: Light, roughness: float, operator) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance [n, 3] of unit k_d and of unit k_s."""
-    rows = slice(0, len(voters))
-    inputs = operator_inputs(voters, rows, light.axis, light.sharpness, roughness, operator)
-    with torch.no_grad():
-        parts = operator.diffuse(inputs[1], inputs[3]), operator.specular(*inputs)
-        parts = shadowed(parts, voters, rows, light.axis, light.sharpness, roughness)
-    exposure = np.exp(light.log_exposure)[voters.photo, None]
-    diffuse, specular = (exposure * (part.double().numpy() @ light.weight) for part in parts)
-    return diffuse, specular
+def _exposed(voters: Illumination, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Radiance of unit k_d and of unit k_s."""
+    diffuse, specular = voters.lit(slice(0, len(voters.block)), roughness)
+    return voters.exposure * diffuse, voters.exposure * specular
 
 
-def reflectances(diffuse, specular, radiance, weight) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Loss, k_d and k_s of the non-negative least-squares fit of radiance [n, 3] by k_d · diffuse + k_s · specular."""
+def reflectances(
+    diffuse: Float[np.ndarray, "n 3"], specular: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n 3"]
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Loss, k_d and k_s of the non-negative least-squares fit of radiance by k_d · diffuse + k_s · specular."""
     total, factors = 0.0, np.zeros((3, 2))
     for c in range(3):
         factors[c], residual = nnls(np.column_stack([diffuse[:, c], specular[:, c]]) * weight[:, c, None], radiance[:, c] * weight[:, c])

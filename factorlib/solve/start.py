@@ -11,8 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.solve.problem import Block
-from factorlib.solve.unknowns import LEAST_REFLECTANCE, Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import LEAST_REFLECTANCE
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
 
 BRIGHTEST = 0.7  # reflectance of the brightest material at the start; the gauge settles it in the end
 

@@ -2,12 +2,12 @@
 
     known   materials by their name, lights by their illumination's; the radiance unit of a block is taken out of its light,
             photos new to a light get the exposure that explains their median radiance
-    new     what a known thing lights or shows is found first, again and again: a light by insertion and descent with the
-            materials held, a material by the search over all roughnesses with the lights held
+    new     what a known light shows, or known materials lie in, is found first, again and again: a light by insertion and descent with
+            the materials fixed, a material by the search over all roughnesses with the lights fixed
     left    what no chain of photos links to anything known starts from mean radiances, as all does from nothing
 
-Earlier materials that no photo linked stand in gauges of their own.  A photo that links them tells the factor per channel
-between them: how much brighter the ones are, in its light, than the others foretell.
+Earlier materials that no photo linked stand in gauges of their own.  A photo that links them gives the factor per channel
+between them: how much brighter the ones are, in its light, than the others predict.
 
 A light that explains its photos worse than one broad lobe does (it was taken again, or turned, or in other units) is not
 known but new.  Only the rounds' start and what is decided before them are changed: nothing pulls toward the earlier answer.
@@ -16,29 +16,32 @@ known but new.  Only the rounds' start and what is decided before them are chang
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from factorlib.solve.descent import Descent, Solution, descend
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import ROUGHNESS, SHARPNESS
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.descent import Descent, descend
 from factorlib.solve.earlier import Earlier
-from factorlib.solve.held_out import held_out_loss
 from factorlib.solve.insertion import blurred, pruned
-from factorlib.solve.normal_equations import Loss, predicted_radiance
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block, of_rows
 from factorlib.solve.roughness import materials_out_of_valleys
 from factorlib.solve.rounds import Start, from_nothing, robust, with_new_lobes
 from factorlib.solve.start import starting_light
-from factorlib.solve.unknowns import ROUGHNESS, SHARPNESS, Light, Materials
-from factorlib.solve.weights import system_of_fitted
-from factorlib.stage import serial_map
+from factorlib.solve.weights import fitted_illumination
 
 log = logging.getLogger("factorlib.solve")
 AT_ONCE = 2  # times as many lobes as a round inserts, where materials need not be found with them
+GUESSED_DIFFUSE, GUESSED_SPECULAR = 0.3, 0.1  # of a new material, before it is searched for
 
 
 class Known(msgspec.Struct, frozen=True):
@@ -56,8 +59,8 @@ def from_earlier(earlier: Earlier, names: Sequence[str], specular: str) -> Start
     """The start of a problem whose materials are called `names`; `specular` as of the bundle: `on` decides nothing."""
     model = earlier.table.model.specular
     decided = np.array([name in model and name in earlier.table.materials and specular == "auto" for name in names])
-    matte = np.array([not model.get(name, True) for name in names]) & decided
-    return Start(partial(_point, earlier=earlier, names=list(names)), decided, matte, rested=True)
+    lambertian = np.array([not model.get(name, True) for name in names]) & decided
+    return Start(partial(_point, earlier=earlier, names=list(names)), decided, lambertian, converged=True)
 
 
 def known_of(earlier: Earlier, names: Sequence[str], blocks: Sequence[Block]) -> Known:
@@ -82,25 +85,23 @@ def _light(earlier: Earlier, block: Block) -> Light | None:
     return Light(axis, np.log(np.clip(lobes.sharpness, *SHARPNESS)), lobes.weight / block.unit, exposure, log_tone)
 
 
-def _point(
-    blocks: Sequence[Block], operator, bundle: Bundle, map_: Callable, *, earlier: Earlier, names: list[str]
-) -> tuple[Materials, list[Light]]:
-    known = known_of(earlier, names, blocks)
-    return Spreading(blocks, known, operator, bundle, map_).point()
+def _point(problem: JointProblem, bundle: Bundle, *, earlier: Earlier, names: list[str]) -> Point:
+    return Propagation(problem, known_of(earlier, names, problem.blocks), bundle).point()
 
 
-class Spreading:
+class Propagation:
     """Materials and lights while they become known; what is known only grows."""
 
-    def __init__(self, blocks: Sequence[Block], known: Known, operator, bundle: Bundle, map_: Callable):
-        self.blocks, self.operator, self.bundle, self.map = blocks, operator, bundle, map_
+    def __init__(self, problem: JointProblem, known: Known, bundle: Bundle):
+        self.problem, self.bundle, self.blocks = problem, bundle, problem.blocks
         self.materials, self.component = known.materials, known.component.copy()
-        self.lights: list[Light | None] = [None] * len(blocks)
+        self.lights: list[Light | None] = [None] * len(self.blocks)
         for i, light in enumerate(known.lights):
             if light is not None and self._known_rows(i).any():
                 self.lights[i] = self._checked(i, light)
 
-    def point(self) -> tuple[Materials, list[Light]]:
+    def point(self) -> Point:
+        """All materials and lights, in one gauge where they are linked."""
         self._one_gauge()
         while self._lights_of_materials() | self._materials_of_lights():
             self._one_gauge()
@@ -111,36 +112,41 @@ class Spreading:
         component = self.component[self.blocks[i].material]
         return (component == _most(component)) & (component >= 0)
 
+    def _seen_in(self, block: Block, light: Light) -> Illumination:
+        return Illumination(block, light, self.materials, self.problem.operator)
+
     def _checked(self, i: int, light: Light) -> Light | None:
         """The light with every photo's exposure and its weights fitted again; None where one broad lobe explains more."""
-        shown = of_rows(self.blocks[i], self._known_rows(i))
-        light = with_exposures(light, shown, self.materials, self.operator)
-        fit = partial(_fitted_weights, shown, materials=self.materials, operator=self.operator, loss=self.bundle.loss)
-        (best, fitted), (least, _) = fit(light), fit(starting_light(shown, self.materials))
-        if best < least:
-            return fitted
+        shown = self.blocks[i].take(self._known_rows(i))
+        light = with_exposures(self._seen_in(shown, light))
+        best, least = (
+            fitted_illumination(self._seen_in(shown, one), self.problem.loss) for one in (light, starting_light(shown, self.materials))
+        )
+        if best.equations.loss < least.equations.loss:
+            return best.light
         log.warning("illumination '%s' starts anew: what the earlier solution says of it explains less than one broad lobe", shown.name)
         return None
 
     def _lights_of_materials(self) -> bool:
         """Find the new lights that show known materials; whether there were any."""
         new = [i for i, light in enumerate(self.lights) if light is None and self._known_rows(i).any()]
-        shown = [of_rows(self.blocks[i], self._known_rows(i)) for i in new]
-        fit = partial(fitted_light, materials=self.materials, operator=self.operator, bundle=self.bundle)
-        for i, light in zip(new, self.map(fit, shown), strict=True):
+        shown = [self.blocks[i].take(self._known_rows(i)) for i in new]
+        fit = partial(fitted_light, materials=self.materials, bundle=self.bundle)
+        alone = [JointProblem([block], self.problem.operator, self.problem.loss) for block in shown]
+        for i, light in zip(new, self.problem.spread(fit, alone), strict=True):
             self.lights[i] = light
         return bool(new)
 
     def _materials_of_lights(self) -> bool:
         """Find the new materials that known lights show; whether there were any."""
         lit = [i for i, light in enumerate(self.lights) if light is not None]
-        blocks, lights = [self.blocks[i] for i in lit], [self.lights[i] for i in lit]
+        blocks = [self.blocks[i] for i in lit]
         new = [m for m in np.flatnonzero(self.component < 0) if any((block.material == m).any() for block in blocks)]
         if not new:
             return False
-        self.materials = _merged(self.materials, _guessed(self.materials, new), new)
-        found = materials_out_of_valleys(blocks, self.materials, lights, self.operator, self.bundle.loss, self.map)
-        self.materials = _merged(self.materials, found, new)
+        self.materials = self.materials.replaced(_guess(len(self.materials)), new)
+        found = materials_out_of_valleys(self.problem.restricted(lit), Point(self.materials, [self.lights[i] for i in lit]))
+        self.materials = self.materials.replaced(found, new)
         for m in new:
             shows = next(i for i in lit if (self.blocks[i].material == m).any())
             self.component[m] = _most(self.component[self.blocks[shows].material])
@@ -153,8 +159,8 @@ class Spreading:
                 continue
             main = _most(self.component[block.material])
             for other in sorted(set(self.component[block.material].tolist()) - {-1, main}):
-                rows = of_rows(block, self.component[block.material] == other)
-                self._rescale(other, _brighter(rows, light, self.materials, self.operator), main, i)
+                rows = block.take(self.component[block.material] == other)
+                self._rescale(other, brighter(self._seen_in(rows, light)), main, i)
 
     def _rescale(self, other: int, factor: Float[np.ndarray, "3"], main: int, keep: int) -> None:
         members = np.flatnonzero(self.component == other)
@@ -167,66 +173,55 @@ class Spreading:
         self.materials = Materials(diffuse, specular, self.materials.roughness)
         self.component[members] = main
 
-    def _rest(self) -> tuple[Materials, list[Light]]:
+    def _rest(self) -> Point:
         """What nothing known leads to, from mean radiances."""
-        start, lights = from_nothing(len(self.materials)).point(self.blocks, self.operator, self.bundle, self.map)
-        materials = _merged(self.materials, start, np.flatnonzero(self.component < 0))
-        return materials, [light if known is None else known for known, light in zip(self.lights, lights, strict=True)]
+        start = from_nothing(len(self.materials)).point(self.problem, self.bundle)
+        materials = self.materials.replaced(start.materials, np.flatnonzero(self.component < 0))
+        return Point(materials, [light if known is None else known for known, light in zip(self.lights, start.lights, strict=True)])
 
 
-def fitted_light(block: Block, materials: Materials, operator, bundle: Bundle) -> Light:
-    """A light found by rounds of insertion and descent with the materials held, as long as they gain."""
-    light, best, least = starting_light(block, materials), None, np.inf
+def fitted_light(problem: JointProblem, materials: Materials, bundle: Bundle) -> Light:
+    """The light of a problem of one block, found by rounds of insertion and descent as long as they gain; the materials are known."""
+    light, best, least = starting_light(problem.blocks[0], materials), None, np.inf
     every = np.ones(7 * len(materials), bool)
     bundle = msgspec.structs.replace(bundle, insert=AT_ONCE * bundle.insert)
     for number in range(bundle.rounds):
-        current = Solution(materials, [light], [])
-        loss = robust([block], current, operator, bundle.loss)
-        current = with_new_lobes([block], current, operator, loss, bundle, number, serial_map)
-        current = descend([block], current, operator, loss, Descent(bundle.iterations, bundle.tolerance), serial_map, held=every)
-        light = blurred(pruned(current.lights[0]), materials.sharpest)
-        held_out = held_out_loss([block], materials, [light], operator, bundle.loss)
+        start = Point(materials, [light])
+        fitting = problem.with_loss(robust(problem, start))
+        current = with_new_lobes(fitting, start, bundle, number)
+        current = descend(fitting, current, Descent(bundle.iterations, bundle.tolerance), fixed=every)
+        light = blurred(pruned(current.point.lights[0]), materials.sharpest)
+        held_out = problem.held_out_loss(Point(materials, [light]))
         gained, least, best = least - held_out, min(least, held_out), light if held_out < least else best
         if gained < bundle.least_gain * held_out or len(light) >= bundle.lobes:
             break
     return best
 
 
-def _fitted_weights(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> tuple[float, Light]:
-    found, of_found = system_of_fitted(block, light, materials, operator, loss)
-    return of_found.loss, found
-
-
-def with_exposures(light: Light, block: Block, materials: Materials, operator) -> Light:
-    """With the exposures that were not known, and the first photo's moved into the weights."""
+def with_exposures(illumination: Illumination) -> Light:
+    """Its light with the exposures that were not known (NaN), and the first photo's moved into the weights."""
+    light, block = illumination.light, illumination.block
     exposure = light.log_exposure
     guess = msgspec.structs.replace(light, log_exposure=np.where(np.isnan(exposure), 0.0, exposure))
     for k in np.flatnonzero(np.isnan(exposure)):
         rows = block.photo == k
         if rows.any():
-            guess.log_exposure[k] = np.log(_brighter(of_rows(block, rows), guess, materials, operator)).mean()
+            of_photo = msgspec.structs.replace(illumination, block=block.take(rows), light=guess)
+            guess.log_exposure[k] = np.log(brighter(of_photo)).mean()
     first = guess.log_exposure[0]
     return msgspec.structs.replace(light, weight=light.weight * np.exp(first), log_exposure=guess.log_exposure - first)
 
 
-def _brighter(block: Block, light: Light, materials: Materials, operator) -> Float[np.ndarray, "3"]:
-    """By what factor observations are brighter than foretold, per channel."""
-    foretold = np.median(predicted_radiance(block, light, materials, operator), axis=0)
-    return np.maximum(np.median(block.radiance, axis=0), 1e-6) / np.maximum(foretold, 1e-6)
+def brighter(illumination: Illumination) -> Float[np.ndarray, "3"]:
+    """By what factor observations are brighter than predicted, per channel."""
+    predicted = np.median(illumination.radiance(), axis=0)
+    return np.maximum(np.median(illumination.block.radiance, axis=0), 1e-6) / np.maximum(predicted, 1e-6)
 
 
-def _guessed(materials: Materials, new: Sequence[int]) -> Materials:
-    """The new materials as grey as the middle of the roughnesses; the search that follows replaces them."""
-    rows = materials.vector().reshape(-1, 7).copy()
-    rows[list(new)] = [*([0.3] * 3), *([0.1] * 3), np.sqrt(ROUGHNESS[0] * ROUGHNESS[1])]
-    return Materials.of_vector(rows.reshape(-1))
-
-
-def _merged(materials: Materials, found: Materials, which: Sequence[int]) -> Materials:
-    """`materials` with those of `which` as `found`."""
-    rows = materials.vector().reshape(-1, 7).copy()
-    rows[list(which)] = found.vector().reshape(-1, 7)[list(which)]
-    return Materials.of_vector(rows.reshape(-1))
+def _guess(count: int) -> Materials:
+    """Grey materials in the middle of the roughnesses, which the search that follows replaces."""
+    row = [*([GUESSED_DIFFUSE] * 3), *([GUESSED_SPECULAR] * 3), np.sqrt(ROUGHNESS[0] * ROUGHNESS[1])]
+    return Materials.of_vector(np.tile(row, count))
 
 
 def _most(component: Int[np.ndarray, "n"]) -> int:

@@ -6,40 +6,50 @@ channels that are already explained, and outliers, carry the weights of the curr
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from factorlib.solve.normal_equations import Loss, System, energy_systems, responses, system
-from factorlib.solve.problem import Block, not_held_out
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.solve.normal_equations import EnergyEquations, NormalEquations, energy_equations, normal_equations
 
-HELD = 1 << 20  # responses of observations to lobes that are held; of more they are computed twice
+KEPT = 1 << 20  # responses of observations to lobes that are kept in memory; of more they are computed twice
 
 
-def system_of_fitted(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> tuple[Light, System]:
-    """The light with the weights that lower the loss most, all else held, and its system.
+class Fitted(NamedTuple):
+    """A light with fitted weights, and the normal equations there."""
+
+    light: Light
+    equations: NormalEquations
+
+
+def fitted_illumination(illumination: Illumination, loss: Loss) -> Fitted:
+    """The light with the weights that lower the loss most, all else as it is.
 
     Observations that are clipped, outliers or toned make the loss one of more than least squares: a light whose fitted weights
     would raise it keeps its own.
     """
-    block = not_held_out(block)
-    shown = responses(block, light, materials, operator)
-    held = list(shown) if len(block) * len(light) <= HELD else None
-    before, gradients, hessians = energy_systems(block, light, materials, shown if held is None else held, loss)
-    found = with_fitted_weights(light, gradients, hessians)
-    of_found = system(block, found, materials, operator, loss, shown=held)
-    return (found, of_found) if of_found.loss <= before else (light, system(block, light, materials, operator, loss, shown=held))
+    fitted = illumination.fitted()
+    computed = fitted.responses()
+    kept = list(computed) if len(fitted.block) * len(fitted.light) <= KEPT else None
+    before = energy_equations(fitted, computed if kept is None else kept, loss)
+    found = fitted.with_light(with_fitted_weights(fitted.light, before))
+    after = normal_equations(found, loss, known=kept)
+    return Fitted(found.light, after) if after.loss <= before.loss else Fitted(fitted.light, normal_equations(fitted, loss, known=kept))
 
 
-def with_fitted_weights(light: Light, gradients: Float[np.ndarray, "3 p"], hessians: Float[np.ndarray, "3 p p"]) -> Light:
-    """The non-negative weights that minimise the quadratic model, by the energies of each channel, with all else held."""
+def with_fitted_weights(light: Light, equations: EnergyEquations) -> Light:
+    """The non-negative weights that minimise the quadratic model by the energies of each channel, all else as it is."""
     energy = light.energy
-    for c, (gradient, hessian) in enumerate(zip(gradients, hessians, strict=True)):
+    for c, (gradient, hessian) in enumerate(zip(equations.gradients, equations.hessians, strict=True)):
         energy[:, c] = nonnegative_minimum(hessian, hessian @ energy[:, c] - gradient)
-    return msgspec.structs.replace(light, weight=energy / light.spread[:, None])
+    return msgspec.structs.replace(light, weight=energy / light.unit_energy[:, None])
 
 
 def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:

@@ -11,10 +11,9 @@ from factorlib.align.evidence import UNKNOWN, Evidence
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import state_of
 from factorlib.refine import descent
-from factorlib.refine.light import pursued_light
+from factorlib.refine.light import Surfaces, pursued_light
 from factorlib.refine.pixels import View, pixels_of
 from factorlib.reflection import reflection_operator
-from factorlib.solve.problem import of_rows
 
 OPERATOR = reflection_operator("network")
 
@@ -26,10 +25,12 @@ def test_where_the_outline_is_left_out_shading_finds_the_way(number, monkeypatch
     about = binary_dilation(label > 0, iterations=20) & ~(label > 0)  # a contour may lie here at no cost
     evidence, prior = Evidence(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
     view = View(pixels_of(photo.channels, [True] * 3, 2400), [photo.given], [True])
-    moving = descent.moving_object(view, 0, [photo.pose], photo.camera, evidence, prior)
+    surfaces = Surfaces(TRUE, OPERATOR)
+    moving = descent.moving_object(descent.Photographed(view, 0, photo.camera, evidence, prior), [photo.pose], surfaces)
     start, true = (state_of(pose, photo.camera, photo.given) for pose in (photo.pose, photo.truth))
-    light = pursued_light(of_rows(*moving.block(true, None)), TRUE, OPERATOR)
+    block, agrees = moving.block(true, None)
+    light = pursued_light(block.take(agrees), surfaces)
     monkeypatch.setattr(descent, "pursued_light", lambda *given: light)
-    found = descent.descended(moving, start, TRUE, OPERATOR, steps=10, most_lost=0.05)
+    found = descent.descended(moving, start, steps=10, most_lost=0.05)
     before, after = (normal_error(photo, state.pose(photo.given)) for state in (start, found))
     assert before > 1.5 and after < 0.6 * before

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 
 from factorlib.refine.descent import projected_equations
-from factorlib.refine.light import pursued_light, together, whitened_residuals, with_weights
+from factorlib.refine.light import Surfaces, pursued_light, together, with_weights
 from factorlib.reflection import reflection_operator
-from factorlib.solve.insertion import whitened_atoms
 from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
+SURFACES = Surfaces(MATERIALS, OPERATOR)
 RNG = np.random.default_rng(3)
 LIGHT = random_light(RNG, 8)
 SHOWN = block("light", LIGHT, MATERIALS, [0, 1], OPERATOR, size=16)
@@ -19,28 +19,28 @@ SHOWN = block("light", LIGHT, MATERIALS, [0, 1], OPERATOR, size=16)
 
 def test_weights_of_the_true_lobes_are_the_true_weights():
     dark = msgspec.structs.replace(LIGHT, weight=np.zeros_like(LIGHT.weight))
-    found = with_weights(SHOWN, dark, MATERIALS, OPERATOR)
+    found = with_weights(SURFACES.under(dark, SHOWN))
     assert (found.weight >= 0).all()
-    assert np.median(np.abs(whitened_residuals(SHOWN, found, MATERIALS, OPERATOR))) < 0.01
+    assert np.median(np.abs(SURFACES.under(found, SHOWN).residuals())) < 0.01
 
 
 def test_what_is_held_out_has_no_say():
     other = np.where(SHOWN.held_out[:, None], 7.0, SHOWN.radiance)
-    lights = [pursued_light(msgspec.structs.replace(SHOWN, radiance=r), MATERIALS, OPERATOR) for r in (SHOWN.radiance, other)]
+    lights = [pursued_light(msgspec.structs.replace(SHOWN, radiance=r), SURFACES) for r in (SHOWN.radiance, other)]
     assert np.array_equal(lights[0].weight, lights[1].weight)
 
 
 def test_a_pursued_light_explains_a_light_it_knows_nothing_of():
-    found = pursued_light(SHOWN, MATERIALS, OPERATOR)
-    residual = whitened_residuals(SHOWN, found, MATERIALS, OPERATOR)
+    found = pursued_light(SHOWN, SURFACES)
+    residual = SURFACES.under(found, SHOWN).residuals()
     assert np.sqrt(np.mean(residual[~SHOWN.held_out] ** 2)) < 1 and np.sqrt(np.mean(residual[SHOWN.held_out] ** 2)) < 1.5
 
 
 def test_outliers_pull_little():
     bright = SHOWN.radiance.copy()
     bright[::50] *= 10
-    found = with_weights(msgspec.structs.replace(SHOWN, radiance=bright), LIGHT, MATERIALS, OPERATOR)
-    assert np.median(np.abs(whitened_residuals(SHOWN, found, MATERIALS, OPERATOR))) < 0.3
+    found = with_weights(SURFACES.under(LIGHT, msgspec.structs.replace(SHOWN, radiance=bright)))
+    assert np.median(np.abs(SURFACES.under(found, SHOWN).residuals())) < 0.3
 
 
 def test_together_holds_every_lobe():
@@ -50,11 +50,11 @@ def test_together_holds_every_lobe():
 def test_a_pose_sees_nothing_that_the_light_explains():
     """A direction of the pose that does to the picture what a change of weights does has no information, and no pull."""
     light = msgspec.structs.replace(LIGHT, weight=LIGHT.weight + 0.1)
-    atoms = whitened_atoms(SHOWN, np.arange(len(SHOWN)), MATERIALS, OPERATOR, light.axis, light.sharpness, light)
+    lit = SURFACES.under(light, SHOWN)
+    atoms = lit.atoms(np.arange(len(SHOWN)), light.unit_lobes)
     as_light = np.einsum("cnp,p->nc", atoms, RNG.normal(size=len(light)))
     other = RNG.normal(size=as_light.shape)
-    residual = whitened_residuals(SHOWN, light, MATERIALS, OPERATOR)
-    hessian, gradient = projected_equations(np.stack([as_light, other], -1), residual, SHOWN, light, MATERIALS, OPERATOR)
-    bare = (as_light**2).sum()
-    assert abs(hessian[0, 0]) < 1e-4 * hessian[1, 1] * bare / (other**2).sum() and abs(gradient[0]) < 1e-2 * np.sqrt(bare)
+    hessian, gradient = projected_equations(np.stack([as_light, other], -1), lit.residuals(), lit)
+    alone = (as_light**2).sum()
+    assert abs(hessian[0, 0]) < 1e-4 * hessian[1, 1] * alone / (other**2).sum() and abs(gradient[0]) < 1e-2 * np.sqrt(alone)
     assert hessian[1, 1] > 0 and np.linalg.eigvalsh(hessian).min() > -1e-6 * hessian[1, 1]

@@ -11,15 +11,22 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
+from factorlib.diagnose.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
+from factorlib.diagnose.uncertainty import standard_errors
+from factorlib.model.blocks import Block
+from factorlib.model.components import connected_components
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import Joint, solve
-from factorlib.solve.normal_equations import predicted_radiance
+from factorlib.reflection.operator import Operator
+from factorlib.solve.bundle import Solution, solve
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Block, Noise, blocks_of_observations, connected_components
-from factorlib.solve.told import ill_explained, untold_by_answer, untold_by_observations
-from factorlib.solve.uncertainty import standard_errors
-from factorlib.solve.unknowns import Light, Materials
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
 from tests.solve.problems import sphere_normals
 
@@ -56,11 +63,11 @@ class Answer(msgspec.Struct, frozen=True):
     roughness: float
     radiance: float
     said: list[str]
-    joint: Joint
+    solution: Solution
 
     @property
     def materials(self) -> Materials:
-        return self.joint.solution.materials
+        return self.solution.point.materials
 
 
 def chosen(rows: Sequence[int]) -> Materials:
@@ -106,7 +113,7 @@ def observed(truth: Materials, lights: Sequence[Light], shown: Sequence[Sequence
     )  # fmt: skip
     radiance = seen.radiance.copy()
     for block, lobes in zip(blocks_of_observations(seen, Noise()), lights, strict=True):  # their rows are those of `parts`
-        radiance[photo == names.index(block.name)] = predicted_radiance(block, lobes, truth, OPERATOR)
+        radiance[photo == names.index(block.name)] = Illumination(block, lobes, truth, OPERATOR).radiance()
     return msgspec.structs.replace(seen, radiance=radiance)
 
 
@@ -252,16 +259,17 @@ BOUNDS = {
 }
 
 
-def answered(given: Case, bundle: Bundle = QUICK, operator=OPERATOR) -> Answer:
-    """The answer, held against the clean observations."""
-    blocks = blocks_of_observations(given.seen, Noise(), seed=bundle.seed)
-    said = untold_by_observations(given.seen.materials, blocks)
-    joint = solve(blocks, len(given.truth), operator, bundle, serial_map, lambda event: None)
-    errors, _ = standard_errors(blocks, joint.solution, operator, joint.loss)
-    said += untold_by_answer(given.seen.materials, blocks, joint.solution.materials, errors)
-    said += ill_explained(blocks, joint.solution.materials, joint.solution.lights, operator)
-    k, roughness = material_errors(joint.solution.materials, given.truth, blocks)
-    return Answer(k, roughness, radiance_error(joint, blocks, given.clean, operator), said, joint)
+def answered(given: Case, bundle: Bundle = QUICK, operator: Operator = OPERATOR) -> Answer:
+    """The answer, compared with the clean observations."""
+    problem, names = JointProblem(blocks_of_observations(given.seen, Noise(), seed=bundle.seed), operator), given.seen.materials
+    said = undetermined_by_observations(names, problem.blocks)
+    solution = solve(problem, from_nothing(len(given.truth)), Run(bundle))
+    found, materials = solution.point, solution.point.materials
+    errors = standard_errors(problem.with_loss(solution.loss), found)
+    said += undetermined_by_answer(names, problem.blocks, materials, errors.materials)
+    said += poorly_explained(problem, found)
+    k, roughness = material_errors(materials, given.truth, problem.blocks)
+    return Answer(k, roughness, radiance_error(problem, solution, given.clean), said, solution)
 
 
 def of_random_starts(given: Case, count: int = 10, bundle: Bundle = QUICK) -> list[Answer]:
@@ -275,7 +283,7 @@ def of_random_starts(given: Case, count: int = 10, bundle: Bundle = QUICK) -> li
 
 
 def is_finite(answer: Answer) -> bool:
-    lights = [getattr(found, name) for found in answer.joint.solution.lights for name in found.__struct_fields__]
+    lights = [getattr(found, name) for found in answer.solution.point.lights for name in found.__struct_fields__]
     return all(np.isfinite(array).all() for array in (answer.materials.vector(), *lights))
 
 
@@ -294,10 +302,10 @@ def material_errors(found: Materials, truth: Materials, blocks: Sequence[Block])
     return float(np.concatenate(errors).mean() / np.concatenate(whole).mean()), float(max(rough))
 
 
-def radiance_error(joint: Joint, blocks: Sequence[Block], clean: Observations, operator) -> float:
-    names, relative = [block.name for block in blocks], []
+def radiance_error(problem: JointProblem, solution: Solution, clean: Observations) -> float:
+    names, relative, point = [block.name for block in problem.blocks], [], solution.point
     for true in blocks_of_observations(clean, Noise()):
         i = names.index(true.name)
-        found = predicted_radiance(true, joint.solution.lights[i], joint.solution.materials, operator) * blocks[i].unit / true.unit
+        found = Illumination(true, point.lights[i], point.materials, problem.operator).radiance() * problem.blocks[i].unit / true.unit
         relative.append((found - true.radiance) / (true.radiance + 1))
     return float(np.sqrt(np.mean(np.concatenate(relative) ** 2)))

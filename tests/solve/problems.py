@@ -3,9 +3,10 @@
 import msgspec
 import numpy as np
 
-from factorlib.solve.normal_equations import predicted_radiance
-from factorlib.solve.problem import Block
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
 
 MATERIALS = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2]]),
@@ -43,7 +44,7 @@ def block(name: str, light: Light, materials: Materials, shown, operator, size: 
         radiance=np.zeros((rows, 3)), clipped=np.zeros((rows, 3), bool), precision=np.ones((rows, 3)),
         material=material, photo=photo, held_out=np.random.default_rng(seed).random(rows) < 0.1,
     )  # fmt: skip
-    radiance = predicted_radiance(empty, light, materials, operator)
+    radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
     return msgspec.structs.replace(empty, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled))
 

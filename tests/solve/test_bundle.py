@@ -5,14 +5,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.model import bounds
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve import unknowns
 from factorlib.solve.bundle import solve
-from factorlib.solve.descent import Solution, evaluated, fitted
-from factorlib.solve.normal_equations import Loss, predicted_radiance
+from factorlib.solve.history import Run
+from factorlib.solve.iterate import evaluate, fit_weights
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import connected_components
-from factorlib.solve.rounds import answer_of
+from factorlib.solve.rounds import answer_of, from_nothing
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
@@ -26,8 +27,8 @@ def rooms(count=2, lobes=4, photos=1, seed=3):
 
 
 def run(blocks, materials=3, bundle=QUICK):
-    joint = solve(blocks, materials, OPERATOR, bundle, serial_map, lambda event: None)
-    return joint.solution.materials, joint.solution.lights, joint.history
+    solution = solve(JointProblem(blocks, OPERATOR), from_nothing(materials), Run(bundle))
+    return solution.point.materials, solution.point.lights, solution.history
 
 
 @pytest.fixture(scope="module")
@@ -45,21 +46,19 @@ def test_recovers_the_materials_it_was_rendered_with(solved):
 
 def test_resynthesises_what_it_was_shown(solved):
     blocks, materials, lights, _ = solved
-    for data, light in zip(blocks, lights, strict=True):
-        error = predicted_radiance(data, light, materials, OPERATOR) - data.radiance
+    for data, radiance in zip(blocks, JointProblem(blocks, OPERATOR).radiance(Point(materials, lights)), strict=True):
+        error = radiance - data.radiance
         assert np.sqrt(np.mean(error**2)) < 0.03 * np.quantile(data.radiance, 0.99)
 
 
-def test_no_lobe_is_sharper_than_the_materials_can_tell_and_the_weights_fit_what_is_left(solved, monkeypatch):
-    monkeypatch.setattr(unknowns, "RESOLVED", 0.3)  # so that lobes are blurred
+def test_no_lobe_is_sharper_than_the_materials_resolve_and_the_weights_fit_what_is_left(solved, monkeypatch):
+    monkeypatch.setattr(bounds, "RESOLVED", 0.3)  # so that lobes are blurred
     blocks, materials, lights, _ = solved
-    everything = [msgspec.structs.replace(b, held_out=np.zeros(len(b), bool)) for b in blocks]
-    found = answer_of(everything, Solution(materials, lights, []), OPERATOR, Loss(), serial_map)
+    problem = JointProblem(blocks, OPERATOR).with_none_held_out()
+    found = answer_of(problem, Point(materials, lights))
     assert all((light.log_sharpness <= np.log(materials.sharpest) + 1e-12).all() for light in found.lights)
     assert any(light.log_sharpness.max() > np.log(materials.sharpest) for light in lights)
-    again = evaluated(everything, found.materials, found.lights, OPERATOR, Loss(), serial_map)
-    better = fitted(everything, found.materials, found.lights, OPERATOR, Loss(), serial_map)
-    assert better.loss > 0.99 * again.loss
+    assert fit_weights(problem, found).loss > 0.99 * evaluate(problem, found).loss
 
 
 def test_lights_are_not_negative_and_finite(solved):
@@ -91,12 +90,6 @@ def test_exposures_of_photos_that_share_a_light_are_found():
     np.testing.assert_allclose(lights[0].log_exposure, truth.log_exposure, atol=0.01)
 
 
-def test_components_of_unlinked_photos():
-    rng = np.random.default_rng(6)
-    blocks = [block(name, random_light(rng, 1), MATERIALS, shown, OPERATOR, size=8) for name, shown in (("a", [0, 1]), ("b", [2]))]
-    assert connected_components(blocks, 4) == [((0, 1), ("a",)), ((2,), ("b",)), ((3,), ())]
-
-
 def test_neither_threads_nor_processes_change_a_bit():
     operator = reflection_operator("network")
     rng = np.random.default_rng(9)
@@ -104,8 +97,8 @@ def test_neither_threads_nor_processes_change_a_bit():
     bundle = Bundle(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
     def answer(map_):
-        solution = solve(blocks, 3, operator, bundle, map_, lambda event: None).solution
-        return np.concatenate([solution.materials.vector(), *(v.reshape(-1) for li in solution.lights for v in (li.axis, li.weight))])
+        point = solve(JointProblem(blocks, operator, spread=map_), from_nothing(3), Run(bundle)).point
+        return np.concatenate([point.materials.vector(), *(v.reshape(-1) for li in point.lights for v in (li.axis, li.weight))])
 
     serial = answer(serial_map)
     with ThreadPoolExecutor(3) as threads, ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:

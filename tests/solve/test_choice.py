@@ -3,14 +3,17 @@
 import msgspec
 import numpy as np
 
+from factorlib.model.cells import mirror_cells
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve import choice
+from factorlib.solve import specular
 from factorlib.solve.bundle import solve
 from factorlib.solve.descent import descend
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import mirror_cells
-from factorlib.solve.unknowns import Materials
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from tests.solve.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
@@ -34,48 +37,49 @@ def rooms(materials, shown, noise=0.3):
 
 def chosen(materials, shown, **options):
     bundle = Bundle(lobes=16, insert=6, rounds=3, iterations=12, polish=10, **options)
-    return solve(rooms(materials, shown), 3, OPERATOR, bundle, serial_map, lambda event: None)
+    return solve(JointProblem(rooms(materials, shown), OPERATOR), from_nothing(3), Run(bundle))
 
 
-def test_matte_materials_lose_their_specular_part_and_glossy_ones_keep_it():
-    joint = chosen(MIXED, [0, 1, 2])
-    assert joint.matte.tolist() == [True, True, False]
-    assert (joint.solution.materials.specular[:2] == 0).all()
-    assert joint.specular[2].held_out_loss_without > 1.05 * joint.specular[2].held_out_loss_with
+def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it():
+    found = chosen(MIXED, [0, 1, 2])
+    assert found.lambertian.tolist() == [True, True, False]
+    assert (found.point.materials.specular[:2] == 0).all()
+    assert found.specular[2].held_out_loss_without > 1.05 * found.specular[2].held_out_loss_with
 
 
 def test_few_lights_that_show_a_material_decide_as_all_do(monkeypatch):
-    monkeypatch.setattr(choice, "LIGHTS", 1)
-    joint = chosen(MIXED, [0, 1, 2])
-    assert joint.matte.tolist() == [True, True, False]
-    assert (joint.solution.materials.specular[:2] == 0).all()
-    assert len(joint.solution.lights) == 2
+    monkeypatch.setattr(specular, "LIGHTS", 1)
+    found = chosen(MIXED, [0, 1, 2])
+    assert found.lambertian.tolist() == [True, True, False]
+    assert (found.point.materials.specular[:2] == 0).all()
+    assert len(found.point.lights) == 2
 
 
-def test_a_matte_scene_ends_without_specular_and_with_few_lobes():
-    matte, glossy = chosen(MIXED, [0, 1]), chosen(MIXED, [0, 1, 2])
-    assert matte.matte[:2].all()
-    assert sum(map(len, matte.solution.lights)) <= 1.2 * sum(map(len, glossy.solution.lights))
+def test_a_lambertian_scene_ends_without_specular_and_with_few_lobes():
+    lambertian, glossy = chosen(MIXED, [0, 1]), chosen(MIXED, [0, 1, 2])
+    assert lambertian.lambertian[:2].all()
+    assert sum(map(len, lambertian.point.lights)) <= 1.2 * sum(map(len, glossy.point.lights))
 
 
 def test_nothing_is_chosen_where_it_is_not_asked_for():
-    joint = chosen(MIXED, [0, 1, 2], specular="on")
-    assert not joint.matte.any() and joint.specular == []
+    found = chosen(MIXED, [0, 1, 2], specular="on")
+    assert not found.lambertian.any() and found.specular == []
 
 
 def test_what_shines_more_than_it_scatters_is_not_tried():
     glossy = Materials(MIXED.diffuse / np.array([[1], [1], [5]]), MIXED.specular, MIXED.roughness)
-    joint = chosen(glossy, [0, 1, 2])
-    assert not joint.matte[2] and joint.specular[2].held_out_loss_without is None
+    found = chosen(glossy, [0, 1, 2])
+    assert not found.lambertian[2] and found.specular[2].held_out_loss_without is None
 
 
 def test_a_descent_that_spoils_what_is_held_out_decides_nothing(monkeypatch):
     """Out of sight of the fit, a lobe may grow where held-out observations alone mirror it: here it does where all have specular parts."""
 
-    def spoiled(blocks, start, *arguments, held, **options):
-        at = descend(blocks, start, *arguments, held=held, **options)
-        factor = 1 if held.any() else 3
-        return msgspec.structs.replace(at, lights=[msgspec.structs.replace(light, weight=factor * light.weight) for light in at.lights])
+    def spoiled(problem, start, *arguments, fixed, **options):
+        at = descend(problem, start, *arguments, fixed=fixed, **options)
+        factor = 1 if fixed.any() else 3
+        lights = [msgspec.structs.replace(light, weight=factor * light.weight) for light in at.point.lights]
+        return msgspec.structs.replace(at, point=Point(at.point.materials, lights))
 
-    monkeypatch.setattr(choice, "descend", spoiled)
+    monkeypatch.setattr(specular, "descend", spoiled)
     assert chosen(MIXED, [2]).specular[2].kept

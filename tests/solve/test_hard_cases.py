@@ -8,10 +8,12 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.responses import material_slices
 from factorlib.reflection import reflection_operator
-from factorlib.solve.held_out import held_out_loss
-from factorlib.solve.normal_equations import Loss, material_slices
-from factorlib.solve.problem import Noise, blocks_of_observations, of_rows
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import write_observations
 from stages import solve as stage
@@ -35,7 +37,7 @@ ONE = "1 material × 1 light"
 
 def bytes_of(answer: Answer) -> bytes:
     lights = b"".join(
-        light.axis.tobytes() + light.log_sharpness.tobytes() + light.weight.tobytes() for light in answer.joint.solution.lights
+        light.axis.tobytes() + light.log_sharpness.tobytes() + light.weight.tobytes() for light in answer.solution.point.lights
     )
     return answer.materials.vector().tobytes() + lights
 
@@ -167,20 +169,20 @@ def test_where_nothing_is_held_out_fitted_observations_choose_the_round():
     all_, none = (blocks_of_observations(given.seen, Noise(), held_out=share) for share in (1e-9, 0.0))
     everything = [msgspec.structs.replace(block, held_out=np.ones(len(block), bool)) for block in all_]
     light = [msgspec.structs.replace(ROOMS[0], weight=ROOMS[0].weight / none[0].unit)]
-    losses = [held_out_loss(blocks, given.truth, light, OPERATOR, Loss()) for blocks in (everything, none)]
+    losses = [JointProblem(blocks, OPERATOR).held_out_loss(Point(given.truth, light)) for blocks in (everything, none)]
     assert losses[0] == losses[1] > 0
 
 
 def test_one_bad_vote_of_held_out_observations_does_not_end_a_solve_that_still_finds_lobes(monkeypatch):
     votes = iter([1.0, 1.2] + [0.5] * 100)
-    monkeypatch.setattr("factorlib.solve.history.held_out_loss", lambda *_: next(votes))
-    history = answered(CASES[ONE](0)).joint.history
+    monkeypatch.setattr("factorlib.model.problem.JointProblem.held_out_loss", lambda *_: next(votes))
+    history = answered(CASES[ONE](0)).solution.history
     assert [event.held_out for event in history if event.phase == "round"][:3] == [1.0, 1.2, 0.5]
 
 
 def test_a_block_of_no_rows_has_no_slices():
     (block,) = blocks_of_observations(CASES[ONE](0).seen, Noise())
-    assert material_slices(of_rows(block, np.zeros(len(block), bool))) == []
+    assert material_slices(block.take(np.zeros(len(block), bool))) == []
 
 
 def test_no_material_is_held_out_whole():

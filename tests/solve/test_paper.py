@@ -3,10 +3,9 @@ import numpy as np
 import pytest
 import torch
 
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.normal_equations import predicted_radiance
-from factorlib.solve.paper import Paper, Problem, drawn, inverse_hessian_times, solve
-from factorlib.stage import serial_map
+from factorlib.solve.paper import Paper, PaperObjective, drawn, inverse_hessian_times, solve
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
@@ -20,7 +19,7 @@ def rooms(photos=1, size=16):
 
 
 def run(blocks, paper=QUICK, operator=OPERATOR):
-    return solve(blocks, 3, operator, paper, serial_map, lambda event: None)
+    return solve(JointProblem(blocks, operator), 3, paper)
 
 
 @pytest.fixture(scope="module")
@@ -30,21 +29,21 @@ def solved():
 
 
 def test_roughly_recovers_the_materials_it_was_rendered_with(solved):
-    found = solved[1].solution.materials
+    found = solved[1].point.materials
     factor = factor_between(found, MATERIALS)
     np.testing.assert_allclose(found.roughness[1:], MATERIALS.roughness[1:], atol=0.15)  # the first is all but matte
     np.testing.assert_allclose(found.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05)  # the glossy one is split badly
 
 
 def test_resynthesises_what_it_was_shown(solved):
-    blocks, joint = solved
-    for data, light in zip(blocks, joint.solution.lights, strict=True):
-        error = predicted_radiance(data, light, joint.solution.materials, OPERATOR) - data.radiance
+    blocks, found = solved
+    for data, radiance in zip(blocks, JointProblem(blocks, OPERATOR).radiance(found.point), strict=True):
+        error = radiance - data.radiance
         assert np.sqrt(np.mean(error**2)) < 0.05 * np.quantile(data.radiance, 0.99)
 
 
 def test_lights_are_not_negative_and_finite(solved):
-    for light in solved[1].solution.lights:
+    for light in solved[1].point.lights:
         assert len(light) == QUICK.lobes
         assert (light.weight >= 0).all()
         assert np.isfinite(light.weight).all() and np.isfinite(light.sharpness).all()
@@ -55,26 +54,26 @@ def test_the_same_seed_gives_the_same_answer():
     short = msgspec.structs.replace(QUICK, samplings=3)
     blocks = rooms()
     one, other = run(blocks, short), run(blocks, short)
-    np.testing.assert_array_equal(one.solution.materials.vector(), other.solution.materials.vector())
-    np.testing.assert_array_equal(one.solution.lights[0].weight, other.solution.lights[0].weight)
+    np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
+    np.testing.assert_array_equal(one.point.lights[0].weight, other.point.lights[0].weight)
 
 
 def test_scaling_a_photo_scales_its_light_alone():
     short = msgspec.structs.replace(QUICK, samplings=3)
     blocks = rooms()
     one, other = run(blocks, short), run([msgspec.structs.replace(blocks[0], unit=7 * blocks[0].unit), blocks[1]], short)
-    np.testing.assert_array_equal(one.solution.materials.vector(), other.solution.materials.vector())
-    np.testing.assert_array_equal(one.solution.lights[0].weight, other.solution.lights[0].weight)  # in units of the block
+    np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
+    np.testing.assert_array_equal(one.point.lights[0].weight, other.point.lights[0].weight)  # in units of the block
 
 
 def test_gradient_is_the_finite_difference():
     blocks = rooms(photos=2, size=8)
-    problem = Problem(blocks, 3, EXACT, Paper(lobes=3))
+    objective = PaperObjective(JointProblem(blocks, EXACT), 3, Paper(lobes=3))
     subset = drawn([np.arange(len(b)) for b in blocks], 60, np.random.default_rng(0))
-    x = problem.start() + 0.3 * torch.randn(sum(problem.sizes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    _, gradient = problem.objective(x, subset)
+    x = objective.start() + 0.3 * torch.randn(sum(objective.sizes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    _, gradient = objective.at(x, subset)
     moves = torch.eye(len(x), dtype=torch.float64) * 1e-6
-    expected = [(problem.objective(x + d, subset)[0] - problem.objective(x - d, subset)[0]) / 2e-6 for d in moves]
+    expected = [(objective.at(x + d, subset)[0] - objective.at(x - d, subset)[0]) / 2e-6 for d in moves]
     np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
 

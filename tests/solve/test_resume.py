@@ -6,11 +6,14 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.light.sphere import fibonacci_sphere
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion, rounds
 from factorlib.solve.bundle import solve
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.resume import Journal
+from factorlib.solve.rounds import from_nothing
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, random_light
 
@@ -50,11 +53,11 @@ def answer(blocks, journal=None, stop=lambda event: False):
         if stop(event):
             raise Killed
 
-    joint = solve(blocks, 3, OPERATOR, BUNDLE, serial_map, report, journal=journal)
-    s = joint.solution
-    parts = [s.materials.vector(), joint.matte, *(getattr(li, f).reshape(-1) for li in s.lights for f in li.__struct_fields__)]
-    told = msgspec.json.encode([joint.history, joint.held_out, joint.specular, joint.loss, joint.self_shadowing])
-    return np.concatenate(parts).tobytes() + told, events
+    found = solve(JointProblem(blocks, OPERATOR), from_nothing(3), Run(BUNDLE, report, journal=journal or Journal()))
+    p = found.point
+    parts = [p.materials.vector(), found.lambertian, *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
+    decided = msgspec.json.encode([found.history, found.shadows, found.specular, found.loss])
+    return np.concatenate(parts).tobytes() + decided, events
 
 
 @pytest.fixture(scope="module")
@@ -99,13 +102,15 @@ def test_what_was_done_is_not_done_again(blocks, tmp_path):
         return serial_map(function, items)
 
     with pytest.raises(Killed):
-        solve(blocks, 3, OPERATOR, BUNDLE, killed_in_the_last_phase, lambda event: None, journal=Journal(Checkpoint(file)))
+        problem = JointProblem(blocks, OPERATOR, spread=killed_in_the_last_phase)
+        solve(problem, from_nothing(3), Run(BUNDLE, lambda event: None, journal=Journal(Checkpoint(file))))
 
     def counted(function, items):
         work.append(len(items))
         return serial_map(function, items)
 
-    solve(blocks, 3, OPERATOR, BUNDLE, counted, lambda event: work.append(0), journal=Journal(Checkpoint(file)))
+    run = Run(BUNDLE, lambda event: work.append(0), journal=Journal(Checkpoint(file)))
+    solve(JointProblem(blocks, OPERATOR, spread=counted), from_nothing(3), run)
     assert sum(work) <= len(blocks) * (BUNDLE.settle + 2)  # where it starts, its steps, the end in gauge
 
 

@@ -1,15 +1,16 @@
-"""The search for another roughness, lights held."""
+"""The search for another roughness, the lights as they are."""
 
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.images.tone import curve
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.normal_equations import Loss
 from factorlib.solve.roughness import materials_out_of_valleys, reflectances
-from factorlib.solve.unknowns import Light, Materials
-from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
@@ -25,10 +26,14 @@ def problem(materials: int, lights: int):
     return blocks, truth, scaled
 
 
+def searched(blocks, materials, lights):
+    return materials_out_of_valleys(JointProblem(blocks, OPERATOR), Point(materials, lights))
+
+
 def test_a_roughness_far_off_is_found_again():
     blocks, truth, lights = problem(materials=3, lights=2)
     wrong = Materials(truth.diffuse * 1.3, truth.specular * 0.5, np.array([0.95, *truth.roughness[1:]]))
-    found = materials_out_of_valleys(blocks, wrong, lights, OPERATOR, Loss(), serial_map)
+    found = searched(blocks, wrong, lights)
     assert abs(found.roughness[0] - truth.roughness[0]) < 0.1  # the grid's own spacing
     np.testing.assert_array_equal(found.roughness[1:], wrong.roughness[1:])  # what is right stays
 
@@ -38,8 +43,8 @@ def test_a_tone_curve_is_undone_first():
     bent = [msgspec.structs.replace(b, radiance=curve(b.radiance, 1.6)) for b in blocks]
     curved = [msgspec.structs.replace(light, log_tone=np.log([1.6])) for light in lights]
     wrong = Materials(truth.diffuse * 1.3, truth.specular * 0.5, np.array([0.95, *truth.roughness[1:]]))
-    found = materials_out_of_valleys(bent, wrong, curved, OPERATOR, Loss(), serial_map)
-    straight = materials_out_of_valleys(blocks, wrong, lights, OPERATOR, Loss(), serial_map)
+    found = searched(bent, wrong, curved)
+    straight = searched(blocks, wrong, lights)
     assert found.roughness[0] == straight.roughness[0]
     np.testing.assert_allclose(found.diffuse[0], truth.diffuse[0], rtol=0.15)
 
@@ -47,7 +52,7 @@ def test_a_tone_curve_is_undone_first():
 def test_a_material_that_nothing_shows_stays():
     blocks, truth, lights = problem(materials=2, lights=2)
     more = Materials(*(np.concatenate([v, v[:1]]) for v in (truth.diffuse, truth.specular, truth.roughness)))
-    found = materials_out_of_valleys(blocks, more, lights, OPERATOR, Loss(), serial_map)
+    found = searched(blocks, more, lights)
     np.testing.assert_array_equal(found.vector()[14:], more.vector()[14:])
 
 
@@ -67,5 +72,5 @@ def test_clipped_channels_do_not_vote():
         for b in blocks
     ]  # fmt: skip
     wrong = Materials(truth.diffuse, truth.specular, np.array([1.0, truth.roughness[1]]))
-    found = materials_out_of_valleys(clipped, wrong, lights, OPERATOR, Loss(), serial_map)
+    found = searched(clipped, wrong, lights)
     assert abs(found.roughness[0] - truth.roughness[0]) < 0.1

@@ -4,12 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.diagnose.identifiability import unlikely_curves
 from factorlib.images.tone import curve
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import solve
+from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
-from factorlib.solve.told import beyond_cameras
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
@@ -28,12 +30,12 @@ def through(data, *exponents):
 
 
 def solved(blocks, **how):
-    joint = solve(blocks, len(MATERIALS), OPERATOR, msgspec.structs.replace(QUICK, **how), serial_map, lambda event: None)
-    return joint, [np.exp(light.log_tone) for light in joint.solution.lights]
+    solution = solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), Run(msgspec.structs.replace(QUICK, **how)))
+    return solution, [np.exp(light.log_tone) for light in solution.point.lights]
 
 
-def error_of(joint):
-    found = joint.solution.materials
+def error_of(solution):
+    found = solution.point.materials
     return np.abs(found.diffuse * factor_between(found, MATERIALS) - MATERIALS.diffuse).max()
 
 
@@ -48,17 +50,17 @@ def found(curved):
 
 
 def test_curves_are_found_and_spare_the_materials(curved, found):
-    joint, exponents = found
+    solution, exponents = found
     without, none = solved(curved, tone="off")
     np.testing.assert_allclose([float(e[0]) if len(e) else 1.0 for e in exponents], (1.3, 0.8, 1.0), rtol=0.05)
     assert all(len(e) == 0 for e in none)
-    assert error_of(joint) < 0.3 * error_of(without)
+    assert error_of(solution) < 0.3 * error_of(without)
 
 
 def test_the_evidence_is_that_held_out_losses_fall(found):
-    told = found[0].tone
-    assert [one.kept for one in told][:2] == [True, True]
-    assert all(one.kept == (one.held_out_loss_with < 0.8 * one.held_out_loss_without) for one in told)
+    evidence = found[0].tone
+    assert [one.kept for one in evidence][:2] == [True, True]
+    assert all(one.kept == (one.held_out_loss_with < 0.8 * one.held_out_loss_without) for one in evidence)
 
 
 def test_photos_of_one_light_have_a_curve_each():
@@ -68,20 +70,20 @@ def test_photos_of_one_light_have_a_curve_each():
 
 
 def test_linear_photos_stay_linear_and_say_why():
-    joint, exponents = solved(rooms())
+    solution, exponents = solved(rooms())
     assert all(len(e) == 0 for e in exponents)
-    assert [told.kept for told in joint.tone] == [False] * 3
+    assert [one.kept for one in solution.tone] == [False] * 3
 
 
 def test_a_curve_that_no_camera_has_is_not_believed():
     """What else is wrong would be explained by an exponent at its bounds."""
     blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
-    joint, exponents = solved(blocks)
+    solution, exponents = solved(blocks)
     assert len(exponents[0]) == 0
-    assert joint.tone[0].held_out_loss_with < 0.8 * joint.tone[0].held_out_loss_without and not joint.tone[0].kept
+    assert solution.tone[0].held_out_loss_with < 0.8 * solution.tone[0].held_out_loss_without and not solution.tone[0].kept
 
 
-def test_an_exponent_near_its_bounds_is_told_of():
+def test_an_exponent_near_its_bounds_is_named():
     blocks = rooms()[:2]
     lights = [msgspec.structs.replace(random_light(np.random.default_rng(0), 2), log_tone=np.log([g])) for g in (1.2, 1.65)]
-    assert [("room1" in said, "1.6" in said) for said in beyond_cameras(blocks, lights)] == [(True, True)]
+    assert [("room1" in said, "1.6" in said) for said in unlikely_curves(blocks, lights)] == [(True, True)]

@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 
 from factorlib.light.lobes import Lobes
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion
 from factorlib.solve.bundle import solve
-from factorlib.solve.descent import Descent, descend, evaluated
+from factorlib.solve.descent import Descent, descend
 from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table, Tone
-from factorlib.solve.normal_equations import Loss, predicted_radiance
+from factorlib.solve.history import Run
+from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
-from factorlib.solve.unknowns import Light, Materials
-from factorlib.solve.warm import Spreading, from_earlier, known_of, with_exposures
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
+from factorlib.solve.warm import Propagation, from_earlier, known_of, with_exposures
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
@@ -66,17 +71,17 @@ def rooms(*numbers, **how):
 
 def answer(blocks, start=None):
     operator = Counted()
-    joint = solve(blocks, 3, operator, BUNDLE, serial_map, lambda event: None, start=start)
-    return joint, operator.cost
+    solution = solve(JointProblem(blocks, operator), start or from_nothing(3), Run(BUNDLE))
+    return solution, operator.cost
 
 
-def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0), matte=(False, False, False)) -> Earlier:
+def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0), lambertian=(False, False, False)) -> Earlier:
     """As the stage writes it and `read_earlier` reads it."""
     rows = zip(names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True)
     table = Table(
         {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
         Gauge(dict(zip(names, component, strict=True))),
-        Model({name: not is_matte for name, is_matte in zip(names, matte, strict=True)}),
+        Model({name: not one for name, one in zip(names, lambertian, strict=True)}),
     )
     lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in zip(blocks, lights, strict=True)}
     exposures = {
@@ -85,10 +90,10 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
     return Earlier(table, lobes, exposures)
 
 
-def of(joint, blocks, count=3):
-    found = joint.solution.materials
+def of(solution, blocks, count=3):
+    found = solution.point.materials
     kept = Materials(found.diffuse[:count], found.specular[:count], found.roughness[:count])
-    return written(blocks, kept, joint.solution.lights, NAMES[:count], [0] * count, joint.matte[:count].tolist())
+    return written(blocks, kept, solution.point.lights, NAMES[:count], [0] * count, solution.lambertian[:count].tolist())
 
 
 @pytest.fixture(scope="module")
@@ -98,21 +103,21 @@ def three():
 
 
 def check_same(cold, warm, blocks):
-    one, other = warm.solution, cold.solution
+    one, other = warm.point, cold.point
     factor = factor_between(one.materials, other.materials)
     np.testing.assert_allclose(one.materials.diffuse * factor, other.materials.diffuse, atol=REFLECTANCE)
     np.testing.assert_allclose(one.materials.specular * factor, other.materials.specular, atol=REFLECTANCE)
     np.testing.assert_allclose(one.materials.roughness, other.materials.roughness, atol=ROUGHNESS)
-    assert (warm.matte == cold.matte).all()
+    assert (warm.lambertian == cold.lambertian).all()
     for b, light, before in zip(blocks, one.lights, other.lights, strict=True):
-        a, c = (predicted_radiance(b, li, s.materials, OPERATOR) for li, s in ((light, one), (before, other)))
+        a, c = (Illumination(b, li, p.materials, OPERATOR).radiance() for li, p in ((light, one), (before, other)))
         assert np.sqrt(np.mean(((a - c) / (c + 1)) ** 2)) < RADIANCE
 
 
 def test_a_fourth_light_from_three_is_the_answer_from_nothing_for_less_than_two_thirds(three):
-    blocks, joint, _ = three
+    blocks, before, _ = three
     more = [*blocks, *rooms(3)]
-    (cold, whole), (warm, part) = answer(more), answer(more, from_earlier(of(joint, blocks), NAMES, "auto"))
+    (cold, whole), (warm, part) = answer(more), answer(more, from_earlier(of(before, blocks), NAMES, "auto"))
     check_same(cold, warm, more)
     assert part < whole * 2 / 3, part / whole
 
@@ -138,12 +143,13 @@ def truth(*numbers, **how):
 
 
 def begun(earlier, blocks, names=NAMES):
-    return from_earlier(earlier, names, "auto").point(blocks, OPERATOR, BUNDLE, serial_map)
+    point = from_earlier(earlier, names, "auto").point(JointProblem(blocks, OPERATOR), BUNDLE)
+    return point.materials, point.lights
 
 
 def explained(blocks, materials, lights, atol=1e-3):
     for b, light in zip(blocks, lights, strict=True):
-        np.testing.assert_allclose(predicted_radiance(b, light, materials, OPERATOR), b.radiance, atol=atol, rtol=atol)
+        np.testing.assert_allclose(Illumination(b, light, materials, OPERATOR).radiance(), b.radiance, atol=atol, rtol=atol)
 
 
 def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
@@ -169,20 +175,21 @@ def test_materials_go_by_their_names():
     np.testing.assert_array_equal(materials.vector(), MATERIALS.vector())
 
 
-def test_a_light_nobody_knows_is_found_with_the_materials_held():
+def test_a_light_nobody_knows_is_found_with_the_materials_fixed():
     blocks, lights = truth(0, 1)
     materials, found = begun(written(blocks[:1], MATERIALS, lights[:1]), blocks)
     np.testing.assert_array_equal(materials.vector(), MATERIALS.vector())
     explained(blocks, materials, found, atol=0.15)
 
 
-def test_a_descent_with_the_materials_held_moves_the_light_alone():
+def test_a_descent_with_the_materials_fixed_moves_the_light_alone():
     (data,), (light,) = truth(0)
     away = msgspec.structs.replace(light, log_sharpness=light.log_sharpness - 0.2)
     moved = msgspec.structs.replace(MATERIALS, roughness=MATERIALS.roughness + 0.03)
-    start = evaluated([data], moved, [away], OPERATOR, Loss(), serial_map)
-    found = descend([data], start, OPERATOR, Loss(), Descent(5), serial_map, held=np.ones(21, bool))
-    np.testing.assert_array_equal(found.materials.vector(), moved.vector())
+    problem = JointProblem([data], OPERATOR)
+    start = evaluate(problem, Point(moved, [away]))
+    found = descend(problem, start, Descent(5), fixed=np.ones(21, bool))
+    np.testing.assert_array_equal(found.point.materials.vector(), moved.vector())
     assert found.loss < start.loss
 
 
@@ -204,7 +211,7 @@ def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
     factor = earlier.exposures[others[0]][0]
     lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was while `first` was not there
     earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
-    light = with_exposures(known_of(earlier, NAMES, blocks).lights[0], blocks[0], MATERIALS, OPERATOR)
+    light = with_exposures(Illumination(blocks[0], known_of(earlier, NAMES, blocks).lights[0], MATERIALS, OPERATOR))
     explained(blocks, MATERIALS, [light], atol=0.02)
     _, (light,) = begun(earlier, blocks)
     np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
@@ -249,13 +256,13 @@ def test_what_nothing_known_leads_to_starts_from_mean_radiances():
 
 def test_what_was_decided_of_a_specular_part_stays():
     blocks, lights = truth(0)
-    start = from_earlier(written(blocks, MATERIALS, lights, matte=(True, False, False)), [*NAMES, "new"], "auto")
-    assert start.decided.tolist() == [True, True, True, False] and start.matte.tolist() == [True, False, False, False]
-    assert not from_earlier(written(blocks, MATERIALS, lights, matte=(True, False, False)), NAMES, "on").matte.any()
+    start = from_earlier(written(blocks, MATERIALS, lights, lambertian=(True, False, False)), [*NAMES, "new"], "auto")
+    assert start.decided.tolist() == [True, True, True, False] and start.lambertian.tolist() == [True, False, False, False]
+    assert not from_earlier(written(blocks, MATERIALS, lights, lambertian=(True, False, False)), NAMES, "on").lambertian.any()
 
 
 def test_nothing_known_in_a_block_leaves_its_light_unknown():
     blocks, lights = truth(0)
     earlier = written(blocks, MATERIALS, lights)
     none = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, materials={}, gauge=Gauge({})))
-    assert Spreading(blocks, known_of(none, NAMES, blocks), OPERATOR, BUNDLE, serial_map).lights == [None]
+    assert Propagation(JointProblem(blocks, OPERATOR), known_of(none, NAMES, blocks), BUNDLE).lights == [None]

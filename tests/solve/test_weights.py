@@ -4,10 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.model.illumination import Illumination
+from factorlib.model.loss import Loss
 from factorlib.reflection import reflection_operator
 from factorlib.solve import weights
-from factorlib.solve.normal_equations import Loss, energy_systems, fit_loss, responses, system
-from factorlib.solve.weights import nonnegative_minimum, system_of_fitted
+from factorlib.solve.normal_equations import energy_equations, normal_equations
+from factorlib.solve.weights import fitted_illumination, nonnegative_minimum
 from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
@@ -23,16 +25,21 @@ def data():
     return msgspec.structs.replace(shown, radiance=noisy), guess
 
 
+def lit(block, light):
+    return Illumination(block, light, MATERIALS, OPERATOR)
+
+
 def by_energy(light, gradient):
     p = len(light)
     return gradient[3 * p : 6 * p].reshape(3, p)
 
 
-def test_energy_systems_are_those_parts_of_the_whole_system(data):
+def test_energy_equations_are_those_parts_of_the_normal_equations(data):
     observed, light = data
-    loss, gradients, hessians = energy_systems(observed, light, MATERIALS, responses(observed, light, MATERIALS, OPERATOR), Loss(1.0, 1e-2))
-    whole, p = system(observed, light, MATERIALS, OPERATOR, Loss(1.0, 1e-2)), len(light)
-    np.testing.assert_allclose(loss, whole.loss, rtol=1e-12)
+    given, loss = lit(observed, light), Loss(1.0, 1e-2)
+    part, whole, p = energy_equations(given, given.responses(), loss), normal_equations(given, loss), len(light)
+    gradients, hessians = part.gradients, part.hessians
+    np.testing.assert_allclose(part.loss, whole.loss, rtol=1e-12)
     np.testing.assert_allclose(gradients, by_energy(light, whole.light_gradient), rtol=1e-9, atol=1e-9 * np.abs(gradients).max())
     for c in range(3):
         own = slice((3 + c) * p, (4 + c) * p)
@@ -42,8 +49,8 @@ def test_energy_systems_are_those_parts_of_the_whole_system(data):
 def test_fitted_weights_are_the_optimum(data):
     """Karush, Kuhn and Tucker: no gradient where there is weight, none that asks for less than nothing elsewhere."""
     observed, light = data
-    found, at = system_of_fitted(observed, light, MATERIALS, OPERATOR, LOSS)
-    before = np.abs(by_energy(light, system(observed, light, MATERIALS, OPERATOR, LOSS).light_gradient)).max()
+    found, at = fitted_illumination(lit(observed, light), LOSS)
+    before = np.abs(by_energy(light, normal_equations(lit(observed, light), LOSS).light_gradient)).max()
     gradient, energy = by_energy(found, at.light_gradient), found.energy.T
     assert (energy == 0).any() and (energy > 0).any()
     assert np.abs(gradient[energy > 0]).max() < 1e-6 * before
@@ -52,10 +59,10 @@ def test_fitted_weights_are_the_optimum(data):
 
 def test_everything_else_stays(data):
     observed, light = data
-    found, at = system_of_fitted(observed, light, MATERIALS, OPERATOR, LOSS)
+    found, at = fitted_illumination(lit(observed, light), LOSS)
     for name in ("axis", "log_sharpness", "log_exposure"):
         np.testing.assert_array_equal(getattr(found, name), getattr(light, name))
-    again = system(observed, found, MATERIALS, OPERATOR, LOSS)
+    again = normal_equations(lit(observed, found), LOSS)
     np.testing.assert_allclose(at.light_hessian, again.light_hessian, rtol=1e-12, atol=1e-12 * again.light_hessian.max())
 
 
@@ -67,25 +74,25 @@ def test_the_loss_falls_with_outliers_and_clipped_values_too(data):
     harmed = msgspec.structs.replace(observed, radiance=wrong, clipped=high)
     for scale in (0.1, 1.0, 10.0):
         loss = Loss(robust_scale=scale, prior=0.0)
-        found, at = system_of_fitted(harmed, light, MATERIALS, OPERATOR, loss)
-        assert at.loss <= fit_loss(harmed, light, MATERIALS, OPERATOR, loss) * (1 + 1e-12)
-        np.testing.assert_allclose(at.loss, fit_loss(harmed, found, MATERIALS, OPERATOR, loss), rtol=1e-5)
+        found, at = fitted_illumination(lit(harmed, light), loss)
+        assert at.loss <= lit(harmed, light).fit_loss(loss) * (1 + 1e-12)
+        np.testing.assert_allclose(at.loss, lit(harmed, found).fit_loss(loss), rtol=1e-5)
 
 
 def test_weights_that_would_raise_the_loss_are_not_taken(data, monkeypatch):
     observed, light = data
-    monkeypatch.setattr(weights, "with_fitted_weights", lambda light, *_: msgspec.structs.replace(light, weight=9 * light.weight))
-    found, at = system_of_fitted(observed, light, MATERIALS, OPERATOR, LOSS)
+    monkeypatch.setattr(weights, "with_fitted_weights", lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight))
+    found, at = fitted_illumination(lit(observed, light), LOSS)
     np.testing.assert_array_equal(found.weight, light.weight)
-    assert at.loss == system(observed, light, MATERIALS, OPERATOR, LOSS).loss
+    assert at.loss == normal_equations(lit(observed, light), LOSS).loss
 
 
 def test_responses_computed_twice_give_the_same_bits(data, monkeypatch):
     observed, light = data
-    held, at = system_of_fitted(observed, light, MATERIALS, OPERATOR, LOSS)
-    monkeypatch.setattr(weights, "HELD", 0)
-    again, other = system_of_fitted(observed, light, MATERIALS, OPERATOR, LOSS)
-    np.testing.assert_array_equal(held.weight, again.weight)
+    kept, at = fitted_illumination(lit(observed, light), LOSS)
+    monkeypatch.setattr(weights, "KEPT", 0)
+    again, other = fitted_illumination(lit(observed, light), LOSS)
+    np.testing.assert_array_equal(kept.weight, again.weight)
     np.testing.assert_array_equal(at.light_hessian, other.light_hessian)
 
 
@@ -94,7 +101,7 @@ def test_what_is_held_out_changes_nothing(data):
     out = np.random.default_rng(7).random(len(observed)) < 0.3
     one = msgspec.structs.replace(observed, held_out=out)
     other = msgspec.structs.replace(one, radiance=np.where(out[:, None], 100.0, one.radiance))
-    (a, at), (b, bt) = (system_of_fitted(x, light, MATERIALS, OPERATOR, LOSS) for x in (one, other))
+    (a, at), (b, bt) = (fitted_illumination(lit(x, light), LOSS) for x in (one, other))
     np.testing.assert_array_equal(a.weight, b.weight)
     assert at.loss == bt.loss
 

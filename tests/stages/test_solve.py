@@ -7,10 +7,11 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
+from factorlib.model.illumination import Illumination
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.solve.earlier import FILES
-from factorlib.solve.normal_equations import predicted_radiance
-from factorlib.solve.problem import Noise, blocks_of_observations
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
@@ -31,7 +32,7 @@ def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0
     )  # fmt: skip
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
-    radiance = predicted_radiance(block, light, MATERIALS, reflection_operator("closed_form"))
+    radiance = Illumination(block, light, MATERIALS, reflection_operator("closed_form")).radiance()
     return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
 
 

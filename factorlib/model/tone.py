@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.images.tone import curve, inverse, slope
-from factorlib.solve.unknowns import TONE, Light
+from factorlib.model.bounds import TONE
+from factorlib.model.lights import Light
 
-WILD = 0.8  # of the logarithms of the exponents' bounds
+NEAR_BOUNDS = 0.8  # of the logarithms of the exponents' bounds
 
 
 def toned(linear: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
@@ -29,10 +31,16 @@ def slope_at(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.nda
 
 
 def exponents(light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 1"]:
+    """The exponent of the photo of each of n observations."""
     return np.exp(light.log_tone)[photo][:, None]
 
 
-def is_wild(light: Light) -> bool:
+def with_curves(light: Light) -> Light:
+    """The light with a curve for each photo, the identity."""
+    return msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))
+
+
+def beyond_cameras(light: Light) -> bool:
     """Whether an exponent has run near the bounds of what cameras do."""
-    low, high = WILD * np.log(TONE)
+    low, high = NEAR_BOUNDS * np.log(TONE)
     return bool(((light.log_tone < low) | (light.log_tone > high)).any())

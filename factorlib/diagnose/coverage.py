@@ -7,7 +7,7 @@ imitate left out and the light of other directions given, is the Schur complemen
     i_d = aᵀa − aᵀJ (JᵀJ)⁻¹ Jᵀa = ‖a‖² − ‖Qᵀa‖²,       Q an orthonormal basis of J's columns,                  (1)
 
 and 1/√i_d is the standard error of the radiance in direction d, averaged over that width.  It is large where no
-observation reflects d toward the camera, and in what only matte materials see.
+observation reflects d toward the camera, and in what only Lambertian materials see.
 """
 
 from __future__ import annotations
@@ -18,41 +18,43 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.light.lobes import lobe_integral
-from factorlib.solve.insertion import whitened_atoms
-from factorlib.solve.normal_equations import Loss, responses, whitened_rows
-from factorlib.solve.problem import Block, of_rows
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import UnitLobes
+from factorlib.model.loss import Loss
 
 SHARPNESS = 100.0  # of the lobes that are asked about
 WIDTH_DEG = float(np.degrees(np.sqrt(2 / SHARPNESS)))  # where such a lobe has fallen to 1/e: 8°
 ROWS, LARGEST = 32, 1000.0
-SAMPLE = 1000  # observations that tell, on behalf of all
+SAMPLE = 1000  # observations that stand for all
 
 
-def relative_standard_errors(
-    block: Block, light: Light, materials: Materials, operator, loss: Loss, sigma: float
-) -> Float[np.ndarray, "h w 3"]:
-    """Standard errors over the light's mean radiance, as a small lat-long map in the frame of the exported ones, at most LARGEST."""
+def relative_standard_errors(illumination: Illumination, loss: Loss, sigma: float) -> Float[np.ndarray, "h w 3"]:
+    """Standard errors over the light's mean radiance, as a small lat-long map in the frame of the exported ones, at most LARGEST.
+
+    loss: that the answer minimises;  sigma: standard deviation of the residuals in units of the noise model
+    """
+    light = illumination.light
     directions = lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA  # of the block's frame
-    errors = light_standard_errors(block, light, materials, operator, loss, directions.reshape(-1, 3), sigma)
+    errors = light_standard_errors(illumination, loss, directions.reshape(-1, 3), sigma)
     mean = lobe_integral(light.sharpness) @ light.weight / (4 * np.pi)
     return np.minimum(errors / np.maximum(mean, 1e-30), LARGEST).reshape(ROWS, 2 * ROWS, 3)
 
 
 def light_standard_errors(
-    block: Block, light: Light, materials: Materials, operator, loss: Loss, directions: Float[np.ndarray, "d 3"], sigma: float
+    illumination: Illumination, loss: Loss, directions: Float[np.ndarray, "d 3"], sigma: float
 ) -> Float[np.ndarray, "d 3"]:
     """Standard error of the light's radiance in unit `directions` of the block's frame, in the block's unit.
 
-    sigma: standard deviation of the residuals in units of the noise model
+    loss: that the answer minimises;  sigma: standard deviation of the residuals in units of the noise model
     Infinite where no observation sees a direction at all.
     """
-    rows = np.sort(np.random.default_rng(0).permutation(len(block))[:SAMPLE])
-    seen = msgspec.structs.replace(of_rows(block, rows), held_out=np.zeros(len(rows), bool))
-    atoms = whitened_atoms(seen, np.arange(len(rows)), materials, operator, directions, np.full(len(directions), SHARPNESS), light)
-    told = [_information(atoms[c], jacobian) for c, jacobian in enumerate(_jacobians(seen, light, materials, operator, loss))]
+    count = len(illumination.block)
+    rows = np.sort(np.random.default_rng(0).permutation(count)[:SAMPLE])
+    sample = msgspec.structs.replace(illumination, block=illumination.block.take(rows).with_none_held_out())
+    atoms = sample.atoms(np.arange(len(rows)), UnitLobes(directions, np.full(len(directions), SHARPNESS)))
+    information = [_information(atoms[c], jacobian) for c, jacobian in enumerate(_jacobians(sample, loss))]
     with np.errstate(divide="ignore"):
-        return sigma / np.sqrt(np.stack(told, 1) * len(block) / len(rows))
+        return sigma / np.sqrt(np.stack(information, 1) * count / len(rows))
 
 
 def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "d"]:
@@ -62,14 +64,12 @@ def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n
     return np.maximum(np.sum(atoms**2, 0) - np.sum((basis.T @ atoms) ** 2, 0), 0.0)
 
 
-def _jacobians(block: Block, light: Light, materials: Materials, operator, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
+def _jacobians(illumination: Illumination, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
     """Of each channel by all but the lobes, in the order of the block's rows; robust weights left out, since a lobe's atoms have none."""
-    unknowns = 7 * len(materials) + light.unknowns
-    whole = [np.zeros((len(block), unknowns)) for _ in range(3)]
-    plain = msgspec.structs.replace(loss, robust_scale=1e6)
-    for some in responses(block, light, materials, operator):
-        for c, channel in enumerate(whitened_rows(block, light, materials, some, plain)):
-            whole[c][some.rows, channel.places] = channel.jacobian.numpy()
-    first = 7 * len(materials)
+    light, first = illumination.light, 7 * len(illumination.materials)
+    unknowns = first + light.unknowns
+    whole = [np.zeros((len(illumination.block), unknowns)) for _ in range(3)]
+    for part in illumination.linearise(msgspec.structs.replace(loss, robust_scale=1e6)):
+        whole[part.channel][part.rows, part.places] = part.jacobian.numpy()
     others = np.r_[0:first, first + 6 * len(light) : unknowns]
     return [jacobian[:, others] for jacobian in whole]

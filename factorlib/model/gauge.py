@@ -14,9 +14,13 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
-from factorlib.solve.problem import Block, connected_components
-from factorlib.solve.unknowns import Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.components import connected_components
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
 
 BRIGHTEST = 0.9
 RULE = (
@@ -25,9 +29,10 @@ RULE = (
 )
 
 
-def in_gauge(materials: Materials, lights: Sequence[Light], blocks: Sequence[Block]) -> tuple[Materials, list[Light]]:
-    """The same predicted radiance in the gauge stated above."""
-    diffuse, specular, lights = materials.diffuse.copy(), materials.specular.copy(), list(lights)
+def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
+    """The same predicted radiance in the gauge stated above; one light per block."""
+    materials, lights = point.materials, list(point.lights)
+    diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
@@ -39,10 +44,10 @@ def in_gauge(materials: Materials, lights: Sequence[Light], blocks: Sequence[Blo
         diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
         for i in own:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
-    return Materials(diffuse, specular, materials.roughness), lights
+    return Point(Materials(diffuse, specular, materials.roughness), lights)
 
 
-def _greying(lights: Sequence[Light]) -> np.ndarray:
+def _greying(lights: Sequence[Light]) -> Float[np.ndarray, "3"]:
     sums = np.array([light.energy.sum(0) for light in lights])
     share = sums / np.maximum(sums.mean(1, keepdims=True), 1e-30)
     return np.clip(share.sum(0) / np.maximum((share**2).sum(0), 1e-30), 1e-3, 1e3)

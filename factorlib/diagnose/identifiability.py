@@ -1,8 +1,8 @@
-"""What cannot be told: from the observations alone, from the answer's standard errors, and where it explains too little.
+"""What is not determined: by the observations alone, by the answer's standard errors, and where it explains too little.
 
-Every message names what is not determined, why, and which photo would help.  None stops the solve: what is determined
-is still found.  A factor per channel between reflectances and lights, and links between photos, are `solve.gauge`'s and
-the stage's matter.
+Every sentence names what is not determined, why, and which photo would help.  None stops the solve: what is determined
+is still found.  The factor per channel between reflectances and lights is `factorlib.model.gauge`'s matter, links between
+photos are `factorlib.diagnose.warnings`'.
 """
 
 from __future__ import annotations
@@ -12,21 +12,26 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.solve.normal_equations import predicted_radiance, residuals
-from factorlib.solve.problem import Block, connected_components
-from factorlib.solve.tone import is_wild
-from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import ROUGHNESS
+from factorlib.model.cells import mirror_directions
+from factorlib.model.components import connected_components
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.tone import beyond_cameras
 
 FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
 FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
 CLIPPED = 0.5  # share of channel values
-ROUGHNESS_ERROR = 0.1  # one standard error that leaves matte and glossy apart
+ROUGHNESS_ERROR = 0.1  # one standard error that tells dull from glossy
 SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
 DARK = 0.1  # a bound on reflectance that still says 'dark'
 OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
 
 
-def untold_by_observations(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
+def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
     """What no solve can find, as sentences.
 
     names: of all materials;  a material that no block shows is left out
@@ -64,7 +69,7 @@ def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]
 def _spread(block: Block, rows: Bool[np.ndarray, "n"]) -> float:
     """Largest angle between a mirror direction and their mean, degrees."""
     normal, view = block.normal[rows], block.view[rows]
-    mirror = 2 * np.sum(normal * view, axis=1, keepdims=True) * normal - view
+    mirror = mirror_directions(normal, view)
     mean = mirror.mean(0)
     return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
 
@@ -78,7 +83,7 @@ def _alone(name: str, lights: Sequence[str]) -> str:
     return said + " that shows another material too would help"
 
 
-def untold_by_answer(names: Sequence[str], blocks: Sequence[Block], found: Materials, errors: Materials) -> list[str]:
+def undetermined_by_answer(names: Sequence[str], blocks: Sequence[Block], found: Materials, errors: Materials) -> list[str]:
     """What the data left open, by the standard `errors` of what was `found`, as sentences; of materials that are seen."""
     seen = sorted({int(m) for block in blocks for m in np.unique(block.material)})
     return [sentence for m in seen for sentence in _of_answer(names[m], _row(found, m), _row(errors, m))]
@@ -109,12 +114,11 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
         yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
 
 
-def ill_explained(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator) -> list[str]:
+def poorly_explained(problem: JointProblem, point: Point) -> list[str]:
     """Illuminations whose observations the answer does not explain to the noise model, as sentences."""
     said = []
-    for block, light in zip(blocks, lights, strict=True):
-        residual = residuals(block, predicted_radiance(block, light, materials, operator)) * (block.precision > 0)
-        share = float((np.abs(residual) > OUTLIER).mean())
+    for block, residual in zip(problem.blocks, problem.residuals(point), strict=True):
+        share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())
         if share > OUTLIERS:
             said.append(
                 f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than {OUTLIER:g} times their noise. "
@@ -123,11 +127,11 @@ def ill_explained(blocks: Sequence[Block], materials: Materials, lights: Sequenc
     return said
 
 
-def beyond_cameras(blocks: Sequence[Block], lights: Sequence[Light]) -> list[str]:
-    """Tone curves that have run toward the bounds of what cameras do."""
+def unlikely_curves(blocks: Sequence[Block], lights: Sequence[Light]) -> list[str]:
+    """Tone curves that have run toward the bounds of what cameras do, as sentences."""
     return [
         f"the tone curves of illumination '{block.name}' have exponents of {', '.join(f'{g:.2g}' for g in np.exp(light.log_tone))}, "
         "more than a camera does: something else is wrong there, as normals or `encoding`. SET=\"solve.tone=off\" goes without them"
         for block, light in zip(blocks, lights, strict=True)
-        if is_wild(light)
+        if beyond_cameras(light)
     ]

@@ -3,9 +3,10 @@
 import numpy as np
 
 from factorlib.light.lobes import lobe_integral
+from factorlib.model.gauge import BRIGHTEST, in_gauge
+from factorlib.model.lights import Light
+from factorlib.model.point import Point
 from factorlib.reflection import reflection_operator
-from factorlib.solve.gauge import BRIGHTEST, in_gauge
-from factorlib.solve.unknowns import Light
 from tests.solve.problems import MATERIALS, block, random_light
 
 
@@ -15,7 +16,7 @@ def test_a_lobe_made_sharper_at_its_energy_moves_no_tint():
     sharper = light.log_sharpness + np.array([2.0, 0, 0, 0])
     kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(sharper))
     other = Light(light.axis, sharper, light.weight * kept[:, None], light.log_exposure)
-    (first, _), (second, _) = (in_gauge(MATERIALS, [li], [data]) for li in (light, other))
+    first, second = (in_gauge(Point(MATERIALS, [li]), [data]).materials for li in (light, other))
     np.testing.assert_allclose(first.vector(), second.vector(), rtol=1e-12)
     assert abs((first.diffuse + first.specular).max() - BRIGHTEST) < 1e-12
 
@@ -23,5 +24,5 @@ def test_a_lobe_made_sharper_at_its_energy_moves_no_tint():
 def test_a_single_light_comes_out_grey():
     light = random_light(np.random.default_rng(2), 4)
     data = block("room", light, MATERIALS, [0, 1, 2], reflection_operator("closed_form"), size=8)
-    _, (grey,) = in_gauge(MATERIALS, [light], [data])
+    (grey,) = in_gauge(Point(MATERIALS, [light]), [data]).lights
     np.testing.assert_allclose(grey.energy.sum(0) / grey.energy.sum(), 1 / 3, rtol=1e-9)

@@ -9,21 +9,22 @@ The sandwich
 
 lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  It is taken over two kinds of
 clusters.  One is what a light sends toward nearby mirror directions: a region of the light, whose bias all materials there
-share.  The other is a whole light: with few lobes it is wrong everywhere in ways that lean together, and only other lights
-tell.  The largest of the three variances is taken, unknown by unknown.
+share.  The other is a whole light: with few lobes it is wrong everywhere in ways that agree, and only other lights
+show it.  The largest of the three variances is taken, unknown by unknown.
 
 Scores are those of residuals up to the noise model's σ at least, where the answer was found with a narrower robust scale: what it set
 aside as an outlier is a part of the light that its lobes do not show, and by how much that would move the materials is what they are
 uncertain by.
 
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
-Here the sum of diffuse and specular reflectance over a component's materials is held in each channel: with g the
-direction of that factor and h the gradient of the held sum, covariances are projected by P = I − g hᵀ / (hᵀ g).
+Here the sum of diffuse and specular reflectance over a component's materials is fixed in each channel: with g the
+direction of that factor and h the gradient of the fixed sum, covariances are projected by P = I − g hᵀ / (hᵀ g).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -32,10 +33,17 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from factorlib.solve.normal_equations import Loss, System, predicted_radiance, residuals, system
-from factorlib.solve.problem import Block, connected_components, mirror_cells
-from factorlib.solve.step import damped, held_unknowns, masked, schur_complement
-from factorlib.solve.unknowns import ROUGHNESS, Light, Materials
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import ROUGHNESS
+from factorlib.model.cells import mirror_cells
+from factorlib.model.components import connected_components
+from factorlib.model.illumination import Illumination
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.arrow import ArrowSystem
+from factorlib.solve.normal_equations import NormalEquations, normal_equations
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
@@ -43,27 +51,35 @@ LEAST_DEVIATION = 1e-4  # of the noise model: what a single observation is expla
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
-def standard_errors(blocks: Sequence[Block], solution, operator, loss: Loss) -> tuple[Materials, float]:
-    """Standard error of every material unknown, and the residual's standard deviation in units of the noise model.
+class StandardErrors(NamedTuple):
+    """Of every material unknown; deviation: standard deviation of the residuals in units of the noise model."""
 
-    solution: a `descent.Solution` of these blocks;  loss: that it minimises
-    What the data do not see, one unknown as the roughness of a matte material or a trade of one for another, is uncertain by
+    materials: Materials
+    deviation: float
+
+
+def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
+    """Standard error of every material unknown, at a point that minimises the problem's loss.
+
+    What the data do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by
     the width of its range, which counts as one more observation of each unknown.
     """
-    materials, lights = solution.materials, solution.lights
-    sigma = max(residual_deviation(blocks, materials, lights, operator), LEAST_DEVIATION)
-    loss = msgspec.structs.replace(loss, robust_scale=max(loss.robust_scale, 1.0))
-    systems = [
-        system(block, light, materials, operator, loss, clusters_of(block)) for block, light in zip(blocks, lights, strict=True)
-    ]
-    information = schur_complement(systems, materials, lights)
-    widths = np.tile(WIDTHS, len(materials))
+    materials, count = point.materials, len(point.materials)
+    sigma = max(residual_deviation(problem, point), LEAST_DEVIATION)
+    loss = msgspec.structs.replace(problem.loss, robust_scale=max(problem.loss.robust_scale, 1.0))
+    system = ArrowSystem([clustered_equations(illumination, loss) for illumination in problem.illuminations(point)])
+    information, widths = system.schur_complement(point), np.tile(WIDTHS, count)
     inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
-    by_cell = [reduced_scores(s, light, materials) for s, light in zip(systems, lights, strict=True)]
+    by_cell = system.reduced_scores(point)
     covariances = inverse, _sandwich(inverse, np.vstack(by_cell), sigma), _sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
-    variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in covariances]
+    variances = [np.diag(in_gauge(covariance, materials, problem.blocks)) for covariance in covariances]
     errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
-    return Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma
+    return StandardErrors(Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma)
+
+
+def clustered_equations(illumination: Illumination, loss: Loss) -> NormalEquations:
+    """Normal equations with the scores of clusters of mirror directions."""
+    return normal_equations(illumination, loss, clusters_of(illumination.block))
 
 
 def _sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float) -> Float[np.ndarray, "k k"]:
@@ -80,22 +96,13 @@ def clusters_of(block: Block) -> Int[np.ndarray, "n"]:
     return np.unique(mirror_cells(block.normal, block.view, CLUSTER), return_inverse=True)[1].reshape(-1)
 
 
-def reduced_scores(s: System, light: Light, materials: Materials) -> Float[np.ndarray, "k 7m"]:
-    """Scores with this light eliminated."""
-    m = len(s.material_gradient)
-    loose = ~held_unknowns(light, materials, s.light_gradient)
-    factor = cho_factor(masked(damped(s.light_hessian, 1e-9), loose), check_finite=False)
-    return s.scores[:, :m] - (s.scores[:, m:] * loose) @ cho_solve(factor, (s.cross_hessian * loose).T, check_finite=False)
-
-
-def residual_deviation(blocks: Sequence[Block], materials: Materials, lights: Sequence[Light], operator) -> float:
+def residual_deviation(problem: JointProblem, point: Point) -> float:
     """Robust standard deviation of the whitened residuals."""
-    every = [residuals(b, predicted_radiance(b, light, materials, operator)) for b, light in zip(blocks, lights, strict=True)]
-    return 1.4826 * float(np.median(np.abs(np.concatenate(every))))
+    return 1.4826 * float(np.median(np.abs(np.concatenate(problem.residuals(point)))))
 
 
 def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]) -> Float[np.ndarray, "k k"]:
-    """The covariance where the sum of each component and channel is held."""
+    """The covariance where the sum of each component and channel is fixed."""
     for members, _ in connected_components(blocks, len(materials)):
         for channel in range(3):
             project = _gauge_projection(materials, members, channel)
@@ -104,11 +111,11 @@ def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks:
 
 
 def _gauge_projection(materials: Materials, members: Sequence[int], channel: int) -> Float[np.ndarray, "7m 7m"]:
-    direction, held = np.zeros(7 * len(materials)), np.zeros(7 * len(materials))
+    direction, fixed = np.zeros(7 * len(materials)), np.zeros(7 * len(materials))
     for m in members:
         direction[7 * m + channel], direction[7 * m + 3 + channel] = materials.diffuse[m, channel], materials.specular[m, channel]
-        held[[7 * m + channel, 7 * m + 3 + channel]] = 1
-    return np.eye(len(direction)) - np.outer(direction, held) / (held @ direction)
+        fixed[[7 * m + channel, 7 * m + 3 + channel]] = 1
+    return np.eye(len(direction)) - np.outer(direction, fixed) / (fixed @ direction)
 
 
 def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

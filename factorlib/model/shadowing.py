@@ -2,7 +2,7 @@
 
     D_ip → v_ip D_ip,   S_ip → u_ip S_ip          with v, u of factorlib.light.visibility, (1) and (2)
 
-All responses of the solve pass through here.  A block without visibility passes unchanged, at no cost.
+All responses of the model pass through here (`factorlib.model.responses`).  A block without visibility passes unchanged, at no cost.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.light.visibility import Seen, cosine_weights, highlight_weights, kernel, seen, seen_share
-from factorlib.solve.problem import Block
+from factorlib.model.blocks import Block
+from factorlib.model.lights import Light, UnitLobes
 
 TOGETHER = 512  # observations whose visibility a processor's cache holds
 
@@ -38,12 +39,7 @@ class Rows(msgspec.Struct, frozen=True):
     directions: Float[Tensor, "k 3"]
 
 
-def without_shadows(block: Block) -> Block:
-    """The same observations, as if nothing hid anything."""
-    return msgspec.structs.replace(block, visibility=None)
-
-
-def shadowed_rows(block: Block, rows) -> Iterator[Rows]:
+def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, "n"]) -> Iterator[Rows]:
     """The shadowed among `rows`, photo by photo, at most TOGETHER at once."""
     visibility, photo = block.visibility[rows], block.photo[rows]
     hidden = (visibility < 255).any(1)
@@ -54,22 +50,26 @@ def shadowed_rows(block: Block, rows) -> Iterator[Rows]:
             yield Rows(torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions)
 
 
-def shadowed(parts, block: Block, rows, axis: Float[np.ndarray, "p 3"], sharpness: Float[np.ndarray, "p"], roughness: float):
-    """`parts` = (diffuse, specular) responses of lobes at `rows`, as they are seen."""
+def shadowed(
+    parts: tuple[Tensor, Tensor], block: Block, rows: slice | Int[np.ndarray, "n"], lobes: UnitLobes, roughness: float
+) -> tuple[Tensor, Tensor]:
+    """`parts` = (diffuse, specular) responses [n, p] to lobes at `rows`, as they are seen."""
     if block.visibility is None:
         return parts
     diffuse, specular = (part.clone() for part in parts)
-    axis, sharpness = (torch.from_numpy(v).float() for v in (axis, sharpness))
+    axis, sharpness = (torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness))
     for some in shadowed_rows(block, rows):
-        lobes = kernel(some.directions, axis, sharpness)
+        light = kernel(some.directions, axis, sharpness)
         glossy, _ = highlight_weights(some.normal, some.view, some.directions, float(roughness))
-        diffuse[some.places] *= seen_share(some.visibility, cosine_weights(some.normal, some.directions), lobes).to(diffuse.dtype)
-        specular[some.places] *= seen_share(some.visibility, glossy, lobes).to(specular.dtype)
+        diffuse[some.places] *= seen_share(some.visibility, cosine_weights(some.normal, some.directions), light).to(diffuse.dtype)
+        specular[some.places] *= seen_share(some.visibility, glossy, light).to(specular.dtype)
     return diffuse, specular
 
 
-def shadowed_response(r: dict[str, Tensor], block: Block, rows, light, roughness: float) -> tuple[dict[str, Tensor], Turning | None]:
-    """The fields of an operator's Response as they are seen, by the product rule, and how they change as lobes turn."""
+def shadowed_response(
+    r: dict[str, Tensor], block: Block, rows: slice, light: Light, roughness: float
+) -> tuple[dict[str, Tensor], Turning | None]:
+    """The fields [n, p] of an operator's Response as they are seen, by the product rule, and how they change as lobes turn."""
     if block.visibility is None:
         return r, None
     r = {name: value.clone() for name, value in r.items()}
@@ -78,8 +78,8 @@ def shadowed_response(r: dict[str, Tensor], block: Block, rows, light, roughness
     tangents = tuple(torch.from_numpy(t).float() for t in light.tangents())
     for some in shadowed_rows(block, rows):
         glossy, by_roughness = highlight_weights(some.normal, some.view, some.directions, float(roughness))
-        matte = cosine_weights(some.normal, some.directions)
-        for part, weights, rough in (("diffuse", matte, None), ("specular", glossy, by_roughness)):
+        cosine = cosine_weights(some.normal, some.directions)
+        for part, weights, rough in (("diffuse", cosine, None), ("specular", glossy, by_roughness)):
             share = seen(some.visibility, weights, some.directions, *lobes, tangents, rough)
             _multiply(r, getattr(turning, part), part, some.places, share)
     return r, turning

@@ -5,16 +5,20 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.diagnose.coverage import LARGEST, relative_standard_errors
+from factorlib.diagnose.uncertainty import clustered_equations, standard_errors
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.solve.arrow import ArrowSystem
 from factorlib.solve.bundle import solve
-from factorlib.solve.coverage import LARGEST, relative_standard_errors
-from factorlib.solve.descent import Descent, descend, evaluated
-from factorlib.solve.normal_equations import Loss, system
+from factorlib.solve.descent import Descent, descend
+from factorlib.solve.history import Run
+from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import of_rows
-from factorlib.solve.uncertainty import clusters_of, reduced_scores, standard_errors
-from factorlib.solve.unknowns import Materials
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
@@ -31,8 +35,8 @@ def noisy(seed: int):
         radiance = data.radiance + NOISE * rng.normal(size=data.radiance.shape) / data.precision
         blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=np.zeros(len(data), bool)))
     scaled = [msgspec.structs.replace(light, weight=light.weight / data.unit) for light, data in zip(lights, blocks, strict=True)]
-    start = evaluated(blocks, MATERIALS, scaled, OPERATOR, LOSS, serial_map)
-    return blocks, descend(blocks, start, OPERATOR, LOSS, Descent(25, 1e-7), serial_map)
+    problem = JointProblem(blocks, OPERATOR, LOSS)
+    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), Descent(25, 1e-7)).point
 
 
 @pytest.fixture(scope="module")
@@ -41,20 +45,20 @@ def solved():
 
 
 def test_scores_of_clusters_sum_to_the_gradient(solved):
-    blocks, solution = solved
-    data, light = blocks[0], solution.lights[0]
-    whole = system(data, light, MATERIALS, OPERATOR, Loss(prior=0.0), clusters_of(data))
+    problem, point = solved
+    whole = clustered_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0))
     np.testing.assert_allclose(whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8)
     assert len(whole.scores) > 20
-    assert reduced_scores(whole, light, MATERIALS).shape == (len(whole.scores), 21)
+    (reduced,) = ArrowSystem([whole]).reduced_scores(Point(MATERIALS, point.lights[:1]))
+    assert reduced.shape == (len(whole.scores), 21)
 
 
 def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():
     inside = []
     for seed in range(8):
-        blocks, solution = noisy(seed)
-        errors, sigma = standard_errors(blocks, solution, OPERATOR, LOSS)
-        found = solution.materials
+        problem, point = noisy(seed)
+        errors, sigma = standard_errors(problem, point)
+        found = point.materials
         factor = (MATERIALS.diffuse + MATERIALS.specular).sum(0) / (found.diffuse + found.specular).sum(0)
         assert sigma == pytest.approx(NOISE, rel=0.1)
         for own, true, error in (
@@ -72,8 +76,9 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
     for seed in range(4):
         rng = np.random.default_rng(seed)
         blocks = [block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)]
-        joint = solve(blocks, 3, OPERATOR, FEW_LOBES, serial_map, lambda event: None)
-        found, errors = joint.solution.materials, standard_errors(blocks, joint.solution, OPERATOR, joint.loss)[0]
+        problem = JointProblem(blocks, OPERATOR)
+        solution = solve(problem, from_nothing(3), Run(FEW_LOBES))
+        found, errors = solution.point.materials, standard_errors(problem.with_loss(solution.loss), solution.point).materials
         factor = factor_between(found, MATERIALS)
         true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
         inside += (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
@@ -81,26 +86,21 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
 
 
 def test_noise_twice_as_large_doubles_the_errors(solved):
-    blocks, solution = solved
+    problem, point = solved
     louder = [
-        msgspec.structs.replace(b, radiance=b.radiance + (b.radiance - predicted) / 1.0)
-        for b, predicted in zip(blocks, predictions(blocks, solution), strict=True)
+        msgspec.structs.replace(b, radiance=b.radiance + (b.radiance - predicted))
+        for b, predicted in zip(problem.blocks, problem.radiance(point), strict=True)
     ]
-    again = evaluated(louder, solution.materials, solution.lights, OPERATOR, LOSS, serial_map)
-    once, twice = (standard_errors(b, s, OPERATOR, Loss(robust_scale=1e3))[0] for b, s in ((blocks, solution), (louder, again)))
+    plain = problem.with_loss(Loss(robust_scale=1e3))
+    once, twice = (standard_errors(p, point).materials for p in (plain, msgspec.structs.replace(plain, blocks=louder)))
     np.testing.assert_allclose(twice.roughness, 2 * once.roughness, rtol=0.05)
 
 
-def predictions(blocks, solution):
-    from factorlib.solve.normal_equations import predicted_radiance
-
-    return [predicted_radiance(b, light, solution.materials, OPERATOR) for b, light in zip(blocks, solution.lights, strict=True)]
-
-
-def test_directions_that_no_observation_mirrors_are_told_less(solved):
-    blocks, solution = solved
-    upper = of_rows(blocks[0], blocks[0].normal[:, 1] < -0.2)  # camera frame: y down, so normals that face upward
-    errors = relative_standard_errors(upper, solution.lights[0], solution.materials, OPERATOR, LOSS, 0.5)
+def test_directions_that_no_observation_mirrors_are_known_less(solved):
+    problem, point = solved
+    given = problem.illuminations(point)[0]
+    upper = given.block.take(given.block.normal[:, 1] < -0.2)  # camera frame: y down, so normals that face upward
+    errors = relative_standard_errors(msgspec.structs.replace(given, block=upper), LOSS, 0.5)
     directions = lat_long_directions(*errors.shape[:2]) @ YUP_FROM_CAMERA
     above, below = errors[directions[..., 1] < -0.6], errors[directions[..., 1] > 0.8]
     assert (errors > 0).all() and (errors <= LARGEST).all()

@@ -5,15 +5,20 @@ import numpy as np
 import pytest
 
 from factorlib.light.sphere import fibonacci_sphere
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import solve
+from factorlib.solve.history import Run
 from factorlib.solve.insertion import lobes_inserted
-from factorlib.solve.normal_equations import Loss, fit_loss, predicted_radiance, system
+from factorlib.solve.normal_equations import normal_equations
 from factorlib.solve.options import Bundle
-from factorlib.solve.problem import Noise, blocks_of_observations
-from factorlib.solve.shadowing import without_shadows
-from factorlib.solve.unknowns import Light, Materials
-from factorlib.stage import serial_map
+from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
 from tests.solve.problems import MATERIALS, block, factor_between, random_light, sphere_normals
 
@@ -88,7 +93,9 @@ def test_model_in_shadow_is_the_traced_radiance(rooms):
     for data, seed in zip(rooms, (20, 21), strict=True):
         light = rough_light(seed)
         light = msgspec.structs.replace(light, weight=light.weight / data.unit)
-        with_, without = (predicted_radiance(b, light, MATERIALS, reflection_operator("network")) for b in (data, without_shadows(data)))
+        with_, without = (
+            Illumination(b, light, MATERIALS, reflection_operator("network")).radiance() for b in (data, data.without_shadows())
+        )
         error, ignored = (np.sqrt(np.mean((found - data.radiance) ** 2)) for found in (with_, without))
         assert ignored > 0.15 * data.radiance.mean()
         assert error < 0.2 * ignored
@@ -97,13 +104,13 @@ def test_model_in_shadow_is_the_traced_radiance(rooms):
 def test_gradients_are_finite_differences(problem):
     """Visibility is computed in single precision, so steps are long and the tolerance is wide."""
     data, light = problem
-    found, step = system(data, light, MATERIALS, OPERATOR, LOSS), 2e-3
+    found, step = normal_equations(Illumination(data, light, MATERIALS, OPERATOR), LOSS), 2e-3
 
     def by_light(move):
-        return fit_loss(data, light.moved(move, MATERIALS.blur), MATERIALS, OPERATOR, LOSS)
+        return Illumination(data, light.moved(move, MATERIALS.blur), MATERIALS, OPERATOR).fit_loss(LOSS)
 
     def by_material(move):
-        return fit_loss(data, light, Materials.of_vector(MATERIALS.vector() + move), OPERATOR, LOSS)
+        return Illumination(data, light, Materials.of_vector(MATERIALS.vector() + move), OPERATOR).fit_loss(LOSS)
 
     for function, gradient in ((by_light, found.light_gradient), (by_material, found.material_gradient)):
         moves = np.eye(len(gradient)) * step
@@ -123,19 +130,19 @@ def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
     hidden = data.directions[0, :, 0] > 0.2
     visibility = np.where(hidden, 0, data.visibility).astype(np.uint8)
     dark = Light(np.array([[0.0, 0.0, -1.0]]), np.zeros(1), np.full((1, 3), 1e-6), np.zeros(1))
-    grown = lobes_inserted(msgspec.structs.replace(data, visibility=visibility), dark, MATERIALS, OPERATOR, 8, seed=0)
+    hidden_from = msgspec.structs.replace(data, visibility=visibility)
+    grown = lobes_inserted(Illumination(hidden_from, dark, MATERIALS, OPERATOR), 8, seed=0)
     assert (grown.axis[1:, 0] < 0.35).all()
 
 
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(rooms):
     quick, error = Bundle(lobes=8, insert=4, rounds=3, iterations=10, polish=20, tolerance=1e-3), {}
     for choice in ("off", "auto"):
-        joint = solve(
-            rooms, 3, reflection_operator("network"), msgspec.structs.replace(quick, self_shadowing=choice), serial_map, lambda event: None
-        )
-        found = joint.solution.materials
+        problem = JointProblem(rooms, reflection_operator("network"))
+        solution = solve(problem, from_nothing(3), Run(msgspec.structs.replace(quick, self_shadowing=choice)))
+        found = solution.point.materials
         factor = factor_between(found, MATERIALS)
         error[choice] = np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(), np.abs(found.roughness - MATERIALS.roughness).mean()
-    assert joint.self_shadowing and joint.held_out["with"] < 0.5 * joint.held_out["without"]
+    assert solution.shadows.kept and solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
     assert error["auto"][0] < 0.5 * error["off"][0]
     assert error["auto"][1] < error["off"][1] + 0.01

@@ -1,0 +1,67 @@
+"""Observations under one illumination, in that illumination's frame and radiance unit."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+ROWS = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
+
+
+class Block(msgspec.Struct, frozen=True):
+    """The n observations under one illumination, sorted by material.
+
+    radiance is divided by `unit` (the block's mean radiance); precision is 1/σ of the noise model times the root of
+    the observation's weight, zero where a channel says nothing; held_out observations choose the model and do not
+    fit it.  visibility says how much of each direction an observation sees, 0 to 255 (None: all of all of them);
+    directions are those, in the block's frame, of each photo.
+    """
+
+    name: str
+    photos: tuple[str, ...]
+    unit: float
+    normal: Float[np.ndarray, "n 3"]
+    view: Float[np.ndarray, "n 3"]
+    radiance: Float[np.ndarray, "n 3"]
+    clipped: Bool[np.ndarray, "n 3"]
+    precision: Float[np.ndarray, "n 3"]
+    material: Int[np.ndarray, "n"]
+    photo: Int[np.ndarray, "n"]
+    held_out: Bool[np.ndarray, "n"]
+    visibility: UInt8[np.ndarray, "n k"] | None = None
+    directions: Float[np.ndarray, "f k 3"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.material)
+
+    def take(self, rows: np.ndarray | slice) -> Block:
+        """The observations `rows` (numbers or a mask) alone."""
+        visibility = None if self.visibility is None else self.visibility[rows]
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, visibility=visibility)
+
+    def fitted(self) -> Block:
+        """What is there to be fitted: all but what is held out."""
+        return self.take(~self.held_out) if self.held_out.any() else self
+
+    def with_none_held_out(self) -> Block:
+        """All observations, to be fitted."""
+        return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
+
+    def sampled(self, count: int, seed: int) -> Block:
+        """At most `count` fitted and `count`/3 held-out observations, each material with its share, order kept."""
+        random = np.random.default_rng(seed)
+        kept = [
+            random.permutation(rows)[:most]
+            for rows, most in ((np.flatnonzero(~self.held_out), count), (np.flatnonzero(self.held_out), count // 3))
+        ]
+        return self.take(np.sort(np.concatenate(kept)))
+
+    def without_shadows(self) -> Block:
+        """The same observations, as if nothing hid anything."""
+        return msgspec.structs.replace(self, visibility=None)
+
+    def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """What `radiance`, in the block's unit, is too bright, in σ; one-sided where clipped: such a pixel says "at least"."""
+        difference = (radiance - self.radiance) * self.precision
+        return np.where(self.clipped, np.minimum(difference, 0.0), difference)

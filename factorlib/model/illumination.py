@@ -1,0 +1,99 @@
+"""One illumination of the joint problem at a point: what its photos show, and what the model says they should.
+
+    predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc),     B_ipc = k_d,c D_ip + k_s,c S_ip,  τ the photo's tone curve
+    residual   r_ic = (y_ic − radiance_ic) / σ_ic, and min(r_ic, 0) where the channel is clipped: a clipped pixel says
+                                                   "at least this much"
+
+D and S are the responses of `factorlib.model.responses`.  A new physical effect is added here and there, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.model.blocks import Block
+from factorlib.model.jacobian import Linearised, linearised
+from factorlib.model.lights import Light, UnitLobes
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.responses import Responses, Rows, material_slices, radiance_of, responses, unit_values
+from factorlib.model.tone import slope_at, toned
+from factorlib.reflection.operator import Operator
+
+
+class Illumination(msgspec.Struct, frozen=True):
+    """The observations made in one light, that light, the materials, and how they reflect; all in the block's radiance unit."""
+
+    block: Block
+    light: Light
+    materials: Materials
+    operator: Operator
+
+    @property
+    def exposure(self) -> Float[np.ndarray, "n 1"]:
+        """The factor of each observation's photo on the light."""
+        return np.exp(self.light.log_exposure)[self.block.photo][:, None]
+
+    def fitted(self) -> Illumination:
+        """What is there to be fitted: all but what is held out."""
+        return msgspec.structs.replace(self, block=self.block.fitted())
+
+    def with_light(self, light: Light) -> Illumination:
+        """In another light."""
+        return msgspec.structs.replace(self, light=light)
+
+    def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Σ_p D w and Σ_p S w at `rows`: what a material of that roughness shows at k_d = 1 and at k_s = 1, unexposed."""
+        parts = unit_values(self.block, rows, self.light.unit_lobes, roughness, self.operator)
+        diffuse, specular = (part @ self.light.weight for part in parts)
+        return diffuse, specular
+
+    def radiance(self) -> Float[np.ndarray, "n 3"]:
+        """y: what every observation should show."""
+        linear, exposure = np.zeros_like(self.block.radiance), self.exposure
+        for m, rows in material_slices(self.block):
+            parts = self.lit(rows, float(self.materials.roughness[m]))
+            linear[rows] = radiance_of(exposure[rows], self.materials.diffuse[m], self.materials.specular[m], *parts)
+        return toned(linear, self.light, self.block.photo)
+
+    def residuals(self) -> Float[np.ndarray, "n 3"]:
+        """r, in σ of the noise model."""
+        return self.block.residuals(self.radiance())
+
+    def losses(self, loss: Loss) -> Float[np.ndarray, "n"]:
+        """Robust loss of every observation, mean over its channels."""
+        return loss.of_residuals(self.residuals()).mean(1)
+
+    def fit_loss(self, loss: Loss) -> float:
+        """The loss over what is not held out, priors included."""
+        residual = self.residuals()[~self.block.held_out]
+        return float(np.sum(loss.of_residuals(residual))) + loss.of_light(self.block, self.light).value
+
+    def responses(self) -> Iterator[Responses]:
+        """D and S with their derivatives, of all observations, some at a time."""
+        return responses(self.block, self.light, self.materials, self.operator)
+
+    def linearise(self, loss: Loss, known: Iterable[Responses] | None = None) -> Iterator[Linearised]:
+        """Whitened residuals and their Jacobian, some observations and a channel at a time; `known`: responses computed before."""
+        for some in self.responses() if known is None else known:
+            yield from linearised(self.block, self.light, self.materials, some, loss)
+
+    def atoms(self, rows: Int[np.ndarray, "n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
+        """What q further lobes of weight one would add to the whitened residual at `rows`, per channel."""
+        block, materials = self.block, self.materials
+        diffuse = np.empty((len(rows), len(lobes)))
+        specular = np.empty_like(diffuse)
+        for m in np.unique(block.material[rows]):
+            of = block.material[rows] == m
+            diffuse[of], specular[of] = unit_values(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
+        scale = block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows])
+        scale *= self.exposure[rows]
+        material = block.material[rows]
+        return np.stack([
+            scale[:, c, None] * (materials.diffuse[material, c, None] * diffuse + materials.specular[material, c, None] * specular)
+            for c in range(3)
+        ])  # fmt: skip

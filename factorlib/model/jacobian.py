@@ -1,0 +1,113 @@
+"""The derivatives of what an illumination shows, by all that is unknown of materials and of its light.
+
+Channels share the geometry unknowns (axis, sharpness) and have their own weights, so the Jacobian is made of one block
+[n, 4p + …] per channel rather than as a sparse [3n, 6p + …] matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from factorlib.elementary import product, square_root
+from factorlib.images.tone import by_log_exponent, curve, slope
+from factorlib.model.blocks import Block
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.responses import Responses
+from factorlib.model.tone import exponents
+
+
+class Linearised(msgspec.Struct, frozen=True):
+    """One channel of some rows, whitened and weighted so that a least-squares step on it is one of the robust loss.
+
+    What is held out weighs nothing.  places: which unknowns (materials first, then the light's) the k columns of the Jacobian are
+    """
+
+    rows: slice
+    channel: int
+    places: Int[np.ndarray, "k"]
+    jacobian: Float[Tensor, "n k"]
+    residual: Float[Tensor, "n"]
+    loss: float
+
+
+class Whitened(msgspec.Struct, frozen=True):
+    """Residual and loss of one channel of n rows; scale: of a slope of radiance, to be one of the residual;
+    rising, by_tone: slopes of radiance by linear radiance and by the log exponents [n, 1]."""
+
+    residual: Float[Tensor, "n"]
+    scale: Float[Tensor, "n"]
+    rising: Float[Tensor, "n 1"] | float
+    by_tone: Float[Tensor, "n 1"] | float
+    loss: float
+
+
+def linearised(block: Block, light: Light, materials: Materials, some: Responses, loss: Loss) -> Iterator[Linearised]:
+    """The three channels of some observations."""
+    p, m, rows, r = len(light), some.material, some.rows, some.parts
+    normal, view = torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows])
+    tangents = [torch.from_numpy(t) for t in light.tangents()]
+    by_tangent = [(product(normal, t.T), product(view, t.T)) for t in tangents]
+    weight, unit_energy = torch.from_numpy(light.weight), torch.from_numpy(light.unit_energy)
+    by_s, weight_by_s = (torch.from_numpy(slope) for slope in light.sharpness_slopes(materials.blur))
+    photos = torch.nn.functional.one_hot(torch.from_numpy(block.photo[rows]), len(light.log_exposure)).double()
+    for c in range(3):
+        kd, ks = materials.diffuse[m, c], materials.specular[m, c]
+        basis = some.basis(materials, c)
+        by_nz = (kd * r["diffuse_by_nz"] + ks * r["specular_by_nz"]) * weight[:, c]
+        by_oz = ks * r["specular_by_oz"] * weight[:, c]
+        columns = [by_nz * n + by_oz * o for n, o in by_tangent]
+        if some.turning is not None:
+            shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(some.turning.diffuse, some.turning.specular, strict=True)]
+            columns = [column + also for column, also in zip(columns, shading, strict=True)]
+        by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
+        columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / unit_energy]
+        linear = product(basis, weight[:, c])
+        lit = [product(r[name], weight[:, c]) for name in ("diffuse", "specular", "specular_by_roughness")]
+        own = [lit[0], lit[1], ks * lit[2]]
+        seen = whitened(block, light, rows, c, linear, loss)
+        jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * seen.rising
+        jacobian = torch.cat([jacobian, photos * seen.by_tone], 1) if len(light.log_tone) else jacobian
+        places = _places(light, len(materials), m, c, p)
+        yield Linearised(rows, c, places, jacobian * seen.scale[:, None], seen.residual, seen.loss)
+
+
+def _places(light: Light, materials: int, m: int, c: int, p: int) -> Int[np.ndarray, "k"]:
+    """Numbers of the unknowns of channel c: geometry and weights of the lobes, exposures, those of material m, tones."""
+    first = 7 * materials
+    end = first + 6 * p + len(light.log_exposure) - 1
+    geometry, exposures, tones = np.arange(first, first + 3 * p), np.arange(first + 6 * p, end), np.arange(end, first + light.unknowns)
+    weights = np.arange(first + (3 + c) * p, first + (4 + c) * p)
+    return np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6], tones])
+
+
+def whitened(block: Block, light: Light, rows: slice, c: int, linear: Float[Tensor, "n"], loss: Loss) -> Whitened:
+    """Channel c of `rows`, whose linear radiance is `linear`."""
+    predicted, rising, by_tone = _toned_with_slopes(linear, block, rows, light)
+    fit = torch.from_numpy((~block.held_out[rows]).astype(float))
+    precision = torch.from_numpy(block.precision[rows, c])
+    difference = (predicted - torch.from_numpy(block.radiance[rows, c])) * precision
+    satisfied = torch.from_numpy(block.clipped[rows, c]) & (difference > 0)
+    residual = torch.where(satisfied, 0.0, difference)
+    root = square_root(1 + (residual / loss.robust_scale) ** 2)
+    pull = square_root(fit / root * ~satisfied)
+    lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
+    return Whitened(residual * pull, precision * pull, rising, by_tone, lost)
+
+
+def _toned_with_slopes(
+    linear: Float[Tensor, "n"], block: Block, rows: slice, light: Light
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 1"] | float, Float[Tensor, "n 1"] | float]:
+    """Radiance as the photos show it, and its slopes by linear radiance and by the log exponents."""
+    if len(light.log_tone) == 0:
+        return linear, 1.0, 0.0
+    x, exponent = linear.clamp(min=0).numpy()[:, None], exponents(light, block.photo[rows])
+    shown, rising, by_tone = (torch.from_numpy(of(x, exponent)) for of in (curve, slope, by_log_exponent))
+    return shown[:, 0], rising, by_tone

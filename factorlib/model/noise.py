@@ -1,0 +1,24 @@
+"""The noise model: how far radiance may be from what the model says."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+
+class Noise(msgspec.Struct, frozen=True):
+    """σ² = absolute² + (relative · radiance)², in units of a block's mean radiance.
+
+    The relative part stands for what a photo's tone curve, rough normals and the lobes' own bias do to bright pixels.
+    """
+
+    absolute: float = 0.05
+    relative: float = 0.05
+    most_weight: float = 8.0  # a merged observation counts as this many independent ones at most
+
+    def precision(self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """√weight/σ of observations, their weights limited."""
+        sigma = np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
+        limited = weight / (1 + weight / self.most_weight)
+        return np.sqrt(limited)[:, None] / sigma

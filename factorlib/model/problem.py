@@ -1,0 +1,98 @@
+"""The joint problem: what is known of materials and lights, and every question that can be asked about a point of it.
+
+    problem = JointProblem(blocks, operator, loss, spread)      point = Point(materials, lights)
+    problem.radiance(point)   .residuals(point)   .linearise(point)   .held_out_loss(point)
+
+Every observation touches one material (7 unknowns) and one light (6 a lobe), so a point is asked about illumination by
+illumination (`factorlib.model.illumination`), and `spread` may do that on several workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.jacobian import Linearised
+from factorlib.model.loss import Loss
+from factorlib.model.point import Point
+from factorlib.reflection.operator import Operator
+from factorlib.stage import serial_map
+
+Spread = Callable[[Callable, Iterable], Iterable]  # an ordered map over independent work
+
+
+class JointProblem(msgspec.Struct, frozen=True):
+    """What is known: observations by illumination, how lobes are reflected, what a residual costs, and how to spread work."""
+
+    blocks: list[Block]
+    operator: Operator
+    loss: Loss = Loss()
+    spread: Spread = serial_map
+
+    def illuminations(self, point: Point) -> list[Illumination]:
+        """Each block with its light; raises ValueError where there is not one light per block."""
+        return [Illumination(b, light, point.materials, self.operator) for b, light in zip(self.blocks, point.lights, strict=True)]
+
+    def radiance(self, point: Point) -> list[Float[np.ndarray, "n 3"]]:
+        """What every observation should show, block by block, in the block's unit."""
+        return [illumination.radiance() for illumination in self.illuminations(point)]
+
+    def residuals(self, point: Point) -> list[Float[np.ndarray, "n 3"]]:
+        """Whitened residuals, block by block, one-sided where clipped; held-out observations too."""
+        return [illumination.residuals() for illumination in self.illuminations(point)]
+
+    def linearise(self, point: Point) -> list[Iterator[Linearised]]:
+        """Residuals and Jacobian of what is fitted, block by block, some rows and one channel at a time."""
+        return [illumination.linearise(self.loss) for illumination in self.illuminations(point)]
+
+    def fit_loss(self, point: Point) -> float:
+        """The loss of what is not held out, priors included."""
+        return sum(illumination.fit_loss(self.loss) for illumination in self.illuminations(point))
+
+    def held_out_losses(self, point: Point) -> list[Float[np.ndarray, "n"]]:
+        """Robust loss of each held-out observation, block by block; of every one where none is held out at all."""
+        none = self.none_held_out
+        judged = msgspec.structs.replace(self, blocks=[block.take(block.held_out | none) for block in self.blocks])
+        return [illumination.losses(self.loss) for illumination in judged.illuminations(point)]
+
+    def held_out_loss(self, point: Point) -> float:
+        """Mean robust loss per held-out channel value; of all values where none is held out."""
+        losses = np.concatenate(self.held_out_losses(point))
+        return float(losses.mean()) if len(losses) else 0.0
+
+    @property
+    def none_held_out(self) -> bool:
+        """Whether all observations are fitted, so that none can choose a model."""
+        return not any(block.held_out.any() for block in self.blocks)
+
+    @property
+    def fitted_values(self) -> int:
+        """How many channel values are fitted."""
+        return sum(int((~block.held_out).sum()) * 3 for block in self.blocks)
+
+    def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
+        """At most `count` fitted observations of each block (one number, or one a block), and a third as many held out."""
+        counts = [count] * len(self.blocks) if isinstance(count, int) else count
+        blocks = [block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)]
+        return msgspec.structs.replace(self, blocks=blocks)
+
+    def restricted(self, lights: Sequence[int]) -> JointProblem:
+        """The blocks of numbers `lights` alone."""
+        return msgspec.structs.replace(self, blocks=[self.blocks[k] for k in lights])
+
+    def without_shadows(self) -> JointProblem:
+        """As if nothing hid anything."""
+        return msgspec.structs.replace(self, blocks=[block.without_shadows() for block in self.blocks])
+
+    def with_none_held_out(self) -> JointProblem:
+        """All observations are fitted."""
+        return msgspec.structs.replace(self, blocks=[block.with_none_held_out() for block in self.blocks])
+
+    def with_loss(self, loss: Loss) -> JointProblem:
+        """The same observations, another loss."""
+        return msgspec.structs.replace(self, loss=loss)

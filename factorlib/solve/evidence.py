@@ -1,0 +1,75 @@
+"""Which of two models is believed: the one way to decide, for shadows, specular parts and tone curves.
+
+Both models are brought to (or near) their optimum on what is fitted.  The richer one stays where held-out observations, which
+neither has seen, are explained so much worse without it that a threshold of `factorlib.solve.thresholds` is passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.thresholds import Threshold
+
+
+class Evidence(msgspec.Struct, frozen=True):
+    """Whether the richer model is kept, and the mean held-out loss of the observations in question with and without it;
+    None for what was not tried."""
+
+    kept: bool
+    held_out_loss_with: float | None = None
+    held_out_loss_without: float | None = None
+
+
+class Candidates(NamedTuple):
+    """The best points of two models of one problem."""
+
+    without: Point
+    richer: Point
+
+
+def compare(problem: JointProblem, candidates: Candidates, threshold: Threshold, material: int | None = None) -> Evidence:
+    """Whether held-out observations, by the problem's loss, ask for the richer model.
+
+    material: the observations in question are those of this material; of all where it is None
+    """
+    without, richer = (np.concatenate(problem.held_out_losses(point)) for point in candidates)
+    own = _in_question(problem, material)
+    harmed = mean(without) > (1 + threshold.harm) * mean(richer)
+    decided = decide(mean(without[own]), mean(richer[own]), threshold)
+    return msgspec.structs.replace(decided, kept=decided.kept or harmed)
+
+
+def compare_by_light(problem: JointProblem, without: Sequence[Point], richer: Point, threshold: Threshold) -> list[Evidence]:
+    """As `compare`, for each light by its own observations alone; a light of which none is held out goes without.
+
+    without: points of the model without; the best of them for each light counts
+    """
+    losses = zip(*(problem.held_out_losses(point) for point in (richer, *without)), strict=True)
+    return [decide(min(mean(other) for other in others), mean(richer), threshold) for richer, *others in losses]
+
+
+def decide(without: float, richer: float, threshold: Threshold) -> Evidence:
+    """Of the mean held-out losses of both models.
+
+    >>> decide(without=1.3, richer=1.0, threshold=Threshold(gain=0.25)).kept
+    True
+    """
+    return Evidence(without > (1 + threshold.gain) * richer, richer, without)
+
+
+def mean(losses: Float[np.ndarray, "n"]) -> float:
+    """Of the losses, 0 for none."""
+    return float(losses.mean()) if len(losses) else 0.0
+
+
+def _in_question(problem: JointProblem, material: int | None) -> Bool[np.ndarray, "n"]:
+    held_out = [block.material[block.held_out | problem.none_held_out] for block in problem.blocks]
+    every = np.concatenate(held_out)
+    return every == material if material is not None else np.ones(len(every), bool)

@@ -1,0 +1,113 @@
+"""Which materials have a specular part: those that held-out observations are explained worse without.
+
+A specular part that a Lambertian material does not have would take up errors of normals and lights.  Each material in turn, the
+least specular first, loses its specular part; the rest of the problem is brought near its optimum again, and `compare` decides.
+A material that reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out
+highlights better than the right one, and a dark glossy material would lose all it shows.
+
+Iterations that do harm to what is held out decide nothing: with it out of their sight, a lobe may grow in the part of the light that
+it alone mirrors, and what is lost there says nothing about a specular part.
+
+What is fitted again for a trial are the `LIGHTS` lights that show most of the material, so that a trial costs the same
+however large the set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Int
+
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.bounds import specular_unknowns
+from factorlib.solve.descent import Descent, descend
+from factorlib.solve.evidence import Candidates, Evidence, compare
+from factorlib.solve.iterate import evaluate
+from factorlib.solve.thresholds import NEEDED_EARLY, SPECULAR
+
+FIRST, ITERATIONS = 3, 6  # iterations of a trial, and how many more where the first ones leave it open
+LIGHTS = 8
+
+
+class Specular(msgspec.Struct, frozen=True):
+    """A point without needless specular parts, which materials are Lambertian, and the evidence for every material."""
+
+    point: Point
+    lambertian: Bool[np.ndarray, "m"]
+    evidence: list[Evidence]
+
+
+class Trials:
+    """Fits of a problem near their optimum, all from the lights of one point.
+
+    problem: its loss judges;  robust: the loss that is lowered
+    """
+
+    def __init__(self, problem: JointProblem, start: Point, robust: Loss):
+        self.problem, self.start = problem, start
+        self.fitting = problem.with_loss(robust)
+        count = len(start.materials)
+        self.observations = np.array([np.bincount(block.material, minlength=count) for block in problem.blocks])
+
+    def near_optimum(
+        self, lights: Sequence[int], materials: Materials, lambertian: Bool[np.ndarray, "m"], most: float = np.inf
+    ) -> Point:
+        """Materials and the `lights` some iterations on, or as they are where those did harm to what is held out.
+
+        most: only the `FIRST` iterations where the held-out loss then exceeds it
+        """
+        own, judge, fixed = self.fitting.restricted(lights), self.problem.restricted(lights), specular_unknowns(lambertian)
+        before = evaluate(own, Point(materials, self.start.restricted(lights).lights))
+        after = descend(own, before, Descent(FIRST), fixed=fixed)
+        if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):
+            after = descend(own, after, Descent(ITERATIONS), fixed=fixed)
+        harmless = (1 + SPECULAR.harm) * judge.held_out_loss(before.point)
+        return after.point if judge.held_out_loss(after.point) <= harmless else before.point
+
+    def lights_of(self, m: int) -> Int[np.ndarray, "k"]:
+        """The lights that show most of material m."""
+        count = self.observations[:, m]
+        most = np.sort(np.argsort(-count, kind="stable")[:LIGHTS])
+        return most[count[most] > 0]
+
+    def shows_held_out(self, lights: Sequence[int], m: int) -> bool:
+        """Whether any observation of material m in the lights is held out."""
+        blocks = [self.problem.blocks[k] for k in lights]
+        return any((block.held_out & (block.material == m)).any() for block in blocks)
+
+
+def without_needless_specular(
+    problem: JointProblem, start: Point, robust: Loss, decided: Bool[np.ndarray, "m"], lambertian: Bool[np.ndarray, "m"]
+) -> Specular:
+    """The point with needless specular parts gone, which materials have none, and the evidence for every material.
+
+    start: nearly at an optimum, so that iterations change the held-out loss less than what is decided;  robust: the loss to lower;
+    decided: materials that are not tried;  lambertian: those of them that have no specular part
+    """
+    trials, lambertian = Trials(problem, start, robust), lambertian.copy()
+    every, numbers = np.arange(len(problem.blocks)), np.arange(len(lambertian))
+    base = start.materials  # all go on from here by as many iterations
+    chosen, evidence = trials.near_optimum(every, base, lambertian), undecided(lambertian)
+    for m in np.argsort(base.specular.mean(1), kind="stable"):
+        lights = trials.lights_of(m)
+        if decided[m] or not trials.shows_held_out(lights, m) or base.specular[m].mean() > base.diffuse[m].mean():
+            continue
+        judge, richer, without = problem.restricted(lights), chosen.restricted(lights), base.lambertian(m)
+        most = NEEDED_EARLY * judge.held_out_loss(richer)
+        trial = trials.near_optimum(lights, without, lambertian | (numbers == m), most)
+        evidence[m] = compare(judge, Candidates(trial, richer), SPECULAR, int(m))
+        if evidence[m].kept:
+            continue
+        base, lambertian[m] = without, True
+        chosen = trial if len(lights) == len(every) else trials.near_optimum(every, base, lambertian)
+    return Specular(chosen, lambertian, evidence)
+
+
+def undecided(lambertian: Bool[np.ndarray, "m"]) -> list[Evidence]:
+    """The evidence where there is none: what was decided before."""
+    return [Evidence(not one) for one in lambertian.tolist()]
