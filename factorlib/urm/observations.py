@@ -26,7 +26,6 @@ from factorlib.reading import reading
 from factorlib.wholefile import writing
 
 VECTORS = ("normal", "view", "radiance", "clipped")
-UNIT_ERROR = 1e-3  # of the length of a direction
 WHAT, CURE = "a reflectance map", "run the stage `urm` again"
 VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
@@ -108,15 +107,7 @@ def read_observations(path: str | Path) -> Observations:
 
 
 def _check(observations: Observations) -> None:
-    """Raise ValueError where a number cannot be meant: no solve survives a single NaN."""
-    for name in ("normal", "view", "radiance", "weight"):
-        if not np.isfinite(getattr(observations, name)).all():
-            raise ValueError(f"column {name!r} holds what is not finite")
-    for name in ("normal", "view"):
-        if (np.abs(np.linalg.norm(getattr(observations, name), axis=1) - 1) > UNIT_ERROR).any():
-            raise ValueError(f"column {name!r} holds what is no direction")
-    if (observations.weight < 0).any():
-        raise ValueError("column 'weight' holds negative weights")
+    """Raise ValueError for a number that names nothing; what is not finite, or weighs nothing, the solve leaves out and counts."""
     for name, known in (("material", observations.materials), ("photo", observations.photos), ("illumination", observations.illuminations)):
         index = getattr(observations, name)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
