@@ -170,7 +170,7 @@ def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> 
     errors = {name: normal_error(photo, state.pose(photo.given)) for name, state in (("before", result.before), ("after", result.after))}
     errors["mesh"] = normal_error(photo, photo.truth)
     verdict = result.settled
-    each = {name: [round(c.gain, 3), round(c.gain_stderr, 3), round(c.score, 4), round(normal_error(photo, c.state.pose(photo.given)), 2)]
+    each = {name: [*np.round(c.gain(verdict.candidates["found"]), 3).tolist(), round(c.score, 4), round(normal_error(photo, c.state.pose(photo.given)), 2)]
             for name, c in verdict.candidates.items()} if verdict else {}
     return {"kind": kind, "seed": seed, "shape": photo.shape, **errors, "chosen": verdict and verdict.chosen,
             "ruled_out": verdict and verdict.ruled_out, "seconds": seconds, "candidates": each}  # fmt: skip

@@ -98,9 +98,9 @@ def decided(own: PosedObject, result: Refined, camera: Camera) -> dict:
         "rotation_deg": angle_between(result.after.rotation, result.before.rotation),
         "normals_deg": normal_difference(own.caster, target, camera, result.before, result.after),
     }
-    candidates = {
-        name: {"held_out_loss": c.held_out_loss, "gain": c.gain, "gain_stderr": c.gain_stderr, "score": c.score}
-        for name, c in verdict.candidates.items()
-    }
+    candidates = {}
+    for name, c in verdict.candidates.items():
+        gain, stderr = c.gain(verdict.candidates["found"])
+        candidates[name] = {"held_out_loss": c.held_out_loss, "gain": gain, "gain_stderr": stderr, "score": c.score}
     evidence = {"chosen": verdict.chosen, "runner_up_ruled_out": verdict.ruled_out, "moved": moved, "candidates": candidates}
     return entry | {"refined": evidence}

@@ -1,7 +1,8 @@
 """Fixing what the data cannot: one factor per channel and connected component, between reflectances and lights.
 
-Tint   The paper's prior settles it: lights as near to grey as they can be.  With a_ic the summed lobe energies of
-       light i over their mean of channels, the factors s_c minimise Σ_i Σ_c (s_c a_ic − 1)², so s_c = Σ_i a_ic / Σ_i a_ic².
+Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
+       light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
+       lights of E_ic, each light counting alike.  In logarithms the rule does not depend on the gauge it starts from.
        The paper sums weights.  But those are peaks: of one light, sums of two fits differ as one of its lobes is fitted by
        several sharper ones, while energies add up to what the light sends.
 Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
@@ -23,8 +24,9 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 
 BRIGHTEST = 0.9
+LEAST_ENERGY = 1e-3  # of a light's brightest channel: a light without any blue has no say in how blue the others are
 RULE = (
-    "per connected component: channel factors make the lights' summed lobe energies nearest to grey (after the prior of Wang et al.); "
+    "per connected component: channel factors make the geometric means over lights of their summed lobe energies grey (after the prior of Wang et al.); "
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
 
@@ -49,5 +51,5 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
 
 def _greying(lights: Sequence[Light]) -> Float[np.ndarray, "3"]:
     sums = np.array([light.energy.sum(0) for light in lights])
-    share = sums / np.maximum(sums.mean(1, keepdims=True), 1e-30)
-    return np.clip(share.sum(0) / np.maximum((share**2).sum(0), 1e-30), 1e-3, 1e3)
+    level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
+    return np.exp((level.mean(1, keepdims=True) - level).mean(0))

@@ -24,6 +24,7 @@ from factorlib.refine.light import pursued_light, robust_scale, together, with_w
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 SURE = 2.0
+ROUNDS = 6  # of pursuit: with 3, in glossy materials what is left over depends on which lobes were found first
 LEAST_SHOWN = 100  # pixels, of each kind
 
 
@@ -37,16 +38,23 @@ class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Judged(msgspec.Struct, frozen=True):
-    """A candidate (found, moved or runner_up): its state, its labelled IoU, its mean held-out loss over the pixels that all
-    candidates show, and by what share that is less than the found pose's, with the standard error.
+    """A candidate.
+
+    name:           found, moved or runner_up
+    score:          its labelled IoU
+    held_out_loss:  mean over the held-out pixels that all candidates show
+    of_cells:       that loss summed over the pixels of each cell, the cells in one order for all candidates
     """
 
     name: str
     state: State
     score: float
     held_out_loss: float
-    gain: float
-    gain_stderr: float
+    of_cells: Float[np.ndarray, "k"]
+
+    def gain(self, over: Judged) -> tuple[float, float]:
+        """By what share of the loss of `over` this one's is less, and the standard error of that share."""
+        return gain_of(over.of_cells, self.of_cells)
 
 
 class Settled(msgspec.Struct, frozen=True):
@@ -72,10 +80,10 @@ def settled(moving: Moving, found: State, runner_up: State | None, cell: Int[np.
 def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
     """Of `judged` candidates; the first is the pose found."""
     best = found = verdicts[0]
-    for one in sorted(verdicts[1:], key=lambda one: one.gain):
+    for one in sorted(verdicts[1:], key=lambda one: one.held_out_loss, reverse=True):
         best = one if is_better(one, found, standards) else best
     named = {one.name: one for one in verdicts}
-    other, own = named.get("runner_up"), max((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.gain)
+    other, own = named.get("runner_up"), min((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.held_out_loss)
     ruled_out = None if other is None or best is other else is_better(own, other, standards)
     return Settled(best.name, named, ruled_out)
 
@@ -101,36 +109,35 @@ def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, "n"])
         return []
     surfaces, residual = moving.surfaces, {}
     fitted = {name: block.take(agrees & ~held_out) for name, (block, agrees) in seen.items()}
-    lobes = together([pursued_light(block, surfaces) for block in fitted.values()])
+    lobes = together([pursued_light(block, surfaces, ROUNDS) for block in fitted.values()])
     for name, (block, _) in seen.items():
         light = with_weights(surfaces.under(lobes, fitted[name]))
         residual[name] = surfaces.under(light, block.take(common & held_out)).residuals()
     loss = Loss(min(robust_scale(r) for r in residual.values()))
     losses = {name: loss.of_residuals(r).mean(1) for name, r in residual.items()}
-    first, of_cell = next(iter(losses.values())), cell[common & held_out]
+    number = np.unique(cell[common & held_out], return_inverse=True)[1].reshape(-1)
     return [
-        Judged(name, state, moving.score(state), float(losses[name].mean()), *gain_of(first, losses[name], of_cell))
+        Judged(name, state, moving.score(state), float(losses[name].mean()), np.bincount(number, weights=losses[name]))
         for name, state in states.items()
     ]
 
 
-def gain_of(before: Float[np.ndarray, "n"], after: Float[np.ndarray, "n"], cell: Int[np.ndarray, "n"]) -> tuple[float, float]:
-    """1 − after/before of the summed losses, and its standard error, the cells' sums being independent.
+def gain_of(before: Float[np.ndarray, "k"], after: Float[np.ndarray, "k"]) -> tuple[float, float]:
+    """1 − Σ after / Σ before of the cells' losses, and its standard error by the scatter of the cells' differences.
 
-    >>> gain_of(np.array([2.0, 2.0]), np.array([1.0, 1.0]), np.array([0, 1]))
+    Which of two candidates comes first changes the difference's sign and nothing else.
+
+    >>> gain_of(np.array([2.0, 2.0]), np.array([1.0, 1.0]))
     (0.5, 0.0)
     """
-    total = max(float(before.sum()), 1e-300)
-    share = float((before - after).sum()) / total
-    names = np.unique(cell, return_inverse=True)[1].reshape(-1)
-    scatter = np.bincount(names, weights=(before - after) - share * before) if len(cell) else np.zeros(0)
-    return share, float(np.sqrt(np.sum(scatter**2)) / total)
+    total, count, difference = max(float(before.sum()), 1e-300), len(before), before - after
+    scatter = float(np.sum((difference - difference.mean()) ** 2)) * count / (count - 1) if count > 1 else np.inf
+    return float(difference.sum()) / total, float(np.sqrt(scatter)) / total
 
 
 def is_better(one: Judged, than: Judged, standards: Standards) -> bool:
     """Whether shading settles for `one`."""
-    gain, more = one.gain - than.gain, one.score - than.score
-    stderr = float(np.hypot(one.gain_stderr, than.gain_stderr))
+    (gain, stderr), more = one.gain(than), one.score - than.score
     lost = standards.rival if "runner_up" in (one.name, than.name) else standards.most_lost
     agreed = more > standards.most_lost or gain > SURE * stderr
     return gain > standards.least_gain and agreed and more >= -lost

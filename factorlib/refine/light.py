@@ -22,7 +22,7 @@ from factorlib.solve.insertion import lobes_inserted, pruned
 from factorlib.solve.start import starting_light
 from factorlib.solve.weights import nonnegative_minimum
 
-ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each
+ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves
 REWEIGHTED = 3  # times, for outliers
 RIDGE = 1e-4  # of the squared response of each lobe
 
@@ -38,11 +38,11 @@ class Surfaces(msgspec.Struct, frozen=True):
         return Illumination(block, light, self.materials, self.operator)
 
 
-def pursued_light(block: Block, surfaces: Surfaces) -> Light:
+def pursued_light(block: Block, surfaces: Surfaces, rounds: int = ROUNDS) -> Light:
     """Explains what of the block is not held out."""
     block = block.take(~block.held_out)
     light = starting_light(block, surfaces.materials)
-    for number in range(ROUNDS):
+    for number in range(rounds):
         light = lobes_inserted(surfaces.under(light, block), INSERTED, number)
         light = pruned(with_weights(surfaces.under(light, block)))
     return light

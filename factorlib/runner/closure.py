@@ -28,6 +28,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.defaults import Names, defaults_of, names_of
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.leftover import left_over
 
@@ -38,13 +39,13 @@ class Source(msgspec.Struct, frozen=True):
     """What one module's text says.
 
     digest:  of its syntax tree;  imports: dotted names as imported
-    params:  fields of its class Params, if it has one, and their defaults as they are written
+    names:   its classes and where its names come from
     environment, programs: what it declares its numbers to depend on
     """
 
     digest: str
     imports: list[str]
-    params: dict[str, str] | None
+    names: Names
     environment: list[str]
     programs: dict[str, str]
 
@@ -88,11 +89,11 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
     """Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
     imports = sorted({name for node in ast.walk(tree) for name in _imported(node, module, is_package)})
-    params = _params_of(tree)
+    names = names_of(tree)
     environment, programs = _declared(tree, "ENVIRONMENT", list[str], []), _declared(tree, "PROGRAMS", dict[str, str], {})
     for node in ast.walk(tree):
         _drop_docstring(node)
-    return Source(hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32], imports, params, environment, programs)
+    return Source(hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32], imports, names, environment, programs)
 
 
 def _declared(tree: ast.Module, name: str, type_: Any, default: Any) -> Any:
@@ -120,14 +121,6 @@ def _imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
     return []
 
 
-def _params_of(tree: ast.Module) -> dict[str, str] | None:
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef) and node.name == "Params":
-            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
-            return {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
-    return None
-
-
 def _drop_docstring(node: ast.AST) -> None:
     if (
         isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
@@ -144,8 +137,13 @@ class Sources:
         self._found: dict[str, Path | None] = {}
 
     def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, str]:
-        """A stage's parameters and their defaults as they are written, read without importing it."""
-        return self._source(f"{package}.{stage}", self._stage_file(package, stage, pipeline_file)).params or {}
+        """A stage's parameters and their defaults as text, read without importing it."""
+        self._stage_file(package, stage, pipeline_file)
+        return defaults_of(f"{package}.{stage}", "Params", self._names)
+
+    def _names(self, module: str) -> Names | None:
+        file = self.find(module)
+        return self._source(module, file).names if file else None
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
         first = f"{package}.{stage}"
@@ -212,7 +210,7 @@ class Sources:
 
     def _source(self, name: str, file: Path) -> Source:
         if file.is_dir():
-            return Source("", [], None, [], {})
+            return Source("", [], Names({}, {}, {}), [], {})
         return self.hashes.source(file, lambda: self._parse(name, file))
 
     @staticmethod

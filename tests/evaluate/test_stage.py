@@ -72,7 +72,7 @@ def test_true_normals_in_the_photos_own_pixels_are_averaged_as_the_photo_was(tmp
     inputs = make_artifacts(Made(tmp_path / "in", seen=LINKED))
     facts = read_json(inputs["masks"] / "photos.json")
     for photo in LINKED:
-        facts[photo] |= {"factor": 3}
+        facts[photo] |= {"factor": 3, "original_size": [3 * n for n in facts[photo]["original_size"]]}
         file = inputs.file(f"truth/{photo}_normal.exr")
         write_exr(file, {name: np.repeat(np.repeat(pixels, 3, 0), 3, 1) for name, pixels in read_exr(file).items()})
     write_json(inputs["masks"] / "photos.json", facts)

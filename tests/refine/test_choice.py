@@ -13,7 +13,8 @@ STANDARDS = Standards(least_gain=0.03, most_lost=0.01, rival=0.05)
 
 
 def one(name, gain, stderr=0.001, score=0.95):
-    return Judged(name, STATE, score, 1 - gain, gain, stderr)
+    """In two cells, of which the pose found has a loss of a half in each: the gain over it, and its standard error."""
+    return Judged(name, STATE, score, 1 - gain, (1 - gain) / 2 + np.array([1, -1]) * stderr / 2)
 
 
 FOUND = one("found", 0.0, 0.0)
@@ -48,9 +49,20 @@ def test_the_order_of_candidates_is_no_matter():
 
 def test_a_gain_is_as_sure_as_its_cells_agree():
     rng = np.random.default_rng(0)
-    before, cell = rng.uniform(1, 2, 400), np.repeat(np.arange(20), 20)
-    assert gain_of(before, 0.7 * before, cell) == pytest.approx((0.3, 0.0), abs=1e-12)
-    of_cell = rng.uniform(0.2, 1.2, 20)  # pixels of a cell agree, cells do not: as unsure as 20 pixels are
-    share, stderr = gain_of(np.ones(400), of_cell[cell], cell)
-    assert share == pytest.approx(1 - of_cell.mean()) and stderr == pytest.approx(of_cell.std() / np.sqrt(20))
-    assert gain_of(before, before * of_cell[cell], cell)[1] > 2 * gain_of(before, before * of_cell[cell], np.arange(400))[1]
+    before = np.full(20, 20.0)
+    assert gain_of(before, 0.7 * before) == pytest.approx((0.3, 0.0), abs=1e-12)
+    after = 20 * rng.uniform(0.2, 1.2, 20)
+    assert gain_of(before, after) == pytest.approx((1 - after.mean() / 20, after.std(ddof=1) / np.sqrt(20) / 20))
+
+
+def test_one_cell_settles_nothing():
+    before, after = np.ones(20), np.ones(20)
+    before[3] = 50.0
+    gain, stderr = gain_of(before, after)
+    assert gain > 0.5 and gain < 2 * stderr
+
+
+def test_both_directions_are_equally_sure():
+    a, b = np.random.default_rng(1).uniform(0, 1, (2, 30))
+    (one, one_stderr), (other, other_stderr) = gain_of(a, b), gain_of(b, a)
+    assert one / one_stderr == pytest.approx(-other / other_stderr)

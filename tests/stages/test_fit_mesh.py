@@ -34,7 +34,7 @@ def made(tmp_path, given, source="found"):
         label = rasterise(caster, camera, pose).label.astype(float)
         zero = np.zeros(label.shape)
         write_exr(masks / f"{photo}.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
-        write_json(masks / f"{photo}.json", {"width": camera.width, "height": camera.height, "focal_px": camera.focal, "focal_source": "dataset"})
+        write_json(masks / f"{photo}.json", {"width": camera.width, "height": camera.height, "focal_px": camera.focal, "focal_source": "dataset", "factor": 1, "original_size": [camera.width, camera.height]})
         thing = {
             "rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "source": source, "silhouette_iou": 0.9,
             "runner_up": None, "left_out": False,

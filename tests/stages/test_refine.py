@@ -40,7 +40,7 @@ def inputs_of(tmp_path, photo, **entry):
         folder.mkdir()
     zero = np.zeros(photo.channels["label"].shape)
     write_exr(masks / "a.exr", {**photo.channels, "left_out": zero, "object": zero})
-    facts = {"width": zero.shape[1], "height": zero.shape[0], "focal_px": photo.camera.focal, "focal_source": "dataset"}
+    facts = {"width": zero.shape[1], "height": zero.shape[0], "factor": 1, "original_size": list(zero.shape[::-1]), "focal_px": photo.camera.focal, "focal_source": "dataset"}
     write_json(masks / "a.json", facts)
     camera = {"focal_px": photo.camera.focal, "focal_source": "dataset", "focal_relative_stderr": 0.0, "principal_point": list(photo.camera.centre)}
     thing = {**pose_entry(photo.pose), "source": "found", "runner_up": None, "left_out": False, "silhouette_iou": 0.0} | entry

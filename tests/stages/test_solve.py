@@ -186,7 +186,7 @@ def test_the_papers_solver_takes_no_start(tmp_path, linked):
         ("materials.json", "{", "(", "not readable as JSON"),
         ("exposures.json", "1.0", "0.0", "not a positive number"),
         ("exposures.json", "1.0", '"one"', "Expected `float`"),
-        ("lobes.parquet", None, None, "not a table of lobes"),
+        ("lobes.parquet", None, None, "not readable as a table of lobes"),
     ],
 )
 def test_a_start_that_is_none_says_which_file_and_what_to_do(tmp_path, a_result, linked, file, old, new, words):
