@@ -16,7 +16,6 @@ from collections.abc import Callable
 import msgspec
 
 
-
 class Class(msgspec.Struct, frozen=True):
     """bases: as they are written;  fields: annotated names, with the expressions of their defaults"""
 
