@@ -18,11 +18,12 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
-from factorlib.solve.insertion import lobes_inserted, pruned
+from factorlib.solve.insertion import candidates, lobes_inserted, pruned
 from factorlib.solve.start import starting_light
 from factorlib.solve.weights import nonnegative_minimum
 
 ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves
+SAMPLE = 1400  # observations that vote about lobes, the same in every round
 REWEIGHTED = 3  # times, for outliers
 RIDGE = 1e-4  # of the squared response of each lobe
 
@@ -42,8 +43,9 @@ def pursued_light(block: Block, surfaces: Surfaces, rounds: int = ROUNDS) -> Lig
     """Explains what of the block is not held out."""
     block = block.take(~block.held_out)
     light = starting_light(block, surfaces.materials)
-    for number in range(rounds):
-        light = lobes_inserted(surfaces.under(light, block), INSERTED, number)
+    lobes = candidates(surfaces.under(light, block), 0, SAMPLE)
+    for _ in range(rounds):
+        light = lobes_inserted(surfaces.under(light, block), INSERTED, lobes)
         light = pruned(with_weights(surfaces.under(light, block)))
     return light
 

@@ -34,20 +34,32 @@ def dictionary(sharpest: float = np.inf) -> UnitLobes:
     return UnitLobes(axis[resolved], sharpness[resolved])
 
 
-def lobes_inserted(illumination: Illumination, count: int, seed: int) -> Light:
+class Candidates(msgspec.Struct, frozen=True):
+    """The dictionary's lobes, and their whitened responses at the rows of observations that vote; of use as long as materials stay."""
+
+    rows: Int[np.ndarray, "n"]
+    lobes: UnitLobes
+    atoms: Float[np.ndarray, "3 n j"]
+
+
+def candidates(illumination: Illumination, seed: int, sample: int = SAMPLE) -> Candidates:
+    """At `sample` of the observations, or all of fewer, drawn by `seed`."""
+    rows, lobes = _sampled_rows(illumination.block, seed, sample), dictionary(illumination.materials.sharpest)
+    return Candidates(rows, lobes, illumination.atoms(rows, lobes))
+
+
+def lobes_inserted(illumination: Illumination, count: int, candidates: Candidates) -> Light:
     """The light with up to `count` further lobes that explain what it leaves unexplained."""
-    rows = _sampled_rows(illumination.block, seed)
-    residual = -illumination.residuals()[rows]
-    lobes = dictionary(illumination.materials.sharpest)
-    chosen, weights = _pursuit(illumination.atoms(rows, lobes), residual, lobes, count)
+    residual, lobes = -illumination.residuals()[candidates.rows], candidates.lobes
+    chosen, weights = _pursuit(candidates.atoms, residual, lobes, count)
     return illumination.light.joined(UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3))
 
 
-def _sampled_rows(block: Block, seed: int) -> Int[np.ndarray, "n"]:
+def _sampled_rows(block: Block, seed: int, sample: int) -> Int[np.ndarray, "n"]:
     fit = np.flatnonzero(~block.held_out)
-    if len(fit) <= SAMPLE:
+    if len(fit) <= sample:
         return fit
-    return np.sort(np.random.default_rng(seed).choice(fit, SAMPLE, replace=False))
+    return np.sort(np.random.default_rng(seed).choice(fit, sample, replace=False))
 
 
 def _pursuit(

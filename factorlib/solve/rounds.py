@@ -25,7 +25,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.descent import Descent, descend
 from factorlib.solve.history import Event, Recorder, Run
-from factorlib.solve.insertion import blurred, lobes_inserted, pruned
+from factorlib.solve.insertion import blurred, candidates, lobes_inserted, pruned
 from factorlib.solve.iterate import Iterate, evaluate, fit_weights
 from factorlib.solve.options import Bundle
 from factorlib.solve.roughness import materials_out_of_valleys
@@ -185,7 +185,7 @@ def with_new_lobes(problem: JointProblem, point: Point, bundle: Bundle, number: 
 def _grown(one: tuple[Illumination, int], bundle: Bundle) -> Light:
     illumination, seed = one
     count = min(bundle.insert, bundle.lobes - len(illumination.light))
-    return lobes_inserted(illumination, count, seed) if count > 0 else illumination.light
+    return lobes_inserted(illumination, count, candidates(illumination, seed)) if count > 0 else illumination.light
 
 
 def _out_of_valleys(problem: JointProblem, current: Iterate) -> Iterate:

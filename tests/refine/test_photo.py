@@ -35,7 +35,7 @@ def test_a_right_pose_stays_as_it_is():
     assert result.settled.chosen == "found" and np.array_equal(result.after.rotation, result.before.rotation)
 
 
-@pytest.mark.parametrize("wrong_first", [True, False])
+@pytest.mark.parametrize("wrong_first", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_shading_tells_front_from_back_where_outlines_are_one(wrong_first):
     photo = photo_of("front/back", 0)
     first, second = (photo.pose, photo.runner_up) if wrong_first else (photo.runner_up, photo.pose)

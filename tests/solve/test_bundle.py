@@ -17,7 +17,7 @@ from factorlib.solve.rounds import answer_of, from_nothing
 from factorlib.stage import serial_map
 from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
-OPERATOR = reflection_operator("closed_form", dtype="float64")
+OPERATOR = reflection_operator("network")
 QUICK = Bundle(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)
 
 

@@ -11,6 +11,7 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.network import SHIPPED
 from factorlib.solve.earlier import FILES
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
@@ -21,7 +22,7 @@ NAMES = ("red", "green", "blue")
 
 
 def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0) -> Observations:
-    """A sphere of each material of `shown` under a light of two lobes, as `closed_form` renders it."""
+    """A sphere of each material of `shown` under a light of two lobes, as `network` renders it."""
     normals = sphere_normals(size)
     n = len(normals) * len(shown)
     empty = Observations(
@@ -32,7 +33,7 @@ def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0
     )  # fmt: skip
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
-    radiance = Illumination(block, light, MATERIALS, reflection_operator("closed_form")).radiance()
+    radiance = Illumination(block, light, MATERIALS, reflection_operator("network")).radiance()
     return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
 
 
@@ -42,9 +43,9 @@ def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None,
     for name, part in seen.items():
         write_observations(urm / f"{name}.parquet", part)
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in seen}
-    folders = {"urm": urm, "train": folder} | ({"start": start} if start else {})
+    folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
     inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
-    quick = {"operator": "closed_form", "lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
+    quick = {"lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
     solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
     return out
 
@@ -124,7 +125,7 @@ def test_nothing_to_see_is_an_error_that_says_where_to_look(tmp_path, linked):
 
 
 def test_the_papers_solver_writes_the_same_artifacts(tmp_path, linked):
-    out = run(tmp_path, linked, solver="paper", paper_lobes=3, paper_samplings=1.0)
+    out = run(tmp_path, linked, solver="paper", operator="network", paper_lobes=3, paper_samplings=1.0)
     found = read_json(out / "materials.json")
     assert found["model"]["solver"] == "paper"
     assert found["model"]["lobes"] == {"a": 3, "b": 3}
