@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph validate verify clean gc setup test test-long data help $(STAGES)
+.PHONY: all plan why status graph params validate verify clean gc setup lock test test-long data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph validate verify clean gc $(STAGES): .venv/ready
+all plan why status graph params validate verify clean gc $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 setup: .venv/ready
@@ -22,6 +22,9 @@ setup: .venv/ready
 	@for python in $${PYTHON:+"$$PYTHON"} python3.11 python3.12 python3; do \
 	  "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && exec "$$python" -I factorlib/setup.py; \
 	done; echo "set-up: no Python 3.11 or 3.12 was found; install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1
+
+lock: .venv/ready
+	@$(PY) -m factorlib.lock
 
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache
@@ -46,6 +49,7 @@ help:
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'
+	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=…]               forget the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'
@@ -56,6 +60,7 @@ help:
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make data                            make data/ again'
+	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 
 .DEFAULT:

@@ -14,7 +14,7 @@ import typer
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
 
@@ -38,8 +38,17 @@ Stages = Annotated[list[str] | None, typer.Argument(help="stages; all without it
 
 
 def project() -> Project:
-    """The checkout this package lies in, or the one that FACTORLIB_ROOT names."""
-    return Project(Path(os.environ.get("FACTORLIB_ROOT", LIBRARY)).resolve(), photo_sets())
+    """The checkout that FACTORLIB_ROOT names, or this package lies in, or, where it is installed, the current folder lies in."""
+    return Project(Path(os.environ.get("FACTORLIB_ROOT") or _checkout()).resolve(), photo_sets())
+
+
+def _checkout() -> Path:
+    here = Path.cwd()
+    for folder in (LIBRARY, here, *here.parents):
+        if (folder / PIPELINE).is_file():
+            return folder
+    cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<a folder with {PIPELINE}, stages and data>"
+    raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
 
 
 # ── what the environment says where the command line does not: make passes it on so, untouched by any shell ──────────
@@ -109,6 +118,12 @@ def graph(mermaid: Annotated[bool, typer.Option("--mermaid", help="as a Mermaid 
 
 
 @app.command()
+def params(stages: Stages = None) -> None:
+    """Every parameter of stages with its default, its range and its meaning (make params STAGE=…)."""
+    raise typer.Exit(verbs.show_params(project(), stages or os.environ.get("STAGE", "").split() or None))
+
+
+@app.command()
 def validate(dataset: Dataset = None, settings: Settings = None) -> None:
     """Check pipeline.yaml, settings and dataset without running anything."""
     raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings)))
@@ -143,7 +158,7 @@ def main() -> None:
     sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
         with heed_stops():
-            app(prog_name="python -m factorlib")
+            app(prog_name="factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
     except InputError as error:
         sys.exit(f"error: {error}")
     except OSError as error:

@@ -37,10 +37,13 @@ CURE_OF_TOLD = "look at its overlay; does the source show this photo, and is the
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
-    crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG  # sharper edges of a mesh stay sharp
-    strict: bool = False  # stop at a doubtful pose
-    keep_doubtful: bool = False  # let an object whose pose was found, and is doubtful, into the solve all the same
-    limits: Limits = Limits()  # how large a mesh may be
+    crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
+    """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
+    strict: bool = False
+    """Whether a doubtful pose stops the run."""
+    keep_doubtful: bool = False
+    """Whether an object whose pose was found, and is doubtful, takes part in the solve."""
+    limits: Limits = Limits()
     search: Search = Search()
 
 

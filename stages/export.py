@@ -34,11 +34,14 @@ Rows = Annotated[int, msgspec.Meta(ge=8, le=4096)]
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """height: of the exported maps, twice as wide;  mitsuba_height: of the copies in the scenes;  crease_deg: as in align."""
+    """Sizes of what is written, and how meshes are read."""
 
     height: Rows = 128
+    """Rows of the exported environment maps, which are twice as wide."""
     mitsuba_height: Rows = 256
+    """Rows of the environment maps in the Mitsuba scenes."""
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
+    """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

@@ -33,10 +33,12 @@ MARGIN = 0.15  # of the mask's extent, seen around it
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
-    """resolution: pixels of a mask's longer side;  least_iou: of mask and mesh, for a pose to be fitted from."""
+    """When factors of a mesh's axes are used, and what they are fitted to."""
 
     resolution: Annotated[int, msgspec.Meta(ge=50, le=2000)] = 200
+    """Pixels of a mask's longer side, to which it is scaled."""
     least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.6
+    """Least overlap of mesh and mask at a pose that factors are fitted from."""
 
 
 class Found(msgspec.Struct, frozen=True):

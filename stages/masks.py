@@ -23,15 +23,14 @@ log = logging.getLogger("factorlib.masks")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A photo that has more pixels than these is averaged down by the least whole factor that makes it fit.
-
-    pixels: that show a material;  frame: of the whole photo, whatever they show;  most_megapixels: of a photo's file, by its
-    header: a larger one is refused before it is read.
-    """
+    """A photo that has more pixels than these is averaged down by the least whole factor that makes it fit."""
 
     pixels: Annotated[int, msgspec.Meta(ge=100)] = 1_000_000
+    """Most pixels that show a material."""
     frame: Annotated[int, msgspec.Meta(ge=100)] = 4_000_000
+    """Most pixels of the whole photo, whatever they show."""
     most_megapixels: Annotated[float, msgspec.Meta(gt=0)] = MOST_MEGAPIXELS
+    """Most megapixels of a photo's file, by its header; a larger one is refused before it is read."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:

@@ -35,11 +35,14 @@ log = logging.getLogger("factorlib.refine")
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
-    """pixels: of a photo that are compared;  directions: of the sphere in which objects shadow, where the solve had shadows."""
+    """When a pose is replaced, and what is compared."""
 
     pixels: Annotated[int, msgspec.Meta(ge=500)] = 2400
+    """Pixels of a photo that are compared."""
     directions: Annotated[int, msgspec.Meta(ge=32, le=4096)] = 256
+    """Directions of the sphere in which objects cast shadows on each other, where the solve had shadows."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Seed of the choice of pixels."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

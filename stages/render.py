@@ -33,12 +33,16 @@ RING = (255, 255, 255)
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """tail: share of a pixel's radiance, of its faintest highlights, that is left to the closed form (0: none)."""
+    """How pictures are computed, and their sizes."""
 
     operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
+    """How a lobe's reflection is computed."""
     tail: Annotated[float, msgspec.Meta(ge=0, le=0.1)] = TAIL
+    """Share of a pixel's radiance, of its faintest highlights, that the closed form gives; 0 for none."""
     ball_size: Size = 128
+    """Pixels of a ball's side."""
     map_size: Size = 64
+    """Pixels of the side of a reflectance map."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

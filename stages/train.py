@@ -25,25 +25,34 @@ HELD_OUT_TOLERANCE = 1e-5  # of the reference; a tenth of the median error that 
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """samples: of the reference, to fit, half as many more at grazing views;  held_out: others, to measure;
-    tolerance: of the reference on `samples`.
-
-    steps, batch, rate: of Adam;  width, depth: hidden layers of the specular network;  diffuse_…: of the diffuse one.
-    """
+    """What networks are trained on, how long, and their sizes."""
 
     samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 524_288
+    """Samples of the reference that the specular network is fitted to; half as many more lie at grazing views."""
     held_out: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
+    """Other samples, which the error is measured on."""
     tolerance: Annotated[float, Meta(gt=0, le=0.1)] = 1e-3
+    """Relative tolerance of the reference's quadrature on `samples`."""
     steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 60_000
+    """Steps of Adam, for the specular network."""
     batch: Annotated[int, Meta(ge=64, le=1 << 16)] = 2048
+    """Samples of a step."""
     rate: Annotated[float, Meta(gt=0, le=0.1)] = 6e-3
+    """Largest learning rate of Adam."""
     width: Annotated[int, Meta(ge=4, le=1024)] = 32
+    """Units of a hidden layer of the specular network."""
     depth: Annotated[int, Meta(ge=1, le=16)] = 3
+    """Hidden layers of the specular network."""
     diffuse_samples: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
+    """Samples that the diffuse network is fitted to."""
     diffuse_steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 3000
+    """Steps of Adam, for the diffuse network."""
     diffuse_width: Annotated[int, Meta(ge=4, le=1024)] = 16
+    """Units of a hidden layer of the diffuse network."""
     diffuse_depth: Annotated[int, Meta(ge=1, le=16)] = 2
+    """Hidden layers of the diffuse network."""
     seed: Annotated[int, Meta(ge=0)] = 0
+    """Seed of samples, first weights and batches."""
 
 
 # What training sees beyond what is measured, so that the edges of the domain are not the edges of the training set.

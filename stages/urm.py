@@ -28,16 +28,18 @@ log = logging.getLogger("factorlib.urm")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """most: observations of a photo; of more, a sample is taken, evenly over materials and normals, and weighted;
-    directions: of the sphere whose visibility is cast, 0 for none;  cast_points: observations of a photo that rays are
-    cast from, the others take their neighbours' visibility.
-    """
+    """Which pixels become observations, and what they see of the sphere."""
 
-    merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0  # 0 keeps every pixel
+    merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0
+    """Pixels of one material whose normals and views differ by less, in degrees, become one observation; 0 keeps every pixel."""
     least_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    """Least confidence that `align` gives a pixel for it to be observed."""
     most: Annotated[int, msgspec.Meta(ge=5000)] = 100_000
+    """Most observations of a photo; of more, a sample is taken, evenly over materials and normals, and weighted."""
     directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
+    """Directions of the sphere whose visibility is cast; 0 for none."""
     cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
+    """Observations of a photo that rays are cast from; the others take their neighbours' visibility."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

@@ -17,11 +17,16 @@ DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another
 class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a pose is held to."""
 
-    least_iou: Share = 0.7  # below, the pose is taken to be wrong
-    least_agreement: Share = 0.8  # of material labels, likewise
-    most_contour_error: Share = 0.009  # of the mask's extent, the median over the contours
+    least_iou: Share = 0.7
+    """Overlap (intersection over union) of mesh and mask below which a pose is doubtful."""
+    least_agreement: Share = 0.8
+    """Share of the pixels both cover on which the materials of mesh and mask agree; below, the pose is doubtful."""
+    most_contour_error: Share = 0.009
+    """Median distance of the contours of mesh and mask, as a share of the mask's extent; above, the pose is doubtful."""
     most_normal_stderr_deg: Annotated[float, msgspec.Meta(gt=0)] = 10.0
-    least_lead: Share = 0.1  # of what the runner-up leaves unexplained, the part that the pose found must explain more
+    """Standard error of normals, in degrees, that the mask leaves; above, the pose is doubtful."""
+    least_lead: Share = 0.1
+    """Share of what the runner-up leaves unexplained that the pose found must explain; below, the pose is doubtful."""
 
 
 def doubts(iou: float, agreement: float, trust: Trust, found: Found | None, standards: Standards = Standards()) -> list[str]:

@@ -38,9 +38,12 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When factors are used."""
 
-    least_gain: Share = 0.2  # of what the silhouettes of photos left out leave unexplained
-    least_share: Share = 0.003  # of the mask's pixels, likewise
+    least_gain: Share = 0.2
+    """Share of what silhouettes of photos left out leave unexplained that factors must explain to be used."""
+    least_share: Share = 0.003
+    """Share of the mask's pixels that factors must explain to be used."""
     steps: Annotated[int, msgspec.Meta(ge=1, le=100)] = 15
+    """Gauss-Newton steps of factors and poses together."""
 
 
 class Sighting(msgspec.Struct, frozen=True):

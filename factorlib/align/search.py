@@ -36,15 +36,24 @@ CLEARLY_BETTER = 0.01  # score by which another focal length must win against EX
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How hard to look.  The tuples hold one number per round of refinement, in order; most guesses fall in the first."""
 
-    views: Count = 300  # directions, evenly over the sphere
+    views: Count = 300
+    """Directions of view, evenly over the sphere, that are tried."""
     rolls: Count = 20
-    apart_deg: float = 14.0  # between guesses
-    cut_effort: Count = 2  # times the views and first guesses where frame or occluder cut the mask: it says less
-    keep: tuple[Count, Count, Count, Count] = (32, 14, 7, 3)  # guesses refined
+    """Turns about the line of sight tried for each direction of view."""
+    apart_deg: float = 14.0
+    """Least angle, in degrees, between two guesses."""
+    cut_effort: Count = 2
+    """Factor on views and first guesses where the frame or another object cuts the mask."""
+    keep: tuple[Count, Count, Count, Count] = (32, 14, 7, 3)
+    """Guesses that each round of refinement takes up."""
     steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
-    resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)  # pixels of the mask's longer side
-    margin: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)  # of that side, seen around the mask
-    rivals: Annotated[int, msgspec.Meta(ge=0)] = 2  # guesses dropped on the way, refined to the end to find a runner-up
+    """Gauss-Newton steps of each round."""
+    resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)
+    """Pixels of the mask's longer side in each round."""
+    margin: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)
+    """What is seen around the mask in each round, as a share of its longer side."""
+    rivals: Annotated[int, msgspec.Meta(ge=0)] = 2
+    """Guesses dropped on the way that are refined to the end all the same, to find a runner-up."""
 
 
 class RunnerUp(msgspec.Struct, frozen=True):

@@ -14,8 +14,10 @@ VERTICES_A_TRIANGLE = 3
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is refused before it is read; a mesh of a million triangles takes about 1 GB and 20 s."""
 
-    megabytes: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 500.0  # of a mesh's file, and of the buffers it draws in together
+    megabytes: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 500.0
+    """Largest size of a mesh's file, and of the buffers it refers to together, in megabytes."""
     triangles: Annotated[int, msgspec.Meta(ge=1, le=10**9)] = 5_000_000
+    """Most triangles of a mesh."""
 
     @property
     def bytes(self) -> int:

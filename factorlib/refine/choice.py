@@ -31,10 +31,14 @@ LEAST_SHOWN = 100  # pixels, of each kind
 class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When a pose is replaced."""
 
-    least_gain: Share = 0.03  # of the held-out loss
-    most_lost: Share = 0.01  # of the labelled IoU, by moving
-    rival: Share = 0.05  # of the labelled IoU: a runner-up that lacks no more of it is tried
+    least_gain: Share = 0.03
+    """Share of the held-out loss by which another pose must lower it."""
+    most_lost: Share = 0.01
+    """Overlap of mesh and mask that a pose may lose by moving."""
+    rival: Share = 0.05
+    """A runner-up whose overlap is less by no more than this is tried."""
     steps: Annotated[int, msgspec.Meta(ge=0, le=100)] = 8
+    """Gauss-Newton steps of a pose."""
 
 
 class Judged(msgspec.Struct, frozen=True):

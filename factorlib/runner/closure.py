@@ -122,11 +122,18 @@ def _imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
 
 
 def _drop_docstring(node: ast.AST) -> None:
+    """The docstring of a module, class or function, and the strings that follow the fields of a class."""
     if (
         isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         and ast.get_docstring(node, clean=False) is not None
     ):
         node.body = node.body[1:] or [ast.Pass()]
+    if isinstance(node, ast.ClassDef):
+        node.body = [item for item in node.body if not _is_string(item)] or [ast.Pass()]
+
+
+def _is_string(node: ast.stmt) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 class Sources:

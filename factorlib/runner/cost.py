@@ -17,13 +17,14 @@ class Meter:
         self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
 
-    def read(self, threads: int) -> dict:
+    def read(self, threads: int, cores: int) -> dict:
         return {
             "started": self.started,
             "seconds": round(time.perf_counter() - self.wall, 3),
             "cpu_seconds": round(_cpu_seconds() - self.cpu, 3),
             "memory_mb": round(_peak_bytes() / 2**20, 1),
             "threads": threads,
+            "cores": cores,
             "machine": {
                 "system": platform.system(),
                 "processor": platform.machine(),

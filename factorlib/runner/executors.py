@@ -1,7 +1,7 @@
 """Where steps run: `concurrent.futures` executors of one process each, all within the machine's cores.
 
-The number of threads of a step is part of its spec, for numerics depend on it; how many steps run at once is the
-machine's affair.  A process pool whose process is killed gives up all its work, so each has one process and one step:
+The number of threads of a step's numerics is part of its spec, for sums depend on it; how many steps run at once, and
+over how many cores a step spreads independent work, is the machine's affair.  A process pool whose process is killed gives up all its work, so each has one process and one step:
 what is killed is that step's affair alone.  Any executor with `submit` will do in place of a pool.
 """
 
@@ -23,18 +23,18 @@ from factorlib.runner.worker import limit_threads
 
 
 class Pools:
-    """Executors by number of threads; `free` says whether a step of so many threads may start now."""
+    """Executors by number of threads; `free` says whether a step that needs so many cores may start now."""
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or _cores()
         self._idle: dict[int, list[Executor]] = {}
         self._busy: dict[Future, tuple[int, Executor]] = {}
 
-    def free(self, threads: int) -> bool:
-        busy = sum(taken for taken, _ in self._busy.values())
-        return busy == 0 or busy + threads <= self.cores
+    def free(self, cores: int) -> bool:
+        busy = sum(taken for taken, _, _ in self._busy.values())
+        return busy == 0 or busy + cores <= self.cores
 
-    def submit(self, threads: int, function: Callable, *arguments) -> Future:
+    def submit(self, cores: int, threads: int, function: Callable, *arguments) -> Future:
         with whole(), _OfWorkers():
             idle = self._idle.setdefault(threads, [])
             executor = idle.pop() if idle else _executor(threads)
@@ -42,16 +42,16 @@ class Pools:
                 future = executor.submit(function, *arguments)
             except BrokenProcessPool:  # its process was killed while it had nothing to do
                 executor.shutdown(wait=False)
-                return self.submit(threads, function, *arguments)
-            self._busy[future] = threads, executor
+                return self.submit(cores, threads, function, *arguments)
+            self._busy[future] = cores, threads, executor
             return future
 
     def done(self, future: Future) -> None:
-        threads, executor = self._busy.pop(future)
+        _, threads, executor = self._busy.pop(future)
         self._idle[threads].append(executor)
 
     def close(self, kill: bool = False) -> None:
-        executors = [e for idle in self._idle.values() for e in idle] + [executor for _, executor in self._busy.values()]
+        executors = [e for idle in self._idle.values() for e in idle] + [executor for _, _, executor in self._busy.values()]
         for executor in executors:
             executor.shutdown(wait=False, cancel_futures=True)
         if kill:

@@ -38,7 +38,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     over:    `photo` for a step per photo; otherwise one step for the whole set
     gather:  in a stage over photos, the file that every `<photo>.json` is gathered into
     makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
-    threads: threads of its numerics, part of what is computed (a sum depends on them), never the machine's
+    threads: threads of its libraries' numerics, part of what is computed (a sum depends on them), never the machine's
+    cores:   that it spreads independent work over by `Inputs.map`, `all` for those of the machine: they change no bit and no key
     logs:    hand it the log of the steps above it (not part of its key)
     optional: run it only where it is asked for, or something that is asked for takes its results
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
@@ -51,6 +52,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gather: str | None = None
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
+    cores: Annotated[int, msgspec.Meta(ge=1, le=1024)] | Literal["all"] = 1
     logs: bool = False
     optional: bool = False
     given: dict[str, list[str]] = {}

@@ -17,6 +17,7 @@ from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
+PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 
 
@@ -85,7 +86,7 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def pipeline_file(self) -> Path:
-        return self.root / "pipeline.yaml"
+        return self.root / PIPELINE
 
     @property
     def build(self) -> Path:

@@ -104,9 +104,9 @@ class Run:
         checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
         running: dict[Future, Code] = {}
         while checks or running:
-            while checks and self.pools.free(checks[0].threads):
+            while checks and self.pools.free(checks[0].taken):
                 code = checks.pop(0)
-                running[self.pools.submit(code.threads, check_params, code)] = code
+                running[self.pools.submit(code.taken, code.threads, check_params, code)] = code
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 outcome, code = _outcome_of(future), running.pop(future)
                 self.pools.done(future)
@@ -143,7 +143,7 @@ class Run:
                 continue
             if not self.pools.free(1):
                 return
-            if self.pools.free(self.survey.spec.pipeline.stages[planned.step.stage].threads):
+            if self.pools.free(self._code(planned.step.stage).taken):
                 self._start(planned)
 
     def _start(self, planned: Planned) -> None:
@@ -169,11 +169,12 @@ class Run:
         work = Running(planned, self._task(planned), lock)
         self.running[planned.step] = work
         self.display.start(planned.step)
-        work.future = self.pools.submit(work.task.code.threads, run_step, work.task)
+        work.future = self.pools.submit(work.task.code.taken, work.task.code.threads, run_step, work.task)
 
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
-        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads)
+        cores = self.pools.cores if spec.cores == "all" else min(spec.cores, self.pools.cores)
+        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores)
 
     def _task(self, planned: Planned) -> Task:
         step, data = planned.step, self.survey.data

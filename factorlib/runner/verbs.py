@@ -13,12 +13,14 @@ from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
 from factorlib.runner.home import made_home, made_homes
 from factorlib.runner.logs import warnings_in
+from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
+from factorlib.runner.worker import Code, load_stage
 
 
 def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
@@ -123,6 +125,17 @@ def warnings_of(seen: Survey, planned: Planned) -> list[str]:
 def show_graph(project: Project, mermaid: bool) -> int:
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
     print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
+    return 0
+
+
+def show_params(project: Project, stages: list[str] | None) -> int:
+    """Every parameter of the stages, or of all, with default, range and meaning."""
+    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
+    for number, name in enumerate(stages or pipeline.order()):
+        check_stage(project, name, [])
+        code = Code(project.root, project.package, name, {}, project.pipeline_file)
+        lines = words.parameter_lines(name, parameters(load_stage(code).Params))
+        print("\n".join([""] * (number > 0) + lines))
     return 0
 
 

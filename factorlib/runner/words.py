@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
 from msgspec import structs
 
+from factorlib.runner.params import Parameter
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.verify import Verdict
@@ -62,6 +64,16 @@ def graph_lines(pipeline: Pipeline) -> list[str]:
         taken = ", ".join(stage.inputs) or "(parameters only)"
         asked = "   (only when asked for)" if stage.optional else ""
         lines.append(f"{name:<10} {'per photo' if stage.over else 'whole set':<10} <- {taken}{asked}")
+    return lines
+
+
+def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
+    """A stage's parameters, each with its default, what it may be and what it means."""
+    if not found:
+        return [f"{stage} has no parameters"]
+    lines = []
+    for one in found:
+        lines += [f"{stage}.{one.name} = {one.default}    ({one.allowed})", *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    ")]
     return lines
 
 

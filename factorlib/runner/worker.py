@@ -16,6 +16,9 @@ import sys
 import time
 import traceback
 import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -43,14 +46,23 @@ EVERY = 0.2  # seconds between two words of progress
 
 
 class Code(msgspec.Struct, frozen=True):
-    """Which stage, where its module is found, and the parameters given to it (in which file)."""
+    """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
+
+    threads: of its libraries' numerics;  cores: that independent work is spread over
+    """
 
     root: Path
     package: str
     stage: str
     params: dict[str, Any]
     settings: Path
-    threads: int
+    threads: int = 1
+    cores: int = 1
+
+    @property
+    def taken(self) -> int:
+        """Cores that it keeps busy."""
+        return max(self.threads, self.cores)
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -93,13 +105,13 @@ def run_step(task: Task) -> Outcome:
     with Events(task) as events:
         try:
             entry, damaged = _made(task, events)
-            cost = meter.read(task.code.threads)
+            cost = meter.read(task.code.threads, task.code.cores)
             _write_log(task, events, cost)
             _keep(task, entry)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
-            return _failed(error, task.temporary.parent, meter.read(task.code.threads)["seconds"])
+            return _failed(error, task.temporary.parent, meter.read(task.code.threads, task.code.cores)["seconds"])
 
 
 def check_params(code: Code) -> Outcome:
@@ -127,6 +139,14 @@ def load_stage(code: Code) -> ModuleType:
     return module
 
 
+def spread(cores: int, function: Callable, items: Iterable) -> list:
+    """The function of every item, in order, on so many threads."""
+    if cores == 1:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(cores) as pool:
+        return list(pool.map(function, items))
+
+
 def params_of(module: ModuleType, code: Code):
     """The stage's parameters as its own struct, every bound checked."""
     return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
@@ -151,9 +171,8 @@ def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
     hashes = FileHashes(store.cache / "files.json")
     _check_code_still(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
-    inputs = Inputs(
-        folders=task.folders, facts=task.facts, files=task.files, photo=task.photo, log=task.log, unfinished=store.unfinished / task.key
-    )
+    unfinished = store.unfinished / task.key
+    inputs = Inputs(task.folders, task.facts, task.files, task.photo, partial(spread, task.code.cores), task.log, unfinished)
     if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
         copy_shipped(folder, task.temporary)
     else:

@@ -81,9 +81,9 @@ class Inline(Executor):
 class InlinePools(Pools):
     """Steps in this process, one after the other."""
 
-    def submit(self, threads, function, *arguments):
+    def submit(self, cores, threads, function, *arguments):
         future = Inline().submit(function, *arguments)
-        self._busy[future] = threads, None
+        self._busy[future] = cores, threads, None
         return future
 
     def done(self, future):

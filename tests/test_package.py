@@ -1,0 +1,86 @@
+"""A Python package like any other: what it imports is declared, the lock follows from that, a wheel of it works by itself."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from factorlib.lock import lock_text
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+OURS = {"factorlib", "stages", "tests", "benchmarks"}
+
+
+def names(requirements):
+    return {canonicalize_name(Requirement(text).name) for text in requirements}
+
+
+def imported(folder):
+    """Top-level modules that the files below a folder import."""
+    found = set()
+    for file in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                modules = [node.module]
+            found |= {module.split(".")[0] for module in modules}
+    return found - OURS - sys.stdlib_module_names
+
+
+@pytest.mark.parametrize("folder", ["factorlib", "stages"])
+def test_every_import_is_a_dependency_that_is_declared(folder):
+    declared = names(PROJECT["dependencies"])
+    of = {module: {canonicalize_name(name) for name in found} for module, found in packages_distributions().items()}
+    missing = {module for module in imported(folder) - {"packaging"} if not of[module] & declared}
+    assert not missing
+
+
+def test_the_lock_is_what_pyproject_asks_for():
+    assert (ROOT / "requirements.lock").read_text() == lock_text(), "make lock"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A wheel of the package, without what it needs, installed into a folder."""
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    source = folder / "source"
+    files = subprocess.run(["git", "ls-files", "--", "factorlib", "pyproject.toml", "README.md", "LICENSE"], cwd=ROOT, check=True, capture_output=True)
+    for name in files.stdout.decode().splitlines():
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(folder), str(source)], check=True)
+    (wheel,) = folder.glob("*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(folder / "site"), str(wheel)], check=True)
+    return folder / "site"
+
+
+def run(site, *words, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(site), "FACTORLIB_ROOT": ""}
+    return subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path):
+    done = run(installed, str(installed / "bin" / "factorlib"), "--help", cwd=tmp_path)
+    assert done.returncode == 0 and "Usage: factorlib" in done.stdout and "validate" in done.stdout
+    code = "import factorlib; from factorlib.reflection import reflection_operator; print(factorlib.__file__, reflection_operator('network'))"
+    done = run(installed, "-c", code, cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.startswith(str(installed)), done.stderr
+
+
+def test_an_installed_command_away_from_a_checkout_says_so(installed, tmp_path):
+    done = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=tmp_path)
+    assert done.returncode == 1 and "pipeline.yaml" in done.stderr and "FACTORLIB_ROOT=" in done.stderr
+    done = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
+    assert done.returncode == 0 and "solve" in done.stdout
