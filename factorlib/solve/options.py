@@ -20,8 +20,8 @@ SpecularParts = Literal["auto", "on"]
 ToneCurves = Literal["auto", "off"]
 
 
-class Bundle(Struct, frozen=True):
-    """How the joint problem is solved.
+class Choices(Struct, frozen=True):
+    """What of the bundle solver a user may choose.
 
     lobes           most lobes an illumination may get; held-out observations may stop earlier
     insert          lobes that each illumination gets in a round
@@ -31,7 +31,6 @@ class Bundle(Struct, frozen=True):
     sample          the least observations per illumination that choose the lobes (60 for each lobe where that is more)
     tolerance       a descent stops after two steps that gain less than this share of the loss
     least_gain      share of the held-out loss that a round must gain to be the best one
-    start_roughness, start_specular_share   of the materials that rounds start from
     self_shadowing  whether what meshes hide is taken to be dark; `auto`: where held-out observations are explained better so
     specular        whether every material has a specular part; `auto`: where held-out observations are explained worse without
     tone            whether photos may have a tone curve beyond their encoding; `auto`: where held-out observations ask for it
@@ -47,9 +46,17 @@ class Bundle(Struct, frozen=True):
     sample: Sample = 1500
     tolerance: Tolerance = 1e-3
     least_gain: Share = 0.01
-    start_roughness: float = 0.4
-    start_specular_share: float = 0.2
     self_shadowing: SelfShadowing = "auto"
     specular: SpecularParts = "auto"
     tone: ToneCurves = "auto"
     seed: Seed = 0
+
+
+class Bundle(Choices, frozen=True):
+    """How the joint problem is solved.
+
+    start_roughness, start_specular_share   of the materials that rounds start from
+    """
+
+    start_roughness: float = 0.4
+    start_specular_share: float = 0.2

@@ -133,7 +133,7 @@ def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
     folder = tmp_path / "earlier"
     folder.mkdir()
     thing = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "runner_up": runner_up}
-    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated"}, "objects": {"thing": thing}}})
+    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}, "objects": {"thing": thing}}})
     return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
 
 

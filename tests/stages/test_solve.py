@@ -11,7 +11,7 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
-from factorlib.solve.earlier import FILES
+from factorlib.results.solution import FILES
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
