@@ -7,7 +7,6 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.earlier import earlier_focal, earlier_pose
@@ -16,12 +15,13 @@ from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_m
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
-from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Found, Search
 from factorlib.align.told import camera_told
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
 from factorlib.meshes.limits import Limits

@@ -13,12 +13,12 @@ import numpy as np
 
 from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.proportions import Sighting, Standards, Verdict, proportions
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import prior_before
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import NO_LIMITS

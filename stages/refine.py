@@ -10,12 +10,12 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.align.camera import Camera, angle_between
 from factorlib.align.evidence import object_evidence, silhouette_iou
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import normal_difference, prior_before
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.camera import Camera, angle_between
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.images.exr import read_exr
 from factorlib.images.tone import straightened
 from factorlib.meshes.limits import NO_LIMITS

@@ -10,6 +10,7 @@ from typing import Annotated
 import msgspec
 
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.visibility import Occluders, visibility
 from factorlib.images.exr import read_exr
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
@@ -21,7 +22,6 @@ from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.sample import sample
-from factorlib.urm.visibility import Occluders, visibility
 
 log = logging.getLogger("factorlib.urm")
 

@@ -29,6 +29,7 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
 )
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
@@ -87,7 +88,7 @@ def mirrored_directions(
 
     normals, views: camera frame;  frame_from_camera: identity for a light fixed to the camera.
     """
-    mirror = 2 * np.sum(normals * views, axis=-1, keepdims=True) * normals - views
+    mirror = mirror_directions(normals, views)
     row, column = lat_long_of_direction(mirror @ (YUP_FROM_CAMERA @ frame_from_camera).T)
     shape = np.array([COVERAGE_ROWS, 2 * COVERAGE_ROWS])
     hit = np.zeros(shape, bool)

@@ -11,18 +11,16 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from msgspec import UNSET, UnsetType
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose, is_pose
 from factorlib.jsonfile import write_json
 from factorlib.results.file import read_result
 
 FILE = "poses.json"
 SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
 AS_IT_IS = (1.0, 1.0, 1.0)
-ROTATION_ERROR = 1e-3  # of RᵀR from the identity
 CURE = "name the folder of a result of `align`, `fit_mesh` or `refine`"
 
 Vec3 = tuple[float, float, float]
@@ -151,13 +149,3 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
         for entry in (thing, thing.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
                 raise InputError("a pose that is no rotation and translation", file=path, key=f"{key}.{name}", cure=cure)
-
-
-def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> bool:
-    """Finite, and a rotation to within rounding.
-
-    >>> is_pose(np.diag([1.0, 1.0, -1.0]), np.ones(3))
-    False
-    """
-    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
-    return bool(finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss

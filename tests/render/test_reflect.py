@@ -6,9 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.light.sphere import fibonacci_sphere
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
 from factorlib.render import reflect

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from factorlib.model.cells import mirror_cells
+from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion, rounds

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Pose, rotation_of_vector
-from factorlib.align.raster import rasterise
 from factorlib.align.search import Search
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose, rotation_of_vector
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.raster import rasterise
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import rasterise
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
