@@ -13,7 +13,6 @@ from factorlib.reading import read_text, reading
 
 T = TypeVar("T")
 VERSION = 1  # of the files of this package; a file without `version` is of version 1, so none is written
-FINITE = {"ge": -1.7e308, "le": 1.7e308}  # bounds of `msgspec.Meta` that refuse infinity
 _WHERE = re.compile(r"^(?P<found>.*?)(?: - at `(?:\$\.?)?(?P<key>[^`]*)`)?$", re.DOTALL)
 
 
@@ -26,8 +25,7 @@ def read_result(path: str | Path, type_: type[T], stage: str, cure: str = "") ->
     cure, text = cure or f"run the stage `{stage}` again", read_text(path, "JSON")
     with reading("JSON", path, cure=cure):
         content = msgspec.json.decode(text)
-    check_version(content, path, cure)
-    return converted(content, type_, path, cure)
+    return converted(of_this_version(content, path, cure), type_, path, cure)
 
 
 def converted(content: Any, type_: type[T], path: str | Path, cure: str) -> T:
@@ -40,9 +38,11 @@ def converted(content: Any, type_: type[T], path: str | Path, cure: str) -> T:
             raise InputError(found["found"], file=path, key=found["key"] or None, cure=cure) from None
 
 
-def check_version(content: Any, path: str | Path, cure: str) -> None:
-    """InputError where the file says a version that is not VERSION.  In files by photo, an entry called `version` is no number."""
-    version = content.get("version", VERSION) if isinstance(content, dict) else VERSION
-    if isinstance(version, dict | list) or version == VERSION:
-        return
-    raise InputError(f"is of version {version}; this program reads version {VERSION}", file=path, key="version", cure=cure)
+def of_this_version(content: Any, path: str | Path, cure: str) -> Any:
+    """The content without its `version`; InputError where that is not VERSION.  In files by photo, an entry of that name is no number."""
+    if not isinstance(content, dict) or isinstance(content.get("version", {}), dict | list):
+        return content
+    if content["version"] != VERSION:
+        found = f"is of version {content['version']}; this program reads version {VERSION}"
+        raise InputError(found, file=path, key="version", cure=cure)
+    return {name: value for name, value in content.items() if name != "version"}

@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 
+from benchmarks.solve.problems import block, random_light
 from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -14,7 +15,6 @@ from factorlib.solve.descent import descend
 from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
-from tests.solve.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
 MIXED = Materials(

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
@@ -23,7 +24,6 @@ from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 from factorlib.solve.warm import Propagation, from_earlier, known_of, with_exposures
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 BUNDLE = Bundle(lobes=16, insert=4, rounds=6, iterations=10, polish=15, tolerance=1e-3)
