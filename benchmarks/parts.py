@@ -25,9 +25,9 @@ from benchmarks.markdown import refresh, table
 from benchmarks.solve.workers import threaded
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
+from factorlib.geometry.sphere import mirror_cells
 from factorlib.jsonfile import json_text
 from factorlib.model.blocks import Block
-from factorlib.model.cells import mirror_cells
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss

@@ -15,13 +15,13 @@ import typer
 
 from benchmarks.align import shapes
 from benchmarks.align.cases import FILLS, photographed
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence
 from factorlib.align.proportions import Sighting, proportions
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import find, focal_prior
 from factorlib.align.state import State
 from factorlib.align.target import target_of
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh, scaled
 

@@ -20,13 +20,13 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from benchmarks.align import shapes
-from factorlib.align.camera import Camera, Pose, rotation_of_vector
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior, refined
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
 from factorlib.generate.chair import chair, labelled
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.model.blocks import Block

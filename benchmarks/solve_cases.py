@@ -1,6 +1,6 @@
 """The hard cases of the joint solve, measured: `python -m benchmarks.solve_cases [--docs]`; --docs refreshes docs/solve.md.
 
-The cases, their errors and bounds are those of tests/solve/hard_cases.py.
+The cases, their errors and bounds are those of benchmarks/solve/hard_cases.py.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import torch
 import typer
 
 from benchmarks.markdown import exact, refresh, table
+from benchmarks.solve.hard_cases import BOUNDS, CASES, answered, of_random_starts
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator
-from tests.solve.hard_cases import BOUNDS, CASES, answered, of_random_starts
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "solve.md"
 SAID = {  # words of a message -> what the table calls it

@@ -1,6 +1,6 @@
 """How far the hard cases' errors spread over differently trained weights and over noise: what their bounds must leave room for.
 
-`python -m benchmarks.solve_spread FOLDER … [--seeds 3]` solves every case of tests/solve/hard_cases.py with the operator of each folder
+`python -m benchmarks.solve_spread FOLDER … [--seeds 3]` solves every case of benchmarks/solve/hard_cases.py with the operator of each folder
 of weights (as the stage `train` writes them), and with as many seeds of noise, and prints the worst of each error beside its bound.
 """
 
@@ -13,9 +13,9 @@ import torch
 import typer
 
 from benchmarks.markdown import exact, table
+from benchmarks.solve import hard_cases
+from benchmarks.solve.hard_cases import BOUNDS, CASES, answered
 from factorlib.reflection import reflection_operator
-from tests.solve import hard_cases
-from tests.solve.hard_cases import BOUNDS, CASES, answered
 
 ERRORS = ("k", "roughness", "radiance")
 

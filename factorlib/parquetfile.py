@@ -6,14 +6,16 @@ What a file announces is looked at before its columns are read: a kilobyte of Pa
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factorlib.reading import check_plain, reading
+from factorlib.wholefile import writing
 
 MOST_ROWS = 100_000_000
 MOST_BYTES = 4096  # of one value: a visibility has as many directions
@@ -45,6 +47,13 @@ def read_columns(
         if not isinstance(about, dict):
             raise ValueError("its metadata `factorlib` is no table")
     return columns, about
+
+
+def write_rows(path: str | Path, type_: type[msgspec.Struct], rows: Sequence[msgspec.Struct]) -> None:
+    """A column for each field of the rows, which are structs of `type_`."""
+    columns = {name: [getattr(row, name) for row in rows] for name in type_.__struct_fields__}
+    with writing(path):
+        pq.write_table(pa.table(columns), path, compression="zstd")
 
 
 def _check_type(name: str, schema: pa.Schema) -> None:

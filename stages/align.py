@@ -7,31 +7,31 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
-from factorlib.align.earlier import EarlierPhoto, read_earlier
+from factorlib.align.earlier import earlier_focal, earlier_pose
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
-from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Found, Search
 from factorlib.align.told import camera_told
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
-from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.results.photos import PhotoFacts, read_photo_facts
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, RunnerUp, entry_of, read_poses, write_photo_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
-AS_IT_IS = (1.0, 1.0, 1.0)
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
 CURE_OF_TOLD = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 
@@ -50,27 +50,28 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name = inputs.photo
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
-    channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_json(inputs["masks"] / f"{name}.json")
-    earlier = read_earlier(inputs["poses"]).get(name) if "poses" in inputs.folders else None
-    things = things_of(slice_, channels, inputs, params, facts["factor"], earlier)
+    channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
+    earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
+    things = things_of(slice_, channels, inputs, params, facts.factor, earlier)
     camera, focal, focal_source = camera_of(slice_, facts, name)
     hold_against(slice_, things, channels["label"], inputs.facts["dataset.materials"], camera, focal, name)
-    result = placed(things, camera, focal, focal_source, name, params.search, earlier.focal(facts["factor"]) if earlier else None)
+    before = earlier_focal(earlier.camera, facts.factor) if earlier else None
+    result = placed(things, camera, focal, focal_source, name, params.search, before)
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     told = slice_.told.source if slice_.told else None
     sources = {thing.name: "given" if thing.pose else told for thing in slice_.objects}
     objects = {thing.name: entry(thing, k, result, maps, params, sources[thing.name]) for k, thing in enumerate(things)}
-    for thing_name, facts_of_it in objects.items():
-        complain(name, thing_name, facts_of_it, params.strict)
-    left_out = np.isin(maps.object, [k for k, facts_of_it in enumerate(objects.values(), start=1) if facts_of_it["left_out"]])
+    for thing_name, found in objects.items():
+        complain(name, thing_name, found, params.strict)
+    left_out = np.isin(maps.object, [k for k, found in enumerate(objects.values(), start=1) if found.left_out])
     write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
-    write_json(out / f"{name}.json", {"camera": camera_entry(result, facts["factor"]), "objects": objects})
+    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), objects))
 
 
 def things_of(
-    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: EarlierPhoto | None = None
+    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: PhotoPoses | None = None
 ) -> list[Thing]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
@@ -83,7 +84,7 @@ def things_of(
         scale = before.scale if before else AS_IT_IS
         caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
-        found = before.as_found() if before else None
+        found = earlier_pose(before) if before else None
         things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
     return things
 
@@ -116,35 +117,30 @@ def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
     return Keypoints(np.array([k.pixel for k in thing.keypoints]) / factor, np.array([k.point for k in thing.keypoints]))
 
 
-def camera_of(slice_: schema.ObjectsSlice, facts: dict, photo: str) -> tuple[Camera, float | None, str | None]:
+def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, float | None, str | None]:
     """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
 
     What dataset.yaml gives goes before what its source of cameras tells, and that before EXIF and the middle of the photo.
     Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
     """
-    factor, (width, height) = facts["factor"], facts["original_size"]
-    focal, source, centre = facts["focal_px"], facts["focal_source"], (width / 2, height / 2)
+    factor, (width, height) = facts.factor, facts.original_size
+    focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
     if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
         told_focal, centre = camera_told(slice_.told, width, height, photo)
         if source != "dataset":
             focal, source = told_focal / factor, slice_.told.source
     across, down = slice_.camera.principal_point or centre
-    return Camera(facts["width"], facts["height"], 1.0, (across / factor, down / factor)), focal, source
+    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), focal, source
 
 
-def camera_entry(result: Placed, factor: int) -> dict:
+def camera_entry(result: Placed, factor: int) -> CameraEntry:
     """Pixels are those of the stage's maps, `factor` of the photo's each."""
     camera = result.camera
-    return {
-        "focal_px": float(camera.focal),
-        "focal_source": result.focal_source,
-        "focal_relative_stderr": result.log_focal_sigma,
-        "principal_point": [float(c) for c in camera.centre],
-        "factor": factor,
-    }
+    centre = float(camera.centre[0]), float(camera.centre[1])
+    return CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, factor)
 
 
-def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> dict:
+def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
     """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
@@ -153,38 +149,34 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, sour
     iou, agreement = silhouette_iou(thing.evidence, seen), label_agreement(thing.evidence, seen)
     found, pose, trust = result.found[k], result.poses[k], trust_in(thing, result, k)
     reasons = doubts(iou, agreement, trust, found, params)
-    return {
-        **pose_entry(pose),
-        "scale": list(thing.scale),
-        "silhouette_iou": iou,
-        "label_agreement": agreement,
-        "source": source if found is None else "refined" if found.earlier else "keypoints" if found.by_keypoints else "found",
-        "score": found.score if found else None,
-        "runner_up": runner_up_entry(found, thing.caster),
-        **msgspec.to_builtins(trust),
-        "doubts": reasons,
-        "left_out": bool(reasons) and found is not None and not params.keep_doubtful,
-    }
+    return ObjectEntry(
+        **entry_of(pose),
+        scale=thing.scale,
+        silhouette_iou=iou,
+        label_agreement=agreement,
+        source=source if found is None else "refined" if found.earlier else "keypoints" if found.by_keypoints else "found",
+        score=found.score if found else None,
+        runner_up=runner_up_entry(found, thing.caster),
+        **msgspec.structs.asdict(trust),
+        doubts=reasons,
+        left_out=bool(reasons) and found is not None and not params.keep_doubtful,
+    )
 
 
-def runner_up_entry(found: Found | None, caster: Caster) -> dict | None:
+def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
     if found is None or found.runner_up is None:
         return None
     other = found.runner_up
-    return {**pose_entry(other.state.pose(caster)), "score": other.score, "normal_difference_deg": other.normal_difference_deg}
+    return RunnerUp(**entry_of(other.state.pose(caster)), score=other.score, normal_difference_deg=other.normal_difference_deg)
 
 
-def pose_entry(pose: Pose) -> dict:
-    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-
-
-def complain(photo: str, thing: str, facts: dict, strict: bool) -> None:
-    cure = CURE_OF_TOLD if facts["source"] in schema.SOURCES else CURE
-    for reason in facts["doubts"]:
+def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
+    cure = CURE_OF_TOLD if entry.source in schema.SOURCES else CURE
+    for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=cure)
         log.warning("%s: %s: %s; %s", photo, thing, reason, cure)
-    if facts["left_out"]:
+    if entry.left_out:
         log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, thing)
 
 

@@ -1,6 +1,6 @@
 """How good the result is: re-synthesis against the photos, everything else against the truth where there is one.
 
-Writes metrics.json; its keys are documented in `factorlib.evaluate.metrics`.  Only this stage reads the truth: so that
+Writes metrics.json; its keys are documented in `factorlib.results.metrics`.  Only this stage reads the truth: so that
 the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
@@ -12,18 +12,21 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from factorlib.dataset.schema import LightSlice, Pose, TruthFile
+from factorlib.dataset.schema import LightSlice, TruthFile
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.geometry import NormalError, averaged_normals, normal_error, pose_error
+from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
-from factorlib.evaluate.materials import Material, compare_materials
-from factorlib.evaluate.metrics import Counts, Metrics, reasons_of
+from factorlib.evaluate.materials import compare_materials
+from factorlib.evaluate.metrics import reasons_of
 from factorlib.evaluate.relighting import compare_relighting
-from factorlib.evaluate.resynthesis import Resynthesis, Shot, compare_photos, shot_of
+from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
-from factorlib.jsonfile import read_json, write_json
+from factorlib.results.materials import Reflectance, read_materials, reflectances
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, Resynthesis, write_metrics
+from factorlib.results.photos import read_photos
+from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 
@@ -51,13 +54,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         **sections,
         reasons=reasons_of(sections, truth is not None),
     )
-    write_json(out / "metrics.json", metrics)
+    write_metrics(out / "metrics.json", metrics)
     progress(3, 3)
 
 
 def _against_truth(inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
-    materials = {n: Material(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
-    estimates = _estimated_materials(inputs)
+    materials = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
+    estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the gauge of the exported lights
     true_lights = {n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()}
     paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
     found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
@@ -98,12 +101,6 @@ def _seen(resynthesis: Resynthesis, lights: dict[str, LightSlice]) -> dict[str, 
     return seen
 
 
-def _estimated_materials(inputs: Inputs) -> dict[str, Material]:
-    """In the gauge of the exported lights."""
-    entries = read_json(inputs["export"] / "materials.json")["materials"]
-    return {n: Material(tuple(m["diffuse"]), tuple(m["specular"]), m["roughness"]) for n, m in entries.items()}
-
-
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals and views [h w 3] of a photo and its observed pixels."""
     geometry = read_exr(inputs["align"] / f"{name}.exr")
@@ -123,22 +120,21 @@ def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.nda
 
 
 def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) -> dict[str, NormalError] | None:
-    found, photos = {}, read_json(inputs["masks"] / "photos.json")
+    found, photos = {}, read_photos(inputs["masks"] / "photos.json")
     for name in lights:
         if name in truth.normals:
-            true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name]["original_size"])
-            true = averaged_normals(true, photos[name]["factor"])  # as the photo was
+            true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name].original_size)
+            true = averaged_normals(true, photos[name].factor)  # as the photo was
             normal, _, pixels = _geometry(inputs, name)
             found[name] = normal_error(normal, true, pixels)
     return {name: error for name, error in found.items() if error} or None
 
 
-def _poses(inputs: Inputs, truth: TruthFile) -> dict | None:
-    estimated = read_json(inputs["align"] / "poses.json")
-    found: dict = {}
+def _poses(inputs: Inputs, truth: TruthFile) -> dict[str, dict[str, PoseError]] | None:
+    estimated = read_poses(inputs["align"] / "poses.json")
+    found: dict[str, dict[str, PoseError]] = {}
     for photo, objects in truth.poses.items():
         for name, pose in objects.items():
-            entry = estimated.get(photo, {}).get("objects", {}).get(name)
-            if entry is not None:
-                found.setdefault(photo, {})[name] = pose_error(Pose(entry["rotation"], entry["translation"]), pose)
+            if photo in estimated and name in estimated[photo].objects:
+                found.setdefault(photo, {})[name] = pose_error(estimated[photo].objects[name], pose)
     return found or None

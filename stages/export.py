@@ -13,20 +13,24 @@ import numpy as np
 import OpenImageIO as oiio
 
 from factorlib.conventions import lat_long_directions
-from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
+from factorlib.dataset import schema
+from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectsSlice
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
-from factorlib.export.materials import headroom_factor, materials_of_table, table_in_gauge
+from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import Environment, Shape, View, write_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
-from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import lat_long_of_lobes, sampled
-from factorlib.light.lobes import Lobes, no_lobes, read_lobes, write_lobes
+from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.results.exposures import read_exposures, write_exposures
+from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.materials import MaterialTable, read_materials, reflectances, write_materials
+from factorlib.results.poses import CameraEntry, ObjectEntry, read_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.export")
@@ -50,11 +54,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(0, 4, "materials")
     table, lobes = _in_gauge(inputs["solve"], {light.illumination for light in lights.values()})
-    exposures = read_json(inputs["solve"] / "exposures.json")
-    write_json(out / "materials.json", table)
-    write_json(out / "exposures.json", exposures)
+    exposures = read_exposures(inputs["solve"] / "exposures.json")
+    write_materials(out / "materials.json", table)
+    write_exposures(out / "exposures.json", exposures)
     write_lobes(out / "lobes.parquet", lobes)
-    materials = materials_of_table(table)
+    materials = reflectances(table)
     write_materialx(out / "materials.mtlx", materials)
     progress(1, 4, "lights")
     _write_lights(out, lobes, params)
@@ -64,21 +68,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         write_glb(out / f"{name}.glb", files.mesh(name, mesh, {}), names, materials)
     progress(3, 4, "scenes")
-    poses = read_json(inputs["align"] / "poses.json")
+    poses = read_poses(inputs["align"] / "poses.json")
     for photo, light in lights.items():
-        view = _view(inputs["align"] / f"{photo}.exr", poses[photo]["camera"])
+        view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
         shapes = [
-            shape for thing in objects[photo].objects for shape in files.shapes(thing, objects[photo].meshes, poses[photo]["objects"])
+            shape for thing in objects[photo].objects for shape in files.shapes(thing, objects[photo].meshes, poses[photo].objects)
         ]
         environment = _environment(out, photo, light, lobes[light.illumination], np.array(exposures.get(photo, [1.0] * 3)), params)
         write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment)
     progress(4, 4)
 
 
-def _in_gauge(solved: Path, illuminations: set[str]) -> tuple[dict, dict[str, Lobes]]:
+def _in_gauge(solved: Path, illuminations: set[str]) -> tuple[MaterialTable, dict[str, Lobes]]:
     """materials.json and the lobes of every illumination; the factor that leaves the one enters the other."""
-    table = read_json(solved / "materials.json")
-    factor = headroom_factor(materials_of_table(table))
+    table = read_materials(solved / "materials.json")
+    factor = headroom_factor(table.materials)
     found = read_lobes(solved / "lobes.parquet")
     for name in sorted(illuminations - set(found)):
         log.warning("illumination '%s' was not solved for, because no pixel in it was observed: it is written as black", name)
@@ -117,10 +121,10 @@ def _environment(out: Path, photo: str, light: LightSlice, lobes: Lobes, exposur
     return Environment(file, 1.0, camera_from_light)
 
 
-def _view(aligned: Path, camera: dict) -> View:
+def _view(aligned: Path, camera: CameraEntry) -> View:
     """The photo's camera; its size from the header of align's maps."""
     spec = oiio.ImageInput.open(str(aligned)).spec()
-    return View(spec.width, spec.height, camera["focal_px"], tuple(camera["principal_point"]))
+    return View(spec.width, spec.height, camera.focal_px, camera.principal_point)
 
 
 class MeshFiles:
@@ -138,16 +142,16 @@ class MeshFiles:
             self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
         return self._meshes[key]
 
-    def shapes(self, thing: ObjectEntry, meshes: dict[str, MeshEntry], poses: dict) -> list[Shape]:
+    def shapes(self, thing: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]) -> list[Shape]:
         """One per material of the object."""
         mesh, stem = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials), self._written(thing, meshes)
         place = np.eye(4)
         pose = poses[thing.name]
-        place[:3, :3], place[:3, 3] = np.array(pose["rotation"]) * pose.get("scale", (1.0, 1.0, 1.0)), pose["translation"]
+        place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
         used = [self.materials[label - 1] for label in mesh.labels]
         return [Shape(f"{thing.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
 
-    def _written(self, thing: ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
+    def _written(self, thing: schema.ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
         """What the files are called before the material, relative to the scenes; a second choice of materials is <mesh>.2."""
         key = (thing.mesh, *sorted(thing.materials.items()))
         if key not in self._stems:

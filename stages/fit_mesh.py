@@ -11,21 +11,21 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.camera import Camera
-from factorlib.align.earlier import SEARCHED, EarlierPhoto
 from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.proportions import Sighting, Standards, Verdict, proportions
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import prior_before
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.images.exr import read_exr
-from factorlib.jsonfile import read_json, write_json
+from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import FILE, SEARCHED, PhotoPoses, entry_of, read_poses, write_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -51,7 +51,7 @@ class Found(msgspec.Struct, frozen=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    poses, slices = read_json(inputs["align"] / "poses.json"), inputs.facts["dataset.objects"]
+    poses, slices = read_poses(inputs["align"] / FILE), inputs.facts["dataset.objects"]
     found: dict[str, list[Found]] = {}
     for photo in sorted(poses):
         for mesh, one in sightings_of(photo, msgspec.convert(slices[photo], ObjectsSlice), poses[photo], inputs, params):
@@ -60,34 +60,34 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for done, (mesh, sightings) in enumerate(sorted(found.items())):
         progress(done, len(found), mesh)
         verdict = proportions([one.sighting for one in sightings], params)
-        report[mesh] = entry_of(verdict, sightings)
+        report[mesh] = fitted(verdict, sightings)
         if verdict.used:
             log.warning("mesh '%s' fits better with its axes times %s", mesh, ", ".join(f"{f:.3f}" for f in verdict.fitted.factors))
             for one, state in zip(sightings, verdict.fitted.states, strict=True):
-                place(poses[one.photo], one, state, verdict.fitted.factors)
+                poses[one.photo] = placed(poses[one.photo], one, state, verdict.fitted.factors)
     write_json(out / "meshes.json", report)
-    write_json(out / "poses.json", poses)
+    write_poses(out / FILE, poses)
 
 
-def sightings_of(photo: str, slice_: ObjectsSlice, entry: dict, inputs: Inputs, params: Params):
+def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: Inputs, params: Params):
     """(mesh, sighting) of every object whose pose was found, with its mask and the mesh as its file has it."""
-    channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_json(inputs["masks"] / f"{photo}.json")
-    earlier, (height, width) = msgspec.convert(entry, EarlierPhoto), channels["label"].shape
-    camera = Camera(width, height, entry["camera"]["focal_px"], tuple(entry["camera"]["principal_point"]))
-    prior = prior_before(camera.focal, entry["camera"]["focal_source"], facts["focal_px"], width, height)
+    channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_photo_facts(inputs["masks"] / f"{photo}.json")
+    height, width = channels["label"].shape
+    camera = entry.camera.camera(width, height)
+    prior = prior_before(camera.focal, entry.camera.focal_source, facts.focal_px, width, height)
     alone = prior if len(slice_.objects) == 1 else FocalPrior(camera.focal, 0.0)
     for number, thing in enumerate(slice_.objects, start=1):
-        said, mesh = entry["objects"][thing.name], slice_.meshes[thing.mesh]
-        if said["source"] not in SEARCHED or said["silhouette_iou"] < params.least_iou:
+        found, mesh = entry.objects[thing.name], slice_.meshes[thing.mesh]
+        if found.source not in SEARCHED or (found.silhouette_iou or 0.0) < params.least_iou:
             continue
         read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials, limits=NO_LIMITS)
         evidence = object_evidence(channels, number, read.labels, thing.mask is not None)
-        state = state_of(earlier.objects[thing.name].pose(), camera, scaled(read, earlier.objects[thing.name].scale))
+        state = state_of(found.pose, camera, scaled(read, found.scale))
         target = target_of(evidence, read.labels, params.resolution, MARGIN)
         yield thing.mesh, Found(photo, thing.name, Sighting(read, target, camera, alone, state), evidence)
 
 
-def entry_of(verdict: Verdict, sightings: list[Found]) -> dict:
+def fitted(verdict: Verdict, sightings: list[Found]) -> dict:
     """Of meshes.json."""
     return {
         "factors": verdict.fitted.factors.tolist(),
@@ -98,12 +98,11 @@ def entry_of(verdict: Verdict, sightings: list[Found]) -> dict:
     }
 
 
-def place(entry: dict, one: Found, state: State, factors: np.ndarray) -> None:
-    """Write an object's pose with the fitted mesh into its photo's entry of poses.json; its runner-up was of another mesh."""
+def placed(entry: PhotoPoses, one: Found, state: State, factors: np.ndarray) -> PhotoPoses:
+    """The photo's entry of poses.json with an object's pose of the fitted mesh; its runner-up was of another mesh."""
     caster = Caster(scaled(one.sighting.mesh, factors))
-    pose, camera = state.pose(caster), state.camera(one.sighting.camera)
-    if one.sighting.prior.sigma > 0:
-        entry["camera"]["focal_px"] = float(camera.focal)
-    iou = silhouette_iou(one.evidence, rasterise(caster, camera, pose).label)
-    changed = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "scale": factors.tolist()}
-    entry["objects"][one.thing] |= changed | {"silhouette_iou": iou, "runner_up": None}
+    pose, seen = state.pose(caster), state.camera(one.sighting.camera)
+    camera = msgspec.structs.replace(entry.camera, focal_px=float(seen.focal)) if one.sighting.prior.sigma > 0 else entry.camera
+    iou = silhouette_iou(one.evidence, rasterise(caster, seen, pose).label)
+    changed = {**entry_of(pose), "scale": factors.tolist(), "silhouette_iou": iou, "runner_up": None}
+    return PhotoPoses(camera, entry.objects | {one.thing: msgspec.structs.replace(entry.objects[one.thing], **changed)})

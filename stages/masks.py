@@ -15,8 +15,8 @@ from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, decoded, open_photo
-from factorlib.jsonfile import write_json
 from factorlib.labels import Labels, read_labels, read_objects
+from factorlib.results.photos import PhotoFacts, write_photo_facts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")
@@ -55,7 +55,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     valid = _valid(photo, labels, path, key)
     progress(2, 3, f"{name}: writing")
     write_exr(out / f"{name}.exr", _channels(photo, labels, valid, objects))
-    write_json(out / f"{name}.json", _summary(photo, labels, valid, facts, materials, stored.size))
+    write_photo_facts(out / f"{name}.json", _summary(photo, labels, valid, facts, materials, stored.size))
     progress(3, 3, name)
 
 
@@ -98,22 +98,22 @@ def _channels(photo: Photo, labels: Labels, valid: np.ndarray, objects: np.ndarr
 
 def _summary(
     photo: Photo, labels: Labels, valid: np.ndarray, facts: PhotoSlice, materials: list[str], size: tuple[int, int]
-) -> dict:
+) -> PhotoFacts:
     """`pixels` counts the valid ones of each material; `clipped_fraction` is the share of them clipped in any channel.
 
     All pixels are those of the EXR; `original_size` (width, height) is the photo's own, `factor` times as large, as displayed.
     """
     focal_px = facts.focal_px / photo.factor if facts.focal_px else photo.focal_px
-    return {
-        "width": photo.width,
-        "height": photo.height,
-        "factor": photo.factor,
-        "original_size": [size[1], size[0]],
-        "focal_px": focal_px,
-        "focal_source": "dataset" if facts.focal_px else "exif" if photo.focal_px else None,
-        "encoding": photo.encoding,
-        "exposure": photo.exposure,
-        "illumination": facts.illumination,
-        "pixels": {material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)},
-        "clipped_fraction": float(photo.clipped[valid].any(axis=-1).mean()),
-    }
+    return PhotoFacts(
+        width=photo.width,
+        height=photo.height,
+        factor=photo.factor,
+        original_size=(size[1], size[0]),
+        focal_px=focal_px,
+        focal_source="dataset" if facts.focal_px else "exif" if photo.focal_px else None,
+        encoding=photo.encoding,
+        exposure=photo.exposure,
+        illumination=facts.illumination,
+        pixels={material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)},
+        clipped_fraction=float(photo.clipped[valid].any(axis=-1).mean()),
+    )

@@ -13,16 +13,17 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from factorlib.dataset.schema import LightSlice
-from factorlib.export.materials import Material, read_materials
 from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
-from factorlib.jsonfile import read_json
-from factorlib.light.lobes import Lobes, read_lobes
+from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.render.ball import ball, ball_normals, observed_cells
 from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import resynthesised
+from factorlib.results.exposures import read_exposures
+from factorlib.results.lobes import read_lobes
+from factorlib.results.materials import Model, Reflectance, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 from factorlib.urm.observations import Observations, read_observations
@@ -47,8 +48,8 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name, names = inputs.photo, inputs.facts["dataset.materials"]
-    table = read_materials(inputs["export"] / "materials.json")
-    materials = [table[material] for material in names]
+    file = inputs["export"] / "materials.json"
+    materials = in_order(read_materials(file), names, file)
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light_of_photo(inputs), params.tail)
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
@@ -57,10 +58,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     def report(done: float, pixels: float) -> None:
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    model = read_json(inputs["solve"] / "materials.json")["model"]
-    tone = model.get("tone", {}).get(name)
+    model = read_materials(inputs["solve"] / "materials.json").model
+    tone = model.tone.get(name)
     again = resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs, model))
-    _write(out / "resynthesis" / name, shown(again, **tone) if tone else again, exposure)
+    _write(out / "resynthesis" / name, shown(again, tone.exponent, tone.pivot) if tone else again, exposure)
     seen = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
@@ -71,9 +72,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(total, total, name)
 
 
-def shadowed(inputs: Inputs, model: dict) -> Observations | None:
+def shadowed(inputs: Inputs, model: Model) -> Observations | None:
     """The photo's observations, where the solve took their visibility into account."""
-    return read_observations(inputs["urm"] / f"{inputs.photo}.parquet") if model.get("self_shadowing") else None
+    return read_observations(inputs["urm"] / f"{inputs.photo}.parquet") if model.self_shadowing else None
 
 
 def light_of_photo(inputs: Inputs) -> Lobes:
@@ -84,7 +85,7 @@ def light_of_photo(inputs: Inputs) -> Lobes:
         log.warning("%s: nothing is known of its light: its pictures are black", inputs.photo)
     if slice_.world_from_camera is not None:
         lobes = lobes.turned(np.array(slice_.world_from_camera).T)
-    return lobes.scaled(np.array(read_json(inputs["export"] / "exposures.json").get(inputs.photo, 1.0)))
+    return lobes.scaled(np.array(read_exposures(inputs["export"] / "exposures.json").get(inputs.photo, 1.0)))
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False) -> None:
@@ -94,7 +95,7 @@ def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False
     write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels) if disc else pixels)
 
 
-def _write_map(stem: Path, reflector: Reflector, material: Material, normals: np.ndarray, exposure: float, size: int) -> None:
+def _write_map(stem: Path, reflector: Reflector, material: Reflectance, normals: np.ndarray, exposure: float, size: int) -> None:
     """Radiance by normal, and which normals the photo shows: ringed in the PNG."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     radiance, observed = ball(reflector, material, size), observed_cells(normals, size)

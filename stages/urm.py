@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import numpy as np
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.visibility import Occluders, visibility
 from factorlib.images.exr import read_exr
-from factorlib.jsonfile import read_json
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import read_mesh
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.sample import sample
-from factorlib.urm.visibility import Occluders, visibility
 
 log = logging.getLogger("factorlib.urm")
 
@@ -53,7 +52,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         illumination=light["illumination"],
         materials=inputs.facts["dataset.materials"],
         least_confidence=params.least_confidence,
-        exposure=read_json(inputs["masks"] / f"{name}.json")["exposure"],
+        exposure=read_photo_facts(inputs["masks"] / f"{name}.json").exposure,
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
@@ -65,13 +64,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, params: Params) -> Observations:
     """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
-    poses = read_json(inputs["align"] / f"{inputs.photo}.json")
-    camera = Camera(shape[1], shape[0], poses["camera"]["focal_px"], tuple(poses["camera"]["principal_point"]))
-    found = visibility(occluders_of(inputs, poses["objects"]), camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
-    return msgspec.structs.replace(seen, visibility=found)
+    found = read_photo_poses(inputs["align"] / f"{inputs.photo}.json")
+    camera, occluders = found.camera.camera(shape[1], shape[0]), occluders_of(inputs, found.objects)
+    seen_past = visibility(occluders, camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
+    return msgspec.structs.replace(seen, visibility=seen_past)
 
 
-def occluders_of(inputs: Inputs, poses: dict) -> Occluders:
+def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Every object of the photo where `align` put it."""
     slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
     for thing in slice_.objects:
@@ -79,6 +78,5 @@ def occluders_of(inputs: Inputs, poses: dict) -> Occluders:
         mesh = read_mesh(
             inputs.file(entry.file), inputs.facts["dataset.materials"], entry.parts, entry.material, thing.materials, limits=NO_LIMITS
         )
-        meshes.append(scaled(mesh, poses[thing.name].get("scale", (1.0, 1.0, 1.0))))
-    placed = [poses[thing.name] for thing in slice_.objects]
-    return Occluders(meshes, [Pose(np.array(pose["rotation"]), np.array(pose["translation"])) for pose in placed])
+        meshes.append(scaled(mesh, poses[thing.name].scale))
+    return Occluders(meshes, [poses[thing.name].pose for thing in slice_.objects])

@@ -22,9 +22,9 @@ from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
 from benchmarks.align import shapes
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import Maps, rasterise
 from factorlib.generate.folder import write_labels, write_obj, write_photo
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Maps, rasterise
 from factorlib.meshes.mesh import Mesh
 
 WIDTH, HEIGHT = 640, 480

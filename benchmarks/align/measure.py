@@ -9,13 +9,13 @@ import numpy as np
 
 from benchmarks.align.cases import Case, case
 from benchmarks.solve.clock import Clock
-from factorlib.align.camera import Camera
 from factorlib.align.doubts import doubts
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou
 from factorlib.align.place import Thing, placed
-from factorlib.align.raster import Caster, Maps, rasterise
 from factorlib.align.search import Found, RunnerUp, Search
 from factorlib.align.trust import Trust, trust_in
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster, Maps, rasterise
 
 RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
 

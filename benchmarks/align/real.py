@@ -23,13 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.align.measure import normal_error_deg
 from benchmarks.solve.clock import Clock
-from factorlib.align.camera import Camera, Pose, angle_between
 from factorlib.align.coarse import toward
-from factorlib.align.raster import Caster, rasterise
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset, ObjectEntry
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose, angle_between
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import read_json
 from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs, silent

@@ -19,10 +19,10 @@ from jaxtyping import Bool, Float
 from benchmarks.solve.clock import Clock
 from benchmarks.solve.scores import material_scores, picture_scores
 from benchmarks.solve.sets import DISTANCE, SIZE, SphereSet, camera, sphere
-from factorlib.align.camera import Camera
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.generate.tracing import rgb, rigid, sensor
+from factorlib.geometry.camera import Camera
 from factorlib.model.bounds import ROUGHNESS
 from factorlib.model.materials import Materials
 

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.solve.sets import SphereSet
-from factorlib.evaluate.materials import Material as Estimate
 from factorlib.evaluate.materials import compare_materials
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -26,6 +25,7 @@ from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
+from factorlib.results.materials import Reflectance
 
 EVERY = 37  # pixels, for operators too slow for all
 Pictures = Mapping[tuple[str, str], Float[np.ndarray, "n 3"]]
@@ -79,9 +79,9 @@ def decibels(error: float) -> float:
 def material_scores(found: Materials, spheres: SphereSet) -> dict:
     """Mean and worst errors, and of each material: k_d and k_s (largest channel, relative) and roughness."""
     names = list(spheres.materials)
-    truths = {n: Estimate(m.diffuse, m.specular, m.roughness) for n, m in spheres.materials.items()}
+    truths = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in spheres.materials.items()}
     estimates = {
-        n: Estimate(tuple(found.diffuse[k].tolist()), tuple(found.specular[k].tolist()), float(found.roughness[k])) for k, n in enumerate(names)
+        n: Reflectance(tuple(found.diffuse[k].tolist()), tuple(found.specular[k].tolist()), float(found.roughness[k])) for k, n in enumerate(names)
     }
     errors = compare_materials(estimates, truths, dict.fromkeys(names, 0))
     kinds = ("diffuse", "specular", "roughness")

@@ -20,11 +20,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.align.camera import Camera
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.generate import lights
 from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, traced
+from factorlib.geometry.camera import Camera
 from factorlib.urm.observations import Observations
 
 SIZE, DISTANCE, GRAZING = 256, 6.0, 0.15

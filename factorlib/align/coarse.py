@@ -17,11 +17,11 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.fft import irfft2, rfft2
 
-from factorlib.align.camera import Camera, rotation_of_vector
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Caster
 from factorlib.align.state import State
 from factorlib.align.target import extent_of
+from factorlib.geometry.camera import Camera, rotation_of_vector
+from factorlib.geometry.raster import Caster
 
 GRID = 80  # pixels of the templates
 WHOLE, CUT = 36, 26  # mask's extent in them
@@ -36,19 +36,6 @@ class Candidate(msgspec.Struct, frozen=True):
 
     state: State
     error: float
-
-
-def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """Unit directions spread evenly over the sphere.
-
-    >>> float(np.abs(fibonacci_directions(500).mean(axis=0)).max()) < 1e-2
-    True
-    """
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
 def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Maps
+from factorlib.geometry.raster import Maps
 
 FULL_DISTANCE = 0.01  # of the mask's extent: nearer to a contour, a small error of pose or mesh shows another place
 FULL_COSINE = 0.3  # flatter than this, a small error of shape turns the normal much

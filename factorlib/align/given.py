@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.camera import Pose
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose
 from factorlib.meshes.mesh import Mesh
 
 FIELD_DEG = 1.0, 150.0  # of view, across the longer side, that cameras have

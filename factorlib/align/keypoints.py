@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import Caster
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import State, state_of
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster
 
 MOST_ERROR = 0.015  # of the photo's longer side, from a point named in the photo to the mesh's: more is a mistake
 LEAST_AGREEING = 4  # three have up to four poses

@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Maps
+from factorlib.geometry.raster import Maps
 from factorlib.images.picture import picture as shown_picture
 
 MESH, MASK = np.array([1.0, 0.15, 0.75]), np.array([0.2, 1.0, 0.2])  # contour colours

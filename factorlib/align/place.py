@@ -9,10 +9,8 @@ import msgspec
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import (
     CLEARLY_BETTER,
@@ -30,6 +28,8 @@ from factorlib.align.search import (
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, rasterise
 
 log = logging.getLogger("factorlib.align")
 

@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.camera import Camera
 from factorlib.align.evidence import labelled_iou
-from factorlib.align.raster import Caster
 from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined
 from factorlib.align.state import State
 from factorlib.align.target import Target
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh, scaled
 
 SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d

@@ -24,11 +24,11 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from factorlib.align.camera import Camera
 from factorlib.align.evidence import labelled_iou
-from factorlib.align.raster import Caster, Hits
 from factorlib.align.state import State
 from factorlib.align.target import Region, Target, border_pairs
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster, Hits
 
 CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
 LEAST_SCALE = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is

@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.camera import Camera, angle_between
 from factorlib.align.coarse import candidates, is_cut
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior, Refined, refined
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
+from factorlib.geometry.camera import Camera, angle_between
+from factorlib.geometry.raster import Caster, rasterise
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 SAME_DEG = 6.0  # refined poses nearer than this are one

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 
 
 class State(msgspec.Struct, frozen=True):

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.camera import Camera
 from factorlib.align.evidence import UNKNOWN, Evidence
+from factorlib.geometry.camera import Camera
 
 
 class Region(msgspec.Struct, frozen=True):

@@ -17,14 +17,14 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from factorlib.align.camera import Camera
 from factorlib.align.evidence import Evidence
 from factorlib.align.place import Placed, Thing
-from factorlib.align.raster import Caster
 from factorlib.align.refine import FocalPrior, contour_of, normal_equations
 from factorlib.align.search import Search, find, normal_difference
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster
 
 RESOLUTION, MARGIN = 200, 0.2
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from factorlib.geometry.sphere import mirror_directions
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
-from factorlib.model.cells import mirror_directions
 from factorlib.model.components import connected_components
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials

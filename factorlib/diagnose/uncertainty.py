@@ -33,9 +33,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
+from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
-from factorlib.model.cells import mirror_cells
 from factorlib.model.components import connected_components
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss

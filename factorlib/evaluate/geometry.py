@@ -8,35 +8,14 @@ Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the dista
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.conventions import FRONT
 from factorlib.images.boxes import box_sum
+from factorlib.results.metrics import AngleError, NormalError, PoseError
 
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
-
-
-class AngleError(msgspec.Struct, frozen=True):
-    """Degrees."""
-
-    median_deg: float
-    p90_deg: float
-
-
-class NormalError(msgspec.Struct, frozen=True):
-    pixels: int
-    estimate: AngleError
-    null: AngleError
-
-
-class PoseError(msgspec.Struct, frozen=True):
-    """rotation in degrees; translation as a fraction of the true distance; null is a random rotation's mean angle."""
-
-    rotation_deg: float
-    translation_relative: float
-    null_rotation_deg: float = RANDOM_ROTATION_DEG
 
 
 def normal_error(estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]):
@@ -79,7 +58,8 @@ def pose_error(estimate, truth) -> PoseError:
     """Of two cam_from_object, each with `rotation` 3×3 and `translation` 3 (`Pose` of the dataset's schema)."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
-    return PoseError(rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float)), float(moved) / distance)
+    turned = rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float))
+    return PoseError(turned, float(moved) / distance, RANDOM_ROTATION_DEG)
 
 
 def _summary(a: np.ndarray, b: np.ndarray) -> AngleError:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
@@ -30,6 +29,8 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
 )
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.geometry.sphere import mirror_directions
+from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
 SPHERE_SIZE = 32
@@ -38,30 +39,6 @@ MAPS = ("all", "mirrored", "unmirrored")
 COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
 
 Samples = Float[np.ndarray, "_ 3"]
-
-
-class LightError(msgspec.Struct, frozen=True):
-    """Fractions of the truth's root mean square, and degrees; 0 is perfect."""
-
-    rmse: float
-    rmse_scale_invariant: float
-    rgb_angle_deg: float
-
-
-class ScoredLight(msgspec.Struct, frozen=True):
-    estimate: LightError
-    null: LightError
-
-
-class LightErrors(msgspec.Struct, frozen=True):
-    """gauge -> view -> errors; the views are mirror, glossy, matte and map_all, map_mirrored, map_unmirrored.
-
-    mean: over lights.  mirrored_fraction: of the sphere, by light; null where no observation is known.
-    """
-
-    lights: dict[str, dict[str, dict[str, ScoredLight]]]
-    mean: dict[str, dict[str, ScoredLight]]
-    mirrored_fraction: dict[str, float | None]
 
 
 def light_error(estimate: Samples, truth: Samples) -> LightError:
@@ -111,7 +88,7 @@ def mirrored_directions(
 
     normals, views: camera frame;  frame_from_camera: identity for a light fixed to the camera.
     """
-    mirror = 2 * np.sum(normals * views, axis=-1, keepdims=True) * normals - views
+    mirror = mirror_directions(normals, views)
     row, column = lat_long_of_direction(mirror @ (YUP_FROM_CAMERA @ frame_from_camera).T)
     shape = np.array([COVERAGE_ROWS, 2 * COVERAGE_ROWS])
     hit = np.zeros(shape, bool)

@@ -13,64 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.results.materials import Reflectance, Vec3
+from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialErrors
+
 DARKEST = 0.01
-Vec3 = tuple[float, float, float]
 
 
-class Material(msgspec.Struct, frozen=True):
-    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
-
-    diffuse: Vec3
-    specular: Vec3
-    roughness: float
-
-
-GREY = Material(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
-
-
-class MaterialError(msgspec.Struct, frozen=True):
-    """roughness: |estimate − truth|; diffuse, specular: signed relative error of each channel, after the factor."""
-
-    roughness: float
-    diffuse: Vec3
-    specular: Vec3
-
-    @property
-    def worst_colour(self) -> float:
-        """The largest relative error of the six."""
-        return max(abs(e) for e in (*self.diffuse, *self.specular))
-
-
-class ComparedMaterial(msgspec.Struct, frozen=True):
-    component: int
-    truth: Material
-    estimate: Material  # as solved, the factor not applied
-    error: MaterialError
-    null: MaterialError
-
-
-class MaterialErrors(msgspec.Struct, frozen=True):
-    """factor: of each component, per channel, on the estimate.  The means are over materials (and channels)."""
-
-    factor: dict[str, Vec3]
-    materials: dict[str, ComparedMaterial]
-    mean_roughness: float
-    mean_diffuse: float
-    mean_specular: float
-    worst_roughness: float
-    worst_diffuse: float
-    worst_specular: float
-    null_mean_roughness: float
-    null_mean_diffuse: float
-    null_mean_specular: float
+GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
 
 
 def compare_materials(
-    estimates: Mapping[str, Material], truths: Mapping[str, Material], component: Mapping[str, int]
+    estimates: Mapping[str, Reflectance], truths: Mapping[str, Reflectance], component: Mapping[str, int]
 ) -> MaterialErrors | None:
     """Errors of the materials that have a truth; None where none has.
 
@@ -91,11 +47,11 @@ def compare_materials(
     return MaterialErrors(factor=factor, materials=compared, **_summary(compared))
 
 
-def common_factor(estimates: list[Material], truths: list[Material]) -> Vec3:
+def common_factor(estimates: list[Reflectance], truths: list[Reflectance]) -> Vec3:
     """The median over materials of true over estimated diffuse + specular, per channel; 1 where nothing is reflected.
 
-    >>> m = Material((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3)
-    >>> common_factor([m], [Material((0.4, 0.4, 0.1), (0.2, 0.1, 0.1), 0.3)])
+    >>> m = Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3)
+    >>> common_factor([m], [Reflectance((0.4, 0.4, 0.1), (0.2, 0.1, 0.1), 0.3)])
     (2.0, 1.0, 1.0)
     """
     estimated, true = (np.array([_albedos(m).sum(axis=0) for m in group]) for group in (estimates, truths))
@@ -103,15 +59,15 @@ def common_factor(estimates: list[Material], truths: list[Material]) -> Vec3:
     return tuple(float(v) for v in np.median(ratio, axis=0))
 
 
-def _albedos(material: Material) -> Float[np.ndarray, "2 3"]:
+def _albedos(material: Reflectance) -> Float[np.ndarray, "2 3"]:
     return np.array([material.diffuse, material.specular], float)
 
 
-def _floored(material: Material) -> Float[np.ndarray, "2 3"]:
+def _floored(material: Reflectance) -> Float[np.ndarray, "2 3"]:
     return np.maximum(_albedos(material), DARKEST)
 
 
-def _error(estimate: Material, truth: Material, factor: Vec3) -> MaterialError:
+def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialError:
     relative = (_albedos(estimate) * factor - _albedos(truth)) / _floored(truth)
     diffuse, specular = (tuple(float(v) for v in row) for row in relative)
     return MaterialError(roughness=abs(estimate.roughness - truth.roughness), diffuse=diffuse, specular=specular)

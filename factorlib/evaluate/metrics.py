@@ -1,52 +1,10 @@
-"""metrics.json as types: what is written when there is a truth, and the reason when a part of it is missing.
-
-Keys are stable; every number is finite.  A section that cannot be had is null and `reasons` says why, by section.
-
-set          counts of photos, materials, illuminations and of the connected components of the observation matrix
-resynthesis  always there: `factorlib.evaluate.resynthesis`
-materials    `factorlib.evaluate.materials`
-relighting   `factorlib.evaluate.relighting`
-light        `factorlib.evaluate.lights`
-normals      photo -> `factorlib.evaluate.geometry.NormalError`
-poses        photo -> object -> `factorlib.evaluate.geometry.PoseError`
-
-Wherever there are gauges: none, scalar_per_set, channel_per_photo (`factorlib.evaluate.gauge`).  PSNR in dB, linear
-relative to the white of the truth and after the tone map; DSSIM after the tone map (`factorlib.evaluate.picture`).
-"""
+"""Why a section of metrics.json is missing, and every number of a file with its path."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import msgspec
-
-from factorlib.evaluate.geometry import NormalError, PoseError
-from factorlib.evaluate.lights import LightErrors
-from factorlib.evaluate.materials import MaterialErrors
-from factorlib.evaluate.relighting import Relighting
-from factorlib.evaluate.resynthesis import Resynthesis
-
 NO_TRUTH = "the dataset names no truth"
-
-
-class Counts(msgspec.Struct, frozen=True):
-    photos: int
-    materials: int
-    illuminations: int
-    components: int
-
-
-class Metrics(msgspec.Struct, frozen=True):
-    """Everything that `evaluate` says of a set."""
-
-    set: Counts
-    resynthesis: Resynthesis
-    materials: MaterialErrors | None
-    relighting: Relighting | None
-    light: LightErrors | None
-    normals: dict[str, NormalError] | None
-    poses: dict[str, dict[str, PoseError]] | None
-    reasons: dict[str, str]
 
 
 SECTIONS = ("materials", "relighting", "light", "normals", "poses")

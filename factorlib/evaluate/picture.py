@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import correlate1d
+
+from factorlib.results.metrics import PictureError
 
 Picture = Float[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
@@ -24,14 +25,6 @@ HIGHEST_PSNR = 120.0
 WHITE_PERCENTILE = 99.0
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW = WINDOW / WINDOW.sum()
-
-
-class PictureError(msgspec.Struct, frozen=True):
-    """psnr_linear_db and psnr_tonemapped_db in dB, higher is better; dssim in [0, 1], 0 is the same picture."""
-
-    psnr_linear_db: float
-    psnr_tonemapped_db: float
-    dssim: float
 
 
 def white_of(truth: Picture, mask: Mask) -> float:

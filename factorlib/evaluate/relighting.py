@@ -13,37 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.evaluate.ball import Light, ball_normals, diffuse_ball, glossy_ball
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.evaluate.materials import Material
-from factorlib.evaluate.picture import PictureError, mean_error, picture_error, white_of
+from factorlib.evaluate.picture import mean_error, picture_error, white_of
+from factorlib.results.materials import Reflectance
+from factorlib.results.metrics import Kinds, Relighting, RelitBall
 
 BALL_SIZE = 32
 KINDS = ("in_true_light", "in_estimated_light", "null_grey", "null_mean_colour")
 GREY = 0.5
 
-Kinds = dict[str, PictureError]  # kind -> error
 Samples = Float[np.ndarray, "_ 3"]
-
-
-class RelitBall(msgspec.Struct, frozen=True):
-    """gauges: gauge -> kind -> error.  exposure = 1 / white of the true ball.  observed: seen in this light in a photo."""
-
-    observed: bool
-    exposure: float
-    gauges: dict[str, Kinds]
-
-
-class Relighting(msgspec.Struct, frozen=True):
-    """balls: light -> material.  The means are over balls; mean_unobserved over pairs that no photo shows, null if none."""
-
-    balls: dict[str, dict[str, RelitBall]]
-    mean: dict[str, Kinds]
-    mean_unobserved: dict[str, Kinds] | None
 
 
 class Appearances:
@@ -54,7 +37,7 @@ class Appearances:
         self.diffuse = diffuse_ball(light, self.normals)
         self.glossy: dict[float, Samples] = {}
 
-    def ball(self, material: Material) -> Samples:
+    def ball(self, material: Reflectance) -> Samples:
         value = np.asarray(material.diffuse) * self.diffuse
         if not any(material.specular):
             return value
@@ -64,8 +47,8 @@ class Appearances:
 
 
 def compare_relighting(
-    estimates: Mapping[str, Material],
-    truths: Mapping[str, Material],
+    estimates: Mapping[str, Reflectance],
+    truths: Mapping[str, Reflectance],
     estimated_lights: Mapping[str, Light],
     true_lights: Mapping[str, Light],
     seen: Mapping[str, Sequence[str]],

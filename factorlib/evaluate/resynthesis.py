@@ -18,16 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.evaluate.picture import PictureError, mean_error, picture_errors, white_of
+from factorlib.evaluate.picture import mean_error, picture_errors, white_of
+from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
 from factorlib.urm.extract import observed_pixels
 
 Picture = Float[np.ndarray, "h w 3"]
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-
-
-class ScoredPicture(msgspec.Struct, frozen=True):
-    estimate: PictureError
-    null: PictureError
 
 
 class Shot(msgspec.Struct, frozen=True):
@@ -40,33 +36,6 @@ class Shot(msgspec.Struct, frozen=True):
     white: float
     counts: dict[str, int]
     clipped_satisfied: float | None
-
-
-class PhotoErrors(msgspec.Struct, frozen=True):
-    """pixels, unused (of these), clipped, invalid, uncovered: numbers of pixels.  exposure = 1 / white of the photo.
-
-    gauges: gauge -> scores over all counted pixels; null where none counts.  materials: material -> gauge -> scores.
-    """
-
-    exposure: float
-    pixels: int
-    unused: int
-    clipped: int
-    invalid: int
-    uncovered: int
-    clipped_satisfied: float | None
-    factor: dict[str, tuple[float, float, float]]
-    gauges: dict[str, ScoredPicture] | None
-    materials: dict[str, dict[str, ScoredPicture]]
-
-
-class Resynthesis(msgspec.Struct, frozen=True):
-    """mean: over photos; worst_*: the lowest PSNR of any photo in the gauge `none`; null where no pixel counts at all."""
-
-    photos: dict[str, PhotoErrors]
-    mean: dict[str, ScoredPicture] | None
-    worst_psnr_linear_db: float | None
-    worst_psnr_tonemapped_db: float | None
 
 
 def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:

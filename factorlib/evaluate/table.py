@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import msgspec
 
-from factorlib.jsonfile import read_json
+from factorlib.results.metrics import read_metrics
 
 COMPARISONS = {"≤": operator.le, "≥": operator.ge}
 
@@ -90,7 +90,7 @@ def _cells(row: Row) -> tuple[str, str, str, str, str]:
 
 def main(path: str) -> int:
     """Print the table of the bounds of data/synthetic; 1 if any is broken."""
-    rows = rows_of(read_json(path), SYNTHETIC)
+    rows = rows_of(msgspec.to_builtins(read_metrics(path)), SYNTHETIC)
     print(table_text(rows))
     return 0 if all(row.ok for row in rows) else 1
 

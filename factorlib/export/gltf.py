@@ -20,16 +20,16 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from factorlib.export.materials import Material
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
+from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
 DIELECTRIC = 0.04
 EXTENSION = "KHR_materials_specular"
 
 
-def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Material]) -> None:
+def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance]) -> None:
     """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1]."""
     scene = trimesh.Scene()
     for label in mesh.labels:
@@ -41,14 +41,14 @@ def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Map
     write_bytes(path, data)
 
 
-def _set_materials(tree: dict[str, Any], materials: Mapping[str, Material]) -> None:
+def _set_materials(tree: dict[str, Any], materials: Mapping[str, Reflectance]) -> None:
     """Exact numbers, which the mesh library would round to eight bits."""
     for entry in tree["materials"]:
         entry.update(gltf_material(materials[entry["name"]]))
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), EXTENSION})
 
 
-def gltf_material(material: Material) -> dict[str, Any]:
+def gltf_material(material: Reflectance) -> dict[str, Any]:
     """The part of a glTF material that says how it reflects."""
     brightest = max(material.specular)
     base = np.array(material.diffuse) / (1 - brightest)

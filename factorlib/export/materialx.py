@@ -12,11 +12,11 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 
-from factorlib.export.materials import Material
+from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
 
 
-def write_materialx(path: str | Path, materials: Mapping[str, Material]) -> None:
+def write_materialx(path: str | Path, materials: Mapping[str, Reflectance]) -> None:
     """Write one `surfacematerial` per material, under its own name."""
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
@@ -25,7 +25,7 @@ def write_materialx(path: str | Path, materials: Mapping[str, Material]) -> None
     write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n")
 
 
-def _add_material(document: ET.Element, prefix: str, name: str, material: Material) -> None:
+def _add_material(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
     weight = max(material.specular) / material.total if material.total > 0 else 0.0
     diffuse = [v / (1 - weight) if weight < 1 else 0.0 for v in material.diffuse]
     specular = [v / weight if weight > 0 else 0.0 for v in material.specular]

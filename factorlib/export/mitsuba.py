@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.export.materials import Material
+from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
 
 VERSION = "3.0.0"
@@ -56,7 +56,7 @@ class Environment(msgspec.Struct, frozen=True):
     camera_from_light: Float[np.ndarray, "3 3"]
 
 
-def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Material], light: Environment) -> str:
+def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment) -> str:
     """The scene as XML; `materials` are those that shapes name, by name."""
     scene = ET.Element("scene", version=VERSION)
     for name, value in DEFAULTS.items():
@@ -73,7 +73,7 @@ def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Material
     return ET.tostring(scene, encoding="unicode") + "\n"
 
 
-def write_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: dict[str, Material], light: Environment) -> None:
+def write_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment) -> None:
     write_text(path, scene_xml(view, shapes, materials, light))
 
 
@@ -118,14 +118,14 @@ def _id(material: str, two_sided: bool) -> str:
     return f"material.{material}.two_sided" if two_sided else f"material.{material}"
 
 
-def _add_material(scene: ET.Element, name: str, material: Material, two_sided: bool) -> None:
+def _add_material(scene: ET.Element, name: str, material: Reflectance, two_sided: bool) -> None:
     if two_sided:
         _add_bsdf(ET.SubElement(scene, "bsdf", type="twosided", id=_id(name, two_sided)), material, {})
     else:
         _add_bsdf(scene, material, {"id": _id(name, two_sided)})
 
 
-def _add_bsdf(parent: ET.Element, material: Material, attributes: dict[str, str]) -> None:
+def _add_bsdf(parent: ET.Element, material: Reflectance, attributes: dict[str, str]) -> None:
     diffuse, specular = np.array(material.diffuse, dtype=float), np.array(material.specular, dtype=float)
     if not specular.any():
         _add_diffuse(parent, diffuse, attributes)

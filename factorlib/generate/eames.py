@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import rasterise
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, Things
 from factorlib.generate.synthetic import drawn_materials
 from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 

@@ -11,9 +11,9 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float, Int
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import Maps, rasterise
 from factorlib.dataset.schema import LEFT_OUT
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.focal import FILM_DIAGONAL
 from factorlib.images.transfer import srgb_encode

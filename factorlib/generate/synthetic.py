@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.camera import Camera, Pose, rotation_of_vector
-from factorlib.align.raster import rasterise
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.lights import Things
 from factorlib.generate.shapes import SHAPES
 from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.camera import Camera
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.generate.mitsuba_variant import mitsuba
+from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from factorlib.errors import InputError
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.model.blocks import Block
-from factorlib.model.cells import HELD_OUT_CELL, held_out_by_cells, mirror_cells
+from factorlib.model.cells import HELD_OUT_CELL, held_out_by_cells
 from factorlib.model.noise import Noise
 from factorlib.urm.observations import Observations
 

@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence, labelled_iou
-from factorlib.align.raster import Caster
 from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Caster
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import State, state_of
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster
 from factorlib.refine.choice import Settled, Standards, settled
 from factorlib.refine.descent import Photographed, moving_object
 from factorlib.refine.light import Surfaces

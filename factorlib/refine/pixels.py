@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import Caster, face_normals, unit
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, face_normals, unit
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.visibility import Occluders, visibility
 from factorlib.model.blocks import Block
 from factorlib.model.noise import Noise
 from factorlib.urm.extract import GRAZING
-from factorlib.urm.visibility import Occluders, visibility
 
 EDGE = 5  # pixels: the square about a pixel that shows one material, all of it valid
 CELLS = 20  # along the masks' extent

@@ -12,49 +12,24 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import msgspec
 import torch
 from jaxtyping import Float
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
-from torch.nn.functional import silu
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reflection import diffuse as diffuse_form
+from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
 from factorlib.reflection.filtering import Filtered, filtered_specular
+from factorlib.reflection.fused import fused
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST, Operator, Response, columns
 from factorlib.wholefile import write_bytes
 
 SHIPPED = Path(__file__).parent / "weights"
 FEATURES = {"diffuse": 8, "specular": 24}
-LARGEST = 8.0  # of the logarithm of the correction
-SHARPEST = 1e4  # in training
-
-
-class Layers(msgspec.Struct, frozen=True):
-    """A fully connected network of SiLU layers; `mean` and `scale` standardise its features."""
-
-    mean: Float[Tensor, "features"]
-    scale: Float[Tensor, "features"]
-    weights: list[Tensor]  # [out, in] each
-    biases: list[Tensor]
-
-    def __call__(self, features: Float[Tensor, "*b features"]) -> Float[Tensor, "*b"]:
-        x = (features - self.mean) * self.scale
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = silu(torch.nn.functional.linear(x, weight, bias))
-        return torch.nn.functional.linear(x, self.weights[-1], self.biases[-1])[..., 0]
-
-    def to(self, dtype: torch.dtype) -> Layers:
-        return Layers(self.mean.to(dtype), self.scale.to(dtype), [w.to(dtype) for w in self.weights], [b.to(dtype) for b in self.biases])
-
-
-def fading(sharpness: Tensor) -> Tensor:
-    """What is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
-    return torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
 
 
 def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
@@ -66,58 +41,15 @@ def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: F
     return torch.stack(torch.broadcast_tensors(*specular_columns(alpha, no, nz, oz, form)), -1)
 
 
-def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> tuple[Tensor, ...]:
-    """Features: bounded, smooth, and of the order of one; see `Filtered` for what they are made of."""
-    alpha = alpha.clamp(0.005, 1)
-    log_width = torch.log(form.sharpness.clamp_max(2e4))
-    u = form.ni / form.deviation
-    height = nz * torch.sqrt(form.sharpness)  # of the axis above the horizon, in widths of the lobe
-    mirror = form.sharpness * (1 + oz - 2 * no * nz).clamp_min(0)  # λ'(1 − z·m), m the mirror direction
-    return (
-        torch.log(alpha),
-        log_width,
-        form.ratio,
-        no,
-        torch.log(no.clamp_min(1e-4) + 0.02),
-        nz,
-        oz,
-        form.px,
-        form.py * form.py,
-        form.misfit / (1 + form.misfit),
-        torch.log(form.density + 1e-5),
-        torch.log1p(form.spread),
-        torch.log1p(torch.log1p(form.distance)),
-        form.ni,
-        torch.log(form.deviation + 1e-3),
-        u * torch.rsqrt(4 + u * u),
-        u * torch.rsqrt(0.2 + u * u),
-        form.cosine / (form.cosine + alpha),
-        form.lit,
-        no / (no + alpha),
-        height * torch.rsqrt(1 + height * height),
-        height * torch.rsqrt(16 + height * height),
-        mirror / (1 + mirror),
-        mirror / (16 + mirror),
-    )
-
-
 def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "*b features"]:
     columns = diffuse_columns(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)
     return torch.stack(torch.broadcast_tensors(*columns), -1)
-
-
-def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
-    u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
-    widths = mean, torch.log(lam.clamp_max(2e4)), across
-    return *widths, nz, nz * nz, mean * nz, u * torch.rsqrt(1 + u * u), u * torch.rsqrt(8 + u * u)
 
 
 class Network(Operator):
     """weights: folder with diffuse.safetensors and specular.safetensors; None takes the shipped ones."""
 
     def __init__(self, weights: str | Path | None = None, dtype: torch.dtype = torch.float32):
-        from factorlib.reflection.fused import fused
-
         super().__init__(dtype)
         folder = Path(weights) if weights is not None else SHIPPED
         self.layers = {part: read_layers(folder / f"{part}.safetensors", FEATURES[part]).to(dtype) for part in FEATURES}

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.render.reflect import Reflector, Shadows
 from factorlib.urm.observations import Observations
 

@@ -11,6 +11,7 @@ from factorlib.images.picture import exposure_of, picture
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.photos import ringed
 from factorlib.report.png import data_uri, outline, reduced
+from factorlib.results.metrics import ScoredLight
 from factorlib.urm.observations import Observations
 
 MAP_SIZE = 64
@@ -47,13 +48,14 @@ class LightRow(msgspec.Struct, frozen=True):
     known_uri: str | None
     known: float | None
     spheres: str | None
-    errors: dict | None
+    errors: dict[str, dict[str, ScoredLight]] | None
 
 
 def exposures(run: Artifacts) -> dict[str, float]:
     """One exposure per photo for all balls and reflectance maps in its light: the one its own picture is shown with."""
-    photos = (run.json("evaluate", "metrics.json") or {}).get("resynthesis", {}).get("photos", {})
-    return {name: photos.get(name, {}).get("exposure", 1.0) for name in run.set.photos}
+    metrics = run.metrics()
+    photos = metrics.resynthesis.photos if metrics else {}
+    return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
 
 def balls(run: Artifacts, seen: dict[str, list[str]], exposure: dict[str, float]) -> list[list[Cell]]:
@@ -111,7 +113,7 @@ def _side(observations: int) -> int:
     return int(np.clip(np.sqrt(observations * 2 / np.pi), 8, MAP_SIZE))
 
 
-def light_row(run: Artifacts, name: str, photos: list[str], errors: dict | None) -> LightRow | None:
+def light_row(run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None) -> LightRow | None:
     radiance = run.illumination(name)
     if radiance is None:
         return None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -15,8 +15,15 @@ from jaxtyping import Float
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
+from factorlib.results.exposures import read_exposures
+from factorlib.results.materials import Channels as Factors
+from factorlib.results.materials import MaterialTable, read_materials
+from factorlib.results.metrics import Metrics, read_metrics
+from factorlib.results.photos import PhotoFacts, read_photos
+from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.urm.observations import Observations, read_observations
 
+T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]
 Picture = Float[np.ndarray, "h w 3"]
 
@@ -37,15 +44,34 @@ class Artifacts(msgspec.Struct, frozen=True):
     set: PhotoSet
     log: Path | None = None
 
-    def json(self, stage: str, name: str) -> Any:
-        path = self.folders[stage] / name
-        return read_json(path) if path.exists() else None
+    def accuracy(self) -> dict[str, Any] | None:
+        """Of the networks, as `train` measured it."""
+        return self._read(read_json, "train", "accuracy.json")
 
-    def photo_facts(self) -> dict[str, dict]:
-        return self.json("masks", "photos.json") or {}
+    def photo_facts(self) -> dict[str, PhotoFacts]:
+        """By photo."""
+        return self._read(read_photos, "masks", "photos.json") or {}
+
+    def poses(self) -> dict[str, PhotoPoses]:
+        """By photo."""
+        return self._read(read_poses, "align", "poses.json") or {}
+
+    def solved(self) -> MaterialTable:
+        """The materials, their gauge and model as solved; without materials where there is no solve."""
+        return self._read(read_materials, "solve", "materials.json") or MaterialTable({})
+
+    def exposures(self) -> dict[str, Factors]:
+        """Factors of photos on their lights."""
+        return self._read(read_exposures, "solve", "exposures.json") or {}
+
+    def metrics(self) -> Metrics | None:
+        """What `evaluate` found."""
+        return self._read(read_metrics, "evaluate", "metrics.json")
 
     def illumination_of(self, photo: str) -> str:
-        return self.photo_facts().get(photo, {}).get("illumination", photo)
+        """The light's name: the photo's own where nothing is known of the photo."""
+        facts = self.photo_facts().get(photo)
+        return facts.illumination if facts else photo
 
     def illuminations(self) -> dict[str, list[str]]:
         """Photos of each illumination, in the order of the set."""
@@ -102,6 +128,10 @@ class Artifacts(msgspec.Struct, frozen=True):
         if self.log is None or not self.log.exists():
             return []
         return [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines() if line.strip()]
+
+    def _read(self, reader: Callable[[Path], T], stage: str, name: str) -> T | None:
+        path = self.folders[stage] / name
+        return reader(path) if path.exists() else None
 
     @staticmethod
     def _rgb(path: Path) -> Picture | None:

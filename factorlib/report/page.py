@@ -7,6 +7,7 @@ from itertools import groupby
 from typing import Any
 
 import jinja2
+import msgspec
 
 from factorlib.report import text
 from factorlib.report.appearance import balls, exposures, light_row, reflectance_maps
@@ -19,6 +20,7 @@ from factorlib.report.photos import AMPLIFICATION, PhotoRow
 from factorlib.report.plot import Series, line_plot
 from factorlib.report.poses import pose_rows
 from factorlib.report.training import training_of
+from factorlib.results.materials import Channels
 
 STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
 CONTENTS = {
@@ -53,11 +55,10 @@ def _grouped(head: list[str]) -> list[tuple[str, int]]:
 
 
 def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict[str, Any]:
-    metrics = run.json("evaluate", "metrics.json")
-    exposure, seen = exposures(run), {p: [m for m, n in f["pixels"].items() if n > 0] for p, f in run.photo_facts().items()}
+    metrics = run.metrics()
+    exposure, seen = exposures(run), {p: [m for m, n in f.pixels.items() if n > 0] for p, f in run.photo_facts().items()}
     cells = balls(run, seen, exposure)
-    errors_of_light = (metrics["light"] or {}).get("lights", {})
-    solved = run.json("solve", "materials.json") or {}
+    errors_of_light, solved = metrics.light.lights if metrics.light else {}, run.solved()
     return {
         "contents": list(CONTENTS.items()),
         "set": run.set,
@@ -71,10 +72,10 @@ def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict
         "cells": cells,
         "maps": [(p, reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         "lights": [r for n, p in run.illuminations().items() if (r := light_row(run, n, p, errors_of_light.get(n)))],
-        "missing": _by_reason(metrics["reasons"]),
+        "missing": _by_reason(metrics.reasons),
         "errors": error_tables(metrics, run.set.photos, run.set.materials),
-        "gauge": solved.get("gauge", {}),
-        "model": solved.get("model", {}),
+        "gauge": _sorted(solved.gauge),
+        "model": _sorted(solved.model),
         "exposures": _shared_exposures(run),
         "plots": _plots(run.convergence()),
         "poses": pose_rows(run),
@@ -83,13 +84,18 @@ def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict
     }
 
 
+def _sorted(part: msgspec.Struct) -> dict[str, Any]:
+    """A part of materials.json as it stands there."""
+    return msgspec.to_builtins(part, order="sorted")
+
+
 def _by_reason(reasons: dict[str, str]) -> dict[str, list[str]]:
     return {reason: sorted(s for s, why in reasons.items() if why == reason) for reason in sorted(set(reasons.values()))}
 
 
-def _shared_exposures(run: Artifacts) -> dict[str, list[float]]:
+def _shared_exposures(run: Artifacts) -> dict[str, Channels]:
     """Factors of photos on the light they share; those that are 1 say nothing."""
-    found = run.json("solve", "exposures.json") or {}
+    found = run.exposures()
     return {photo: factor for photo, factor in found.items() if any(abs(f - 1) > 1e-9 for f in factor)}
 
 

@@ -11,6 +11,7 @@ from factorlib.images.picture import picture
 from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts, Channels
 from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
+from factorlib.results.metrics import PhotoErrors
 
 AMPLIFICATION = 4
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
@@ -24,13 +25,12 @@ class Panel(msgspec.Struct, frozen=True):
 
 
 class PhotoRow(msgspec.Struct, frozen=True):
-    """One photo: four panels of the same crop, its facts and its errors (as in metrics.json, or None)."""
+    """One photo: four panels of the same crop, and its errors, where there are any."""
 
     name: str
     illumination: str
     panels: list[Panel]
-    facts: dict
-    errors: dict | None
+    errors: PhotoErrors | None
 
 
 def longest_side(photos: int) -> int:
@@ -38,13 +38,13 @@ def longest_side(photos: int) -> int:
     return 440 if photos <= 12 else 300
 
 
-def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: dict | None) -> PhotoRow:
+def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErrors | None) -> PhotoRow:
     """`tags`: the colour of each material in masks; `errors`: the photo's entry of the metrics."""
     masks, geometry, resynthesis = run.masks(name), run.geometry(name), run.resynthesis(name)
     shown = np.rint(masks["label"]) > 0
     box, longest = box_of(shown), longest_side(len(run.set.photos))
     cut = [{k: v[box] for k, v in channels.items()} for channels in (masks, geometry)]
-    exposure = errors["exposure"] if errors else 1.0
+    exposure = errors.exposure if errors else 1.0
     photo = np.nan_to_num(np.stack([cut[0][c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
     panels = [
         _panel("photo", _display(photo, exposure), longest),
@@ -54,7 +54,7 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: dict | No
         found = np.nan_to_num(resynthesis[box], posinf=0, neginf=0)
         panels.append(_panel("re-synthesis", _cut_out(_display(found, exposure), _explained(*cut)), longest))
         panels.append(_panel("difference", _difference(photo, found, exposure, *cut), longest))
-    return PhotoRow(name, run.illumination_of(name), panels, run.photo_facts().get(name, {}), errors)
+    return PhotoRow(name, run.illumination_of(name), panels, errors)
 
 
 def _display(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> Float[np.ndarray, "h w 3"]:

@@ -8,6 +8,8 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.report.headlines import LOW_IOU
 from factorlib.report.photos import longest_side
 from factorlib.report.png import box_of, data_uri, reduced
+from factorlib.results.photos import PhotoFacts
+from factorlib.results.poses import AS_IT_IS, ObjectEntry, PhotoPoses, RunnerUp
 
 
 class ObjectRow(msgspec.Struct, frozen=True):
@@ -18,11 +20,11 @@ class ObjectRow(msgspec.Struct, frozen=True):
     suspicious: bool
     agreement: float | None
     score: float | None
-    runner_up: dict | None  # score, normal_difference_deg
+    runner_up: RunnerUp | None
     doubts: list[str]
     left_out: bool
     earlier: bool = False  # taken from an earlier result
-    scale: list[float] | None = None  # factors of the mesh's axes, where they are not 1
+    scale: tuple[float, float, float] | None = None  # factors of the mesh's axes, where they are not 1
 
 
 class PoseRow(msgspec.Struct, frozen=True):
@@ -30,38 +32,37 @@ class PoseRow(msgspec.Struct, frozen=True):
 
     photo: str
     uri: str | None
-    focal_px: float | None
+    focal_px: float
     focal_source: str | None
     objects: list[ObjectRow]
     factor: int
-    original_size: list[int] | None
+    original_size: tuple[int, int] | None
 
 
 def pose_rows(run: Artifacts) -> list[PoseRow]:
-    poses, facts = run.json("align", "poses.json") or {}, run.photo_facts()
-    return [_row(run, photo, poses[photo], facts.get(photo, {})) for photo in run.set.photos if photo in poses]
+    poses, facts = run.poses(), run.photo_facts()
+    return [_row(run, photo, poses[photo], facts.get(photo)) for photo in run.set.photos if photo in poses]
 
 
-def _row(run: Artifacts, photo: str, entry: dict, facts: dict) -> PoseRow:
-    source = entry["camera"].get("focal_source", facts.get("focal_source"))
+def _row(run: Artifacts, photo: str, entry: PhotoPoses, facts: PhotoFacts | None) -> PoseRow:
+    source = entry.camera.focal_source
     return PoseRow(
         photo,
         _overlay(run, photo),
-        entry["camera"].get("focal_px"),
+        entry.camera.focal_px,
         None if source == "estimated" else source,
-        [_object(name, said) for name, said in entry["objects"].items()],
-        facts.get("factor", 1),
-        facts.get("original_size"),
+        [_object(name, found) for name, found in entry.objects.items()],
+        facts.factor if facts else 1,
+        facts.original_size if facts else None,
     )
 
 
-def _object(name: str, said: dict) -> ObjectRow:
-    iou, doubts = said.get("silhouette_iou"), said.get("doubts", [])
+def _object(name: str, found: ObjectEntry) -> ObjectRow:
+    iou, doubts = found.silhouette_iou, found.doubts
     suspicious = bool(doubts) or (iou is not None and iou < LOW_IOU)
-    scale = said.get("scale", [1.0] * 3)
     return ObjectRow(
-        name, iou, suspicious, said.get("label_agreement"), said.get("score"), said.get("runner_up"), doubts, said.get("left_out", False),
-        said.get("source") == "refined", scale if scale != [1.0] * 3 else None,
+        name, iou, suspicious, found.label_agreement, found.score, found.runner_up, doubts, found.left_out,
+        found.source == "refined", found.scale if found.scale != AS_IT_IS else None,
     )  # fmt: skip
 
 

@@ -8,17 +8,18 @@ from scipy.optimize import linear_sum_assignment
 
 from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts
+from factorlib.results.materials import Reflectance
 
 PALETTE = ("#d1495b", "#2e8b57", "#3d6fb6", "#e0b13a", "#7d4f9e", "#3fb0c4", "#e07b39", "#8c6d46", "#9aa53a",
            "#e8e8e8", "#303438")  # fmt: skip
+UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # of a material that was not solved
 
 
 def material_tags(run: Artifacts) -> dict[str, str]:
     """A colour "#rrggbb" of each material of the set, near to its diffuse one (to its specular one, for a metal)."""
-    solved = (run.json("solve", "materials.json") or {}).get("materials", {})
-    unknown = {"diffuse": [0.2] * 3, "specular": [0.0] * 3}
-    found = [solved.get(name, unknown) for name in run.set.materials]
-    return nearest_tags(run.set.materials, np.array([np.add(m["diffuse"], np.multiply(0.15, m["specular"])) for m in found]))
+    solved = run.solved().materials
+    found = [solved.get(name, UNKNOWN) for name in run.set.materials]
+    return nearest_tags(run.set.materials, np.array([np.add(m.diffuse, np.multiply(0.15, m.specular)) for m in found]))
 
 
 def nearest_tags(names: list[str], reflectance: Float[np.ndarray, "m 3"]) -> dict[str, str]:

@@ -35,7 +35,7 @@ class Training(msgspec.Struct, frozen=True):
 
 def training_of(run: Artifacts) -> Training | None:
     """accuracy.json is {network: {measure: number, quantity: {bin: {measure: number}}}}."""
-    accuracy = run.json("train", "accuracy.json")
+    accuracy = run.accuracy()
     if accuracy is None:
         return None
     text = str(accuracy)

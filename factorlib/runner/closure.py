@@ -218,7 +218,7 @@ class Sources:
     def _source(self, name: str, file: Path) -> Source:
         if file.is_dir():
             return Source("", [], Names({}, {}, {}), [], {})
-        return self.hashes.source(file, lambda: self._parse(name, file))
+        return self.hashes.source(file, lambda: self._parse(name, file), Source)
 
     @staticmethod
     def _parse(name: str, file: Path) -> Source:

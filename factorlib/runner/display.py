@@ -1,4 +1,4 @@
-"""What a user sees of a run: bars on a terminal, plain lines elsewhere; a long step always shows life."""
+"""What a user sees of a run where there is no terminal: plain lines; a long step always shows life."""
 
 from __future__ import annotations
 
@@ -8,15 +8,6 @@ import time
 from factorlib.runner.plan import Planned, Step
 
 BEAT = 10.0  # seconds between two plain lines about the same step
-
-
-def display_for(stream=None) -> Display:
-    stream = stream or sys.stderr
-    if stream.isatty():
-        from factorlib.runner.bars import Bars
-
-        return Bars()
-    return Display(stream)
 
 
 class Display:

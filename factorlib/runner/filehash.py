@@ -8,15 +8,13 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from factorlib.wholefile import replace_file
 
-if TYPE_CHECKING:
-    from factorlib.runner.closure import Source
-
+T = TypeVar("T")
 Signature = tuple[int, int, int, int]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
 FORMAT = 3  # of the cache; one of another format is made anew
@@ -61,10 +59,9 @@ class FileHashes:
     def content(self, path: Path) -> str:
         return self._remembered(self._contents, path, lambda: hash_of_file(path), Hash)
 
-    def source(self, path: Path, parse: Callable[[], Source]) -> Source:
-        from factorlib.runner.closure import Source
-
-        return self._remembered(self._sources, path, parse, Source)
+    def source(self, path: Path, parse: Callable[[], T], type_: type[T]) -> T:
+        """What `parse` makes of a file of source, remembered; type_: what that is."""
+        return self._remembered(self._sources, path, parse, type_)
 
     def _remembered(self, table: dict, path: Path, make: Callable, type_: type):
         now = signature(path)

@@ -51,8 +51,8 @@ def check_stage(project: Project, name: str, verbs: list[str]) -> None:
 
 
 def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
-    from factorlib.runner.display import display_for
     from factorlib.runner.run import Refused, run
+    from factorlib.runner.screen import display_for
 
     display = display_for()
     try:

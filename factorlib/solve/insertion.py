@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.lobes import lobe_integral
-from factorlib.light.sphere import fibonacci_sphere
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes

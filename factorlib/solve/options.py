@@ -20,36 +20,42 @@ SpecularParts = Literal["auto", "on"]
 ToneCurves = Literal["auto", "off"]
 
 
-class Bundle(Struct, frozen=True):
-    """How the joint problem is solved.
-
-    lobes           most lobes an illumination may get; held-out observations may stop earlier
-    insert          lobes that each illumination gets in a round
-    rounds          most rounds
-    iterations      of the joint descent in a round
-    polish, settle  iterations at the end, on four times the sample and on all observations
-    sample          the least observations per illumination that choose the lobes (60 for each lobe where that is more)
-    tolerance       a descent stops after two steps that gain less than this share of the loss
-    least_gain      share of the held-out loss that a round must gain to be the best one
-    start_roughness, start_specular_share   of the materials that rounds start from
-    self_shadowing  whether what meshes hide is taken to be dark; `auto`: where held-out observations are explained better so
-    specular        whether every material has a specular part; `auto`: where held-out observations are explained worse without
-    tone            whether photos may have a tone curve beyond their encoding; `auto`: where held-out observations ask for it
-    seed            of samples and of what is held out
-    """
+class Choices(Struct, frozen=True):
+    """What of the bundle solver a user may choose."""
 
     lobes: Lobes = 72
+    """Most lobes of an illumination; held-out observations may stop earlier."""
     insert: Inserted = 12
+    """Lobes that each illumination gets in a round."""
     rounds: Rounds = 12
+    """Most rounds of inserting lobes."""
     iterations: Iterations = 10
+    """Iterations of the joint descent in a round."""
     polish: Polish = 20
+    """Iterations of the descent at the end, on four times the sample."""
     settle: Polish = 2
+    """Iterations of the descent at the very end, on all observations."""
     sample: Sample = 1500
+    """Least number of observations of an illumination on which lobes are chosen; 60 for each lobe where that is more."""
     tolerance: Tolerance = 1e-3
+    """A descent stops after two steps that lower the loss by less than this share of it."""
     least_gain: Share = 0.01
+    """Share of the held-out loss that a round must gain to be taken as the best one."""
+    self_shadowing: SelfShadowing = "auto"
+    """Whether what meshes hide of the light is dark; auto: where that explains held-out observations better."""
+    specular: SpecularParts = "auto"
+    """Whether every material has a specular part; auto: where held-out observations are explained worse without."""
+    tone: ToneCurves = "auto"
+    """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
+    seed: Seed = 0
+    """Seed of the samples, and of what is held out."""
+
+
+class Bundle(Choices, frozen=True):
+    """How the joint problem is solved.
+
+    start_roughness, start_specular_share   of the materials that rounds start from
+    """
+
     start_roughness: float = 0.4
     start_specular_share: float = 0.2
-    self_shadowing: SelfShadowing = "auto"
-    specular: SpecularParts = "auto"
-    tone: ToneCurves = "auto"
-    seed: Seed = 0

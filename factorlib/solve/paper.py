@@ -37,7 +37,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS, SHARPNESS
 from factorlib.model.gauge import in_gauge

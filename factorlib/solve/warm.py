@@ -24,14 +24,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import ROUGHNESS, SHARPNESS
+from factorlib.model.bounds import ROUGHNESS, SHARPNESS, TONE
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
+from factorlib.results.solution import Earlier
 from factorlib.solve.descent import Descent, descend
-from factorlib.solve.earlier import Earlier
 from factorlib.solve.insertion import blurred, pruned
 from factorlib.solve.options import Bundle
 from factorlib.solve.roughness import materials_out_of_valleys
@@ -81,7 +81,7 @@ def _light(earlier: Earlier, block: Block) -> Light | None:
         return None
     axis = lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True)
     tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
-    log_tone = np.log(tone) if len(tone) == len(block.photos) else np.zeros(0)
+    log_tone = np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0)
     return Light(axis, np.log(np.clip(lobes.sharpness, *SHARPNESS)), lobes.weight / block.unit, exposure, log_tone)
 
 

@@ -1,9 +1,9 @@
-"""Groups of observations that are alike, and cells of directions to tell which are."""
+"""Groups of observations that are alike."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 
 def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "g"], Int[np.ndarray, "n"]]:
@@ -23,13 +23,3 @@ def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "g"], Int[np.n
     group = np.empty(len(keys), np.int64)
     group[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
     return np.minimum.reduceat(order, starts), group
-
-
-def direction_cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n 3"]:
-    """Cells of roughly `size` radians: an octahedral map of the sphere, cut into squares."""
-    x, y, z = np.moveaxis(direction / np.abs(direction).sum(-1, keepdims=True), -1, 0)
-    fold = z > 0  # the viewer's side (z < 0) stays whole in the middle
-    u = np.where(fold, (1 - np.abs(y)) * np.sign(x), x)
-    v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
-    step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
-    return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)

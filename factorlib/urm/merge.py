@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import csr_array
 
-from factorlib.light.sphere import fibonacci_sphere
-from factorlib.urm.cells import direction_cells, groups
+from factorlib.geometry.sphere import direction_cells, fibonacci_sphere, mirror_directions
+from factorlib.urm.cells import groups
 from factorlib.urm.observations import Observations
 
 HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
@@ -31,7 +31,7 @@ def merge(observations: Observations, degrees: float) -> Observations:
     if degrees <= 0 or len(observations) == 0:
         return observations
     cell = np.radians(degrees)
-    mirror = 2 * np.sum(observations.normal * observations.view, -1, keepdims=True) * observations.normal - observations.view
+    mirror = mirror_directions(observations.normal, observations.view)
     flags = observations.clipped @ np.array([1, 2, 4])
     keys = np.column_stack([observations.photo, observations.material, flags, direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)])
     if observations.visibility is not None:

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Int
 
-from factorlib.urm.cells import direction_cells, groups
+from factorlib.geometry.sphere import direction_cells
+from factorlib.urm.cells import groups
 from factorlib.urm.observations import Observations
 
 CELL = np.radians(3.0)  # of normals: about as well as poses and meshes are known

@@ -6,9 +6,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.evidence import Evidence
-from factorlib.align.raster import Caster, rasterise
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import usable
 from factorlib.meshes.soup import Soup, no_normals

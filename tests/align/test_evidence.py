@@ -8,8 +8,8 @@ from factorlib.align.coarse import is_cut
 from factorlib.align.confidence import confidence
 from factorlib.align.evidence import UNKNOWN, Evidence, label_agreement, labelled_iou, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
-from factorlib.align.raster import rasterise
 from factorlib.align.target import target_of
+from factorlib.geometry.raster import rasterise
 from tests.align.scenes import at, ball, chair, dumbbell, evidence_of, mesh_of, photo_of
 
 

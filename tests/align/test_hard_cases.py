@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.evidence import Evidence, label_agreement, silhouette_iou
 from factorlib.align.place import Thing, placed
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import Search
 from factorlib.align.trust import trust_in
 from factorlib.errors import InputError
 from factorlib.generate.shapes import closed_grid
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import CREASE_DEG, read_mesh, usable
 from factorlib.meshes.soup import Soup, no_normals
 from tests.align.scenes import at, ball, blob, chair, evidence_of, mesh_of, photo_of

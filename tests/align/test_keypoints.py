@@ -8,9 +8,9 @@ import pytest
 from factorlib.align.evidence import Evidence
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.place import Thing, placed
-from factorlib.align.raster import Caster
 from factorlib.align.search import focal_prior
 from factorlib.errors import InputError
+from factorlib.geometry.raster import Caster
 from tests.align.scenes import ball, chair, evidence_of, mesh_of, normal_error_deg, photo_of
 
 TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip

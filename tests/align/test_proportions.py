@@ -8,10 +8,10 @@ import pytest
 from factorlib.align import proportions as module
 from factorlib.align.evidence import Evidence
 from factorlib.align.proportions import SHAPES, Sighting, jacobian_with_shape, proportions
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors, scaled
 from tests.align.scenes import blob, chair, photo_of
 

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Pose, angle_between
 from factorlib.align.coarse import is_cut
 from factorlib.align.evidence import UNKNOWN, Evidence
-from factorlib.align.raster import Caster, rasterise
 from factorlib.align.search import Search, find, focal_prior
+from factorlib.geometry.camera import Pose, angle_between
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import usable
 from factorlib.meshes.soup import Soup, no_normals
 from tests.align.scenes import ball, blob, chair, dumbbell, evidence_of, mesh_of, normal_error_deg, photo_of

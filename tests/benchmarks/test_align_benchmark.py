@@ -12,11 +12,11 @@ from benchmarks.align import cases, real, shapes
 from benchmarks.align.measure import normal_error_deg
 from benchmarks.align.tables import as_tables, real_tables
 from benchmarks.markdown import refresh
-from factorlib.align.camera import Pose, angle_between, rotation_of_vector
 from factorlib.align.coarse import toward
-from factorlib.align.raster import rasterise
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose, angle_between, rotation_of_vector
+from factorlib.geometry.raster import rasterise
 from factorlib.jsonfile import write_json
 from factorlib.meshes.read import read_mesh
 

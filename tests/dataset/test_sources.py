@@ -10,12 +10,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.camera import Camera, Pose
 from factorlib.align.told import camera_told
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Told
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
 
 SIZE = 200, 150
 POINTS = np.array([[0.3, -0.2, 0.1], [-0.4, 0.1, 0.6], [0.0, 0.5, -0.3]])

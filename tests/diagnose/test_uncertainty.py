@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.diagnose.coverage import LARGEST, relative_standard_errors
 from factorlib.diagnose.uncertainty import clustered_equations, standard_errors
@@ -19,7 +20,6 @@ from factorlib.solve.history import Run
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
 FEW_LOBES = Bundle(lobes=16, insert=8, rounds=4, specular="on")

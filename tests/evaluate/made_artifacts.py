@@ -14,20 +14,20 @@ import pyarrow.parquet as pq
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, ball_normals, light_of_lat_long
-from factorlib.evaluate.materials import Material
 from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
+from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
 from factorlib.urm.extract import observations_of_photo
 from factorlib.urm.observations import write_observations
 
 SIZE = 24
 TRUE = {
-    "red": Material((0.5, 0.1, 0.08), (0.06, 0.06, 0.06), 0.3),
-    "white": Material((0.6, 0.6, 0.55), (0.05, 0.05, 0.05), 0.5),
-    "brass": Material((0.05, 0.04, 0.02), (0.5, 0.4, 0.2), 0.25),
-    "black": Material((0.02, 0.02, 0.02), (0.04, 0.04, 0.04), 0.2),
+    "red": Reflectance((0.5, 0.1, 0.08), (0.06, 0.06, 0.06), 0.3),
+    "white": Reflectance((0.6, 0.6, 0.55), (0.05, 0.05, 0.05), 0.5),
+    "brass": Reflectance((0.05, 0.04, 0.02), (0.5, 0.4, 0.2), 0.25),
+    "black": Reflectance((0.02, 0.02, 0.02), (0.04, 0.04, 0.04), 0.2),
 }
 
 
@@ -53,8 +53,8 @@ def light_map(seed: int, height: int = 32) -> np.ndarray:
     return value
 
 
-def perturbed(material: Material, error: float) -> Material:
-    return Material(
+def perturbed(material: Reflectance, error: float) -> Reflectance:
+    return Reflectance(
         tuple(v * (1 + 0.04 * error) for v in material.diffuse),
         tuple(v * (1 - 0.05 * error) for v in material.specular),
         material.roughness + 0.02 * error,
@@ -168,7 +168,6 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     for stage in ("solve", "export"):
         write_json(folders[stage] / "materials.json", result)
         write_json(folders[stage] / "exposures.json", {p: [1.0, 1.0, 1.0] for p in made.seen})
-    write_json(folders["solve"] / "uncertainty.json", {})
     steps = np.arange(30)
     history = {"iteration": steps, "round": steps // 10, "lobes": 4 * (1 + steps // 10)}
     history |= {"loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02}

@@ -2,7 +2,8 @@
 
 import pytest
 
-from factorlib.evaluate.materials import Material, compare_materials
+from factorlib.evaluate.materials import compare_materials
+from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE, perturbed
 
 ONE = dict.fromkeys(TRUE, 0)
@@ -10,7 +11,7 @@ ONE = dict.fromkeys(TRUE, 0)
 
 def scaled(material, factor):
     times = [tuple(v * f for v, f in zip(colour, factor)) for colour in (material.diffuse, material.specular)]
-    return Material(*times, material.roughness)
+    return Reflectance(*times, material.roughness)
 
 
 def test_a_factor_per_channel_is_no_error():
@@ -49,6 +50,6 @@ def test_unseen_and_untold_materials_are_left_out():
 
 
 def test_black_specular_has_no_infinite_error():
-    truth = {"chalk": Material((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)}
-    estimate = {"chalk": Material((0.5, 0.5, 0.5), (0.005, 0.0, 0.0), 0.5)}
+    truth = {"chalk": Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)}
+    estimate = {"chalk": Reflectance((0.5, 0.5, 0.5), (0.005, 0.0, 0.0), 0.5)}
     assert compare_materials(estimate, truth, {"chalk": 0}).materials["chalk"].error.specular[0] == pytest.approx(0.5, rel=0.3)

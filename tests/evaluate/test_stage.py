@@ -7,10 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.evaluate.metrics import NO_TRUTH, Metrics, flattened
+from factorlib.evaluate.metrics import NO_TRUTH, flattened
 from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json, write_json
+from factorlib.results.metrics import Metrics
 from factorlib.stage import silent
 from stages import evaluate
 from tests.evaluate.made_artifacts import Made, make_artifacts

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import rasterise
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.light.lobes import Lobes, write_lobes
+from factorlib.light.lobes import Lobes
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.network import SHIPPED
+from factorlib.results.lobes import write_lobes
 from factorlib.stage import Inputs
 
 NAMES = ["red", "brass", "unseen"]

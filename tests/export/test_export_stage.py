@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT
-from factorlib.export.materials import materials_of_table, read_materials
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy
-from factorlib.light.lobes import read_lobes, write_lobes
 from factorlib.reflection import reflection_operator
+from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.materials import read_materials
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
@@ -36,8 +36,8 @@ def files_of(folder):
 
 def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_path):
     out, operator = run(inputs, tmp_path / "out"), reflection_operator("closed_form", dtype="float64")
-    solved = materials_of_table(read_json(inputs["solve"] / "materials.json"))
-    found, lobes = read_materials(out / "materials.json"), read_lobes(out / "lobes.parquet")
+    solved = read_materials(inputs["solve"] / "materials.json").materials
+    found, lobes = read_materials(out / "materials.json").materials, read_lobes(out / "lobes.parquet")
     normal = torch.tensor(FRONT[None])
     for name, light in made_export.lights().items():
         for material in solved:

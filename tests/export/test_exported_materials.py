@@ -9,34 +9,35 @@ import pytest
 import trimesh
 
 from factorlib.export.gltf import write_glb
-from factorlib.export.materials import Material, headroom_factor, table_in_gauge
+from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.meshes.mesh import Mesh
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
 
-BRIGHT = Material((0.9, 0.3, 0.2), (0.1, 0.2, 0.3), 0.5)
-CASES = {"bright": BRIGHT.scaled(0.8), "matte": Material((0.2, 0.3, 0.4), (0, 0, 0), 0.9), "metal": Material((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
-         "black": Material((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
+
+def bright(scale: float) -> Reflectance:
+    return Reflectance(*(tuple(scale * v for v in colour) for colour in ((0.9, 0.3, 0.2), (0.1, 0.2, 0.3))), 0.5)
+
+
+CASES = {"bright": bright(0.8), "matte": Reflectance((0.2, 0.3, 0.4), (0, 0, 0), 0.9), "metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
+         "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.8, 1.0, 30.0])
 def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
-    materials = {"a": BRIGHT.scaled(scale), "b": BRIGHT.scaled(0.01)}
+    materials = {"a": bright(scale), "b": bright(0.01)}
     factor = headroom_factor(materials)
-    assert max(m.scaled(factor).total for m in materials.values()) <= 1 - 1e-5 + 1e-15
-    assert factor == 1.0 if BRIGHT.scaled(scale).total < 1 - 1e-5 else factor < 1
+    assert max(factor * m.total for m in materials.values()) <= 1 - 1e-5 + 1e-15
+    assert factor == 1.0 if bright(scale).total < 1 - 1e-5 else factor < 1
 
 
 def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
-    entry = {"diffuse": [0.8] * 3, "specular": [0.4] * 3, "roughness": 0.3, "alpha": 0.09}
-    table = {
-        "materials": {"a": {**entry, "stderr": {"diffuse": [0.1] * 3, "specular": [0.2] * 3, "roughness": 0.05}}},
-        "gauge": {"rule": "x"},
-    }
+    before = solved(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
+    table = MaterialTable({"a": before}, Gauge(rule="x"))
     found = table_in_gauge(table, 0.5)
-    assert found["materials"]["a"] == {"diffuse": [0.4] * 3, "specular": [0.2] * 3, "roughness": 0.3, "alpha": 0.09,
-                                       "stderr": {"diffuse": [0.05] * 3, "specular": [0.1] * 3, "roughness": 0.05}}  # fmt: skip
-    assert found["gauge"]["rule"] == "x" and found["gauge"]["export_factor"] == 0.5
-    assert table["materials"]["a"]["diffuse"] == [0.8] * 3
+    assert found.materials == {"a": solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))}
+    assert found.gauge.rule == "x" and found.gauge.export_factor == 0.5
+    assert table.materials["a"] == before
 
 
 def test_materialx_mixes_to_the_solved_reflectances(tmp_path):

@@ -8,7 +8,6 @@ from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import mitsuba_map, node_directions, sharpened
-from factorlib.export.materials import Material, read_materials
 from factorlib.export.mitsuba import Environment, Shape, View, write_scene
 from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
@@ -18,6 +17,7 @@ from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
+from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
 from stages import export, render
 from tests.export import made_export
@@ -82,7 +82,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("ball")
 
 
-def ball_scene(folder, material: Material, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
+def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
     """A ball in front of a square camera, through a scene file and a mesh file."""
     if not (folder / "ball.red.ply").exists():
         made_export.write_obj(folder / "ball.obj", (1, 1, 1))
@@ -111,14 +111,14 @@ def centroid(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_light_of_one_texel_comes_back_from_its_side(folder, side):
-    matte = Material((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    matte = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
     path = ball_scene(folder, matte, one_lobe(SIDES[side]))
     np.testing.assert_allclose(np.sign(np.round(centroid(rendered(path, spp=32)), 1)), SIDES[side][:2])
 
 
 def test_light_fixed_to_the_world_turns_with_the_camera(folder):
     turn = made_export.WORLD_FROM_CAMERA["side"]
-    matte = Material((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    matte = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
     still = rendered(ball_scene(folder, matte, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
     turned = rendered(ball_scene(folder, matte, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64)
     np.testing.assert_allclose(centroid(turned), centroid(still), atol=0.01)
@@ -128,10 +128,10 @@ def test_light_fixed_to_the_world_turns_with_the_camera(folder):
 # materials -----------------------------------------------------------------------------------------------------------
 
 CASES = {
-    "diffuse": Material((0.9, 0.5, 0.1), (0, 0, 0), 0.5),
-    "specular": Material((0, 0, 0), (0.9, 0.5, 0.1), 0.5),
-    "black": Material((0, 0, 0), (0, 0, 0), 0.5),
-    "all of it": Material((0.5, 0.2, 0.3), (0.1, 0.49999, 0.2), 0.4),
+    "diffuse": Reflectance((0.9, 0.5, 0.1), (0, 0, 0), 0.5),
+    "specular": Reflectance((0, 0, 0), (0.9, 0.5, 0.1), 0.5),
+    "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5),
+    "all of it": Reflectance((0.5, 0.2, 0.3), (0.1, 0.49999, 0.2), 0.4),
 }
 
 

@@ -23,13 +23,14 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from factorlib.align.earlier import read_earlier as read_earlier_poses
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.errors import InputError
 from factorlib.labels import read_labels
-from factorlib.light.lobes import Lobes, read_lobes, write_lobes
-from factorlib.solve.earlier import read_earlier as read_earlier_solution
+from factorlib.light.lobes import Lobes
+from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.poses import read_poses
+from factorlib.results.solution import read_earlier as read_earlier_solution
 from factorlib.urm.observations import Observations, read_observations, write_observations
 
 LONG = float(os.environ.get("FUZZ_SECONDS", "600"))
@@ -161,14 +162,15 @@ IMAGES_BIN = struct.pack("<Q", 2) + b"".join(
 )
 CAMERAS_TXT = b"# cameras\n1 PINHOLE 200 150 300 300.1 104 71\n2 RADIAL 200 150 300 104 71 0.0001 0\n"
 IMAGES_TXT = b"# images\n1 .7 .1 -.5 .5 1 2 3 1 7.png\n1 2 3\n2 .7 .1 -.5 .5 1 2 3 2 8.png\n\n"
+STDERR = {"diffuse": [0.1, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.1}
 MATERIALS_JSON = {
-    "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3}},
+    "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3, "alpha": 0.09, "stderr": STDERR}},
     "gauge": {"component": {"red": 0}},
     "model": {"specular": {"red": True}, "self_shadowing": True, "self_shadowing_chosen_by": {"on": 1.0}, "tone": {"hall": {"exponent": 1.0, "pivot": 0.5}}},
 }
 POSES_JSON = {
     "hall": {
-        "camera": {"focal_px": 300.0, "focal_source": "exif", "focal_relative_stderr": 0.1},
+        "camera": {"focal_px": 300.0, "principal_point": [8.0, 6.0], "focal_source": "exif", "focal_relative_stderr": 0.1},
         "objects": {"vase": {"rotation": EYE, "translation": [0.0, 0.0, 2.0], "scale": [1.0, 1.0, 1.0], "runner_up": None}},
     }
 }
@@ -273,7 +275,7 @@ PARTS = {  # name -> (file, source, its contents, reader)
     "lobes": ("lobes.parquet", None, None, lambda folder: read_lobes(folder / "lobes.parquet")),
     "earlier solution": ("materials.json", None, spoiled(MATERIALS_JSON).map(text_of), read_earlier_solution),
     "earlier exposures": ("exposures.json", None, spoiled({"hall": [1.0, 1.0, 1.0]}).map(text_of), read_earlier_solution),
-    "earlier poses": ("poses.json", None, spoiled(POSES_JSON).map(text_of), read_earlier_poses),
+    "earlier poses": ("poses.json", None, spoiled(POSES_JSON).map(text_of), lambda folder: read_poses(folder / "poses.json")),
 }
 
 

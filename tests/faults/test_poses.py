@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Pose
 from factorlib.align.given import check_before_camera, warn_of_camera
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose
 from tests.align.scenes import blob
 from tests.stages.test_align import run, step
 

@@ -12,7 +12,8 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
-from factorlib.light.lobes import Lobes, read_lobes, write_lobes
+from factorlib.light.lobes import Lobes
+from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.urm.observations import read_observations, write_observations
 from tests.faults.test_fuzz import observations
 

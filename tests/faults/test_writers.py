@@ -16,28 +16,29 @@ from factorlib.checkpoint import Checkpoint
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
-from factorlib.export.materials import Material
 from factorlib.export.materialx import write_materialx
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
-from factorlib.light.lobes import Lobes, write_lobes
+from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
+from factorlib.parquetfile import write_rows
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.reflection.training import Step
+from factorlib.results.lobes import write_lobes
+from factorlib.results.materials import Reflectance
 from factorlib.runner.project import LIBRARY
 from factorlib.solve.history import Event
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.wholefile import append_text, bytes_of, replace_file, write_text
-from stages.solve import _write_history
 from stages.train import _write_curves
 
 RNG = np.random.default_rng
 PIXELS = RNG(0).random((48, 64, 3), dtype=np.float32)
 CODES = (255 * PIXELS).astype(np.uint8)
-GLOSS = {name: Material((0.1, 0.2, 0.3), (0.1, 0.1, 0.1), 0.5) for name in ("red", "wood")}
+GLOSS = {name: Reflectance((0.1, 0.2, 0.3), (0.1, 0.1, 0.1), 0.5) for name in ("red", "wood")}
 
 
 def mesh() -> Mesh:
@@ -66,7 +67,7 @@ WRITERS = {
     "every stage: JSON": ("a.json", lambda path: write_json(path, {"a": PIXELS.tolist()})),
     "urm: observations": ("a.parquet", lambda path: write_observations(path, observations())),
     "solve: lobes": ("a.parquet", lambda path: write_lobes(path, {"a": Lobes(RNG(0).random((200, 3)), RNG(0).random(200), RNG(0).random((200, 3)))})),
-    "solve: convergence": ("a.parquet", lambda path: _write_history(path, [Event(k, "a", k, k / 7, k / 3, k) for k in range(500)])),
+    "solve: convergence": ("a.parquet", lambda path: write_rows(path, Event, [Event(k, "a", k, k / 7, k / 3, k) for k in range(500)])),
     "train: curves": ("a.parquet", lambda path: _write_curves(path, {"a": [Step(k, k / 3, k / 7, k / 9, k / 11) for k in range(300)]})),
     "train: weights": ("a.safetensors", lambda path: write_layers(path, layers())),
     "train and solve: what they go on from": ("a.pt", lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)})),

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Camera
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.generate import tracing
 from factorlib.generate.shapes import sphere
+from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
 
 pytest.importorskip("mitsuba")

@@ -6,7 +6,8 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
-from factorlib.light.lobes import Lobes, lobe_integral, no_lobes, read_lobes, write_lobes
+from factorlib.light.lobes import Lobes, lobe_integral, no_lobes
+from factorlib.results.lobes import read_lobes, write_lobes
 
 
 def some_lobes(count: int = 6, seed: int = 0) -> Lobes:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen, seen_share
 
 RNG = np.random.default_rng(4)

@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection import reflection_operator
 from factorlib.solve.normal_equations import normal_equations
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=3.0, prior=0.05)

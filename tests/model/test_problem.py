@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.gauge import in_gauge
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -15,7 +16,6 @@ from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 from factorlib.solve.step import damped_step
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 ORDER = [2, 0, 1]  # material k of the permuted problem is material ORDER[k] of the other

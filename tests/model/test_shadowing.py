@@ -4,7 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.light.sphere import fibonacci_sphere
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light, sphere_normals
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
@@ -20,7 +21,6 @@ from factorlib.solve.normal_equations import normal_equations
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
-from tests.solve.problems import MATERIALS, block, factor_between, random_light, sphere_normals
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 NAMES = ("red", "green", "blue")

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from factorlib.export.materials import Material
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.render.ball import ball, ball_normals, observed_cells
 from factorlib.render.reflect import Reflector
+from factorlib.results.materials import Reflectance
 
-MATTE = Material((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)
+MATTE = Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)
 
 
 def brightest(axis) -> tuple[float, float]:

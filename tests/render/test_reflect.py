@@ -6,16 +6,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.export.materials import Material
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.light.sphere import fibonacci_sphere
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
 from factorlib.render import reflect
 from factorlib.render.reflect import Reflector, Shadows
+from factorlib.results.materials import Reflectance
 
-GLOSSY = Material((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
+GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
 
 
 def unit(count: int, seed: int) -> np.ndarray:
@@ -37,7 +37,7 @@ def points(count: int) -> tuple[np.ndarray, np.ndarray]:
     return normals, views * np.sign((normals * views).sum(1, keepdims=True))
 
 
-def by_quadrature(lat_long: np.ndarray, material: Material, normals: np.ndarray, views: np.ndarray) -> np.ndarray:
+def by_quadrature(lat_long: np.ndarray, material: Reflectance, normals: np.ndarray, views: np.ndarray) -> np.ndarray:
     """Lambert + GGX over every texel of an exported map; normals and views in the camera frame."""
     height, width = lat_long.shape[:2]
     i = lat_long_directions(height, width).reshape(-1, 3)

@@ -5,12 +5,13 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT
-from factorlib.export.materials import materials_of_table
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.tone import curve
 from factorlib.jsonfile import read_json, write_json
-from factorlib.light.lobes import no_lobes, write_lobes
+from factorlib.light.lobes import no_lobes
 from factorlib.reflection import reflection_operator
+from factorlib.results.lobes import write_lobes
+from factorlib.results.materials import read_materials
 from factorlib.stage import silent
 from stages import export, render
 from tests.export import made_export
@@ -47,7 +48,7 @@ def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(
     inputs, _ = made
     world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()["front" if photo == "front" else "room"]
     normal = torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])  # in the light's own frame
-    solved = materials_of_table(read_json(inputs["solve"] / "materials.json"))
+    solved = read_materials(inputs["solve"] / "materials.json").materials
     out = run(made, photo, tmp_path / "out")
     for name in made_export.NAMES:
         expected = reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]

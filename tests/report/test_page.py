@@ -203,7 +203,7 @@ def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
     shutil.copytree(inputs["align"], tmp_path / "align")
     poses = json.loads((tmp_path / "align" / "poses.json").read_text())
     poses["noon"]["objects"]["balls"] |= {
-        "label_agreement": 0.71, "score": 0.912, "runner_up": {"score": 0.905, "normal_difference_deg": 41.0},
+        "label_agreement": 0.71, "score": 0.912, "runner_up": {**poses["noon"]["objects"]["balls"], "score": 0.905, "normal_difference_deg": 41.0},
         "doubts": ["mesh <and> mask differ"], "left_out": True, "source": "refined", "scale": [1.0, 1.05, 0.952],
     }  # fmt: skip
     (tmp_path / "align" / "poses.json").write_text(json.dumps(poses))

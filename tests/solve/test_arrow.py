@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
@@ -13,7 +14,6 @@ from factorlib.solve.arrow import DEFINITE, FLOOR
 from factorlib.solve.bounds import MOST_S, MOST_TURN, MOST_WIDTHS, Bounds, light_at_bound, materials_at_bound
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.step import damped_step
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2

@@ -5,6 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.model import bounds
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
@@ -15,7 +16,6 @@ from factorlib.solve.iterate import evaluate, fit_weights
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import answer_of, from_nothing
 from factorlib.stage import serial_map
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 QUICK = Bundle(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)

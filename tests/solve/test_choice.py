@@ -3,7 +3,8 @@
 import msgspec
 import numpy as np
 
-from factorlib.model.cells import mirror_cells
+from benchmarks.solve.problems import block, random_light
+from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
@@ -14,7 +15,6 @@ from factorlib.solve.descent import descend
 from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
-from tests.solve.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
 MIXED = Materials(

@@ -6,18 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.errors import InputError
-from factorlib.jsonfile import read_json
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations
-from factorlib.model.point import Point
-from factorlib.model.problem import JointProblem
-from factorlib.model.responses import material_slices
-from factorlib.reflection import reflection_operator
-from factorlib.stage import Inputs, silent
-from factorlib.urm.observations import write_observations
-from stages import solve as stage
-from tests.solve.hard_cases import (
+from benchmarks.solve.hard_cases import (
     BOUNDS,
     CASES,
     FLAT,
@@ -31,6 +20,17 @@ from tests.solve.hard_cases import (
     observed,
     of_random_starts,
 )
+from factorlib.errors import InputError
+from factorlib.jsonfile import read_json
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.responses import material_slices
+from factorlib.reflection import reflection_operator
+from factorlib.stage import Inputs, silent
+from factorlib.urm.observations import write_observations
+from stages import solve as stage
 
 ONE = "1 material × 1 light"
 

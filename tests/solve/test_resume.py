@@ -4,8 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.checkpoint import Checkpoint
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve import insertion, rounds
@@ -15,7 +16,6 @@ from factorlib.solve.options import Bundle
 from factorlib.solve.resume import Journal
 from factorlib.solve.rounds import from_nothing
 from factorlib.stage import serial_map
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)

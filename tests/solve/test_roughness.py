@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.images.tone import curve
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
@@ -11,7 +12,6 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.roughness import materials_out_of_valleys, reflectances
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 

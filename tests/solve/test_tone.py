@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.diagnose.identifiability import unlikely_curves
 from factorlib.images.tone import curve
 from factorlib.model.problem import JointProblem
@@ -12,7 +13,6 @@ from factorlib.solve.bundle import solve
 from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 QUICK = Bundle(lobes=8, insert=4, rounds=3, iterations=8, polish=15, tolerance=1e-4)

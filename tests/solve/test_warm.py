@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
@@ -13,16 +14,16 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
+from factorlib.results.solution import Earlier
 from factorlib.solve import insertion
 from factorlib.solve.bundle import solve
 from factorlib.solve.descent import Descent, descend
-from factorlib.solve.earlier import Earlier, Gauge, Model, Reflectance, Table, Tone
 from factorlib.solve.history import Run
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 from factorlib.solve.warm import Propagation, from_earlier, known_of, with_exposures
-from tests.solve.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 BUNDLE = Bundle(lobes=16, insert=4, rounds=6, iterations=10, polish=15, tolerance=1e-3)
@@ -78,7 +79,7 @@ def answer(blocks, start=None):
 def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0), lambertian=(False, False, False)) -> Earlier:
     """As the stage writes it and `read_earlier` reads it."""
     rows = zip(names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True)
-    table = Table(
+    table = MaterialTable(
         {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
         Gauge(dict(zip(names, component, strict=True))),
         Model({name: not one for name, one in zip(names, lambertian, strict=True)}),

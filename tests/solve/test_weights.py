@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
 from factorlib.reflection import reflection_operator
 from factorlib.solve import weights
 from factorlib.solve.normal_equations import energy_equations, normal_equations
 from factorlib.solve.weights import fitted_illumination, nonnegative_minimum
-from tests.solve.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=1e6, prior=0.0)

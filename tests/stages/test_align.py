@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Pose, rotation_of_vector
-from factorlib.align.raster import rasterise
 from factorlib.align.search import Search
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose, rotation_of_vector
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
@@ -133,7 +133,7 @@ def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
     folder = tmp_path / "earlier"
     folder.mkdir()
     thing = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "runner_up": runner_up}
-    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated"}, "objects": {"thing": thing}}})
+    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}, "objects": {"thing": thing}}})
     return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
 
 

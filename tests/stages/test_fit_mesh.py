@@ -8,12 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.raster import rasterise
 from factorlib.dataset.schema import ObjectsSlice
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.meshes.mesh import scaled
+from factorlib.results.poses import PhotoPoses, write_poses
 from factorlib.stage import Inputs, silent
 from stages import align, export, fit_mesh, urm
 from tests.align.scenes import chair, photo_of
@@ -42,7 +43,7 @@ def made(tmp_path, given, source="found"):
         facts = {"focal_px": camera.focal, "focal_source": "dataset", "principal_point": list(camera.centre)}
         poses[photo] = {"camera": facts, "objects": {"thing": thing}}
         truth[photo] = caster, camera, pose
-    write_json(aligned / "poses.json", poses)
+    write_poses(aligned / "poses.json", msgspec.convert(poses, dict[str, PhotoPoses]))
     slice_ = {"camera": {}, "objects": [{"name": "thing", "mesh": "thing"}], "meshes": {"thing": {"file": "thing.ply", "material": "white"}}}
     facts = {"dataset.materials": ["white"], "dataset.objects": {photo: slice_ for photo in PHOTOS}}
     return Inputs({"masks": masks, "align": aligned}, facts, {"thing.ply": tmp_path / "thing.ply"}), truth

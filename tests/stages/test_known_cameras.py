@@ -11,12 +11,12 @@ import pycolmap
 import pytest
 import yaml
 
-from factorlib.align.camera import Camera, Pose, rotation_of_vector
-from factorlib.align.raster import Caster, rasterise
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.generate.folder import write_labels, write_photo
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes import write_ply
 from factorlib.stage import Inputs
 from stages import align, masks

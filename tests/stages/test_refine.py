@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from benchmarks.refine import TRUE, photographed
-from factorlib.align.earlier import read_earlier
 from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
 from factorlib.images.tone import shown
@@ -17,6 +16,7 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
+from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, silent
 from stages import align, refine
 
@@ -60,7 +60,7 @@ def inputs_of(tmp_path, photo, **entry):
 def write_materials(folder, stderr):
     table = {
         name: {"diffuse": TRUE.diffuse[m].tolist(), "specular": TRUE.specular[m].tolist(), "roughness": float(TRUE.roughness[m]),
-               "stderr": {"diffuse": stderr}}
+               "alpha": float(TRUE.roughness[m]) ** 2, "stderr": {"diffuse": stderr, "specular": stderr, "roughness": 0.1}}
         for m, name in enumerate(NAMES)
     }  # fmt: skip
     write_json(folder / "materials.json", {"materials": table, "model": {"self_shadowing": False}})
@@ -119,13 +119,13 @@ def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, capl
     "text, words",
     [
         ("[]", "Expected `object`"),
-        ('{"a": {"camera": {"focal_px": -1}, "objects": {}}}', "focal_px"),
-        ('{"a": {"camera": {"focal_px": 1}, "objects": {"t": {"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}}}}', "a.objects.t"),
-        ('{"a": {"camera": {"focal_px": 1}, "objects": {"t": {"translation": [0,0,1]}}}}', "rotation"),
+        ('{"a": {"camera": {"focal_px": -1, "principal_point": [0, 0]}, "objects": {}}}', "focal_px"),
+        ('{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}}}}', "a.objects.t"),
+        ('{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"translation": [0,0,1]}}}}', "rotation"),
     ],
 )
 def test_a_folder_without_poses_is_refused(tmp_path, text, words):
     (tmp_path / "poses.json").write_text(text)
     with pytest.raises(InputError) as caught:
-        read_earlier(tmp_path)
+        read_poses(tmp_path / "poses.json")
     assert words in str(caught.value) and "poses.json" in str(caught.value) and "result of `align`, `fit_mesh` or `refine`" in str(caught.value)

@@ -5,6 +5,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks.solve.problems import MATERIALS, random_light, sphere_normals
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.model.illumination import Illumination
@@ -12,11 +13,10 @@ from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
-from factorlib.solve.earlier import FILES
+from factorlib.results.solution import FILES
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
-from tests.solve.problems import MATERIALS, random_light, sphere_normals
 
 NAMES = ("red", "green", "blue")
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import rasterise
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
@@ -31,7 +31,7 @@ def step(folder, poses: dict[str, Pose]):
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
     clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
     write_exr(folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside})
-    write_json(folder / "masks" / "a.json", {"exposure": None})
+    write_json(folder / "masks" / "a.json", {"width": CAMERA.width, "height": CAMERA.height, "factor": 1, "original_size": [CAMERA.width, CAMERA.height]})
     placed = {name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()} for name, pose in poses.items()}
     camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
     write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})

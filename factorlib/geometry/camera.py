@@ -8,6 +8,8 @@ import pycolmap
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+ROTATION_ERROR = 1e-3  # of RᵀR from the identity
+
 
 class Camera(msgspec.Struct, frozen=True):
     """COLMAP's SIMPLE_PINHOLE, all in pixels of the photo as displayed."""
@@ -67,3 +69,13 @@ def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 
     28.64789
     """
     return float(np.rad2deg(Rotation.from_matrix(first @ second.T).magnitude()))
+
+
+def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> bool:
+    """Finite, and a rotation to within rounding.
+
+    >>> is_pose(np.diag([1.0, 1.0, -1.0]), np.ones(3))
+    False
+    """
+    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
+    return bool(finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)

@@ -6,13 +6,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import rasterise
 from factorlib.errors import InputError
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.visibility import Occluders, visibility
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate, read_observations, write_observations
-from factorlib.urm.visibility import Occluders, visibility
 from tests.align.scenes import at, ball, mesh_of
 from tests.urm.test_urm import observations
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
+from benchmarks.solve.problems import sphere_normals
 from factorlib.diagnose.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
 from factorlib.diagnose.uncertainty import standard_errors
 from factorlib.model.blocks import Block
@@ -28,7 +29,6 @@ from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
-from tests.solve.problems import sphere_normals
 
 OPERATOR = reflection_operator("network")
 QUICK = Bundle(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)

@@ -19,8 +19,8 @@ import open3d as o3d
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.light.sphere import fibonacci_sphere
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import Mesh, area_vectors
 
 LIFT = 1e-3  # of the object's radius: how far off the surface rays start

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.camera import Camera, Pose
-from factorlib.align.raster import MIN_COSINE, Caster, rasterise, toward_viewer
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import MIN_COSINE, Caster, rasterise, toward_viewer
 from tests.align.scenes import at, ball, blob, chair, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))

@@ -18,7 +18,7 @@ import numpy as np
 import open3d as o3d
 from jaxtyping import Bool, Float, Int
 
-from factorlib.align.camera import Camera, Pose
+from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 
 MIN_COSINE = 0.01

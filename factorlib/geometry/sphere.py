@@ -1,0 +1,51 @@
+"""Directions: even sets of them, those that mirrors show, and cells to tell which are alike."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
+    """`count` nearly uniform unit directions.
+
+    >>> bool(abs(fibonacci_sphere(100).mean()) < 1e-2)
+    True
+    """
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - z**2)
+    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
+
+
+def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """The same lattice turned and mirrored, from which the search for poses looks: other views would find other poses' last digits.
+
+    >>> float(np.abs(fibonacci_directions(500).mean(axis=0)).max()) < 1e-2
+    True
+    """
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def mirror_directions(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """2(n·o)n − o: where a mirror at the point would show the light from; all unit, in one frame."""
+    return 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
+
+
+def mirror_cells(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n"]:
+    """A name of the cell, a cube of `size` cut by the unit sphere, in which each observation's mirror direction lies."""
+    return np.floor((mirror_directions(normal, view) + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
+
+
+def direction_cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n 3"]:
+    """Cells of roughly `size` radians: an octahedral map of the sphere, cut into squares."""
+    x, y, z = np.moveaxis(direction / np.abs(direction).sum(-1, keepdims=True), -1, 0)
+    fold = z > 0  # the viewer's side (z < 0) stays whole in the middle
+    u = np.where(fold, (1 - np.abs(y)) * np.sign(x), x)
+    v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
+    step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
+    return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)

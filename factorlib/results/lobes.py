@@ -1,0 +1,49 @@
+"""lobes.parquet of `solve` and `export`: the light of each illumination, one row per lobe."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from factorlib.light.lobes import Lobes
+from factorlib.parquetfile import read_columns
+from factorlib.reading import reading
+from factorlib.wholefile import writing
+
+FRAME = (
+    "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
+)
+COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
+WHAT, CURE = "a table of lobes", "run the stage `solve` again"
+
+
+def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
+    """Write lobes.parquet: one row per lobe, illuminations by name; an illumination may have no lobe."""
+    names = sorted(lights)
+    rows = [np.column_stack([lights[n].axis, lights[n].sharpness, lights[n].weight]) for n in names]
+    table = np.concatenate([np.zeros((0, len(COLUMNS))), *rows]).astype(float)
+    illumination = [name for name, part in zip(names, rows, strict=True) for _ in range(len(part))]
+    columns = {"illumination": pa.array(illumination, pa.string())} | {c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)}
+    about = {"frame": FRAME, "lobe": "weight * exp(sharpness * (dot(direction, axis) - 1))", "illuminations": names}
+    metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
+    with writing(path):
+        pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
+
+
+def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
+    """Lobes by illumination; raises InputError for a file that `write_lobes` did not write."""
+    columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=cure)
+    with reading(WHAT, path, cure=cure):
+        names = msgspec.convert(about["illuminations"], list[str])
+        values = np.column_stack([columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]).reshape(-1, len(COLUMNS))
+        illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
+        if not set(illumination) <= set(names):
+            raise ValueError("a lobe of an illumination that its metadata do not name")
+    parts = {name: values[illumination == name] for name in names}
+    return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}

@@ -1,0 +1,152 @@
+"""materials.json of `solve` and `export`: reflectances with standard errors, their gauge, and what was decided of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from factorlib.errors import InputError
+from factorlib.jsonfile import write_json
+from factorlib.results.file import read_result
+
+Vec3 = tuple[float, float, float]
+AtLeast0 = Annotated[float, msgspec.Meta(ge=0)]
+Channels = tuple[AtLeast0, AtLeast0, AtLeast0]  # linear Rec. 709
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class Reflectance(msgspec.Struct, frozen=True):
+    """Lambert k_d and GGX k_s per channel (linear Rec. 709), roughness in [0, 1] with α = roughness²."""
+
+    diffuse: Channels
+    specular: Channels
+    roughness: Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+    @property
+    def alpha(self) -> float:
+        """α of GGX."""
+        return self.roughness**2
+
+    @property
+    def total(self) -> float:
+        """max k_d + max k_s."""
+        return max(self.diffuse) + max(self.specular)
+
+
+class StandardErrors(msgspec.Struct, frozen=True):
+    """Of a reflectance, in the gauge that the file's `gauge.stderr` names."""
+
+    diffuse: Channels
+    specular: Channels
+    roughness: AtLeast0
+
+
+class Solved(Reflectance, frozen=True):
+    """A solved material; alpha, α = roughness², stands in the file for other programs."""
+
+    alpha: AtLeast0
+    stderr: StandardErrors
+
+    @property
+    def reflectance(self) -> Reflectance:
+        """Without its standard errors."""
+        return Reflectance(self.diffuse, self.specular, self.roughness)
+
+
+class Gauge(msgspec.Struct, frozen=True):
+    """Which rule settled the factor per channel that the observations leave free.
+
+    component: number of each material's connected component, which has a factor of its own;  stderr: the gauge of standard errors
+    export_factor, export_rule: what `export` multiplied all reflectances by, and why
+    """
+
+    rule: str = ""
+    component: dict[str, int] = {}
+    stderr: str = ""
+    export_factor: Positive | UnsetType = UNSET
+    export_rule: str | UnsetType = UNSET
+
+
+class Tone(msgspec.Struct, frozen=True):
+    """The tone curve of a photo (`factorlib.images.tone`); pivot is the radiance that it leaves as it is."""
+
+    exponent: Positive
+    pivot: Positive
+
+
+class Decision(msgspec.Struct, frozen=True):
+    """Whether a part of the model was kept, and the mean held-out loss with and without it; None for what was not tried."""
+
+    kept: bool
+    held_out_loss_with: float | None = None
+    held_out_loss_without: float | None = None
+
+
+class Started(msgspec.Struct, frozen=True):
+    """What was taken over from an earlier solution."""
+
+    materials: list[str]
+    illuminations: list[str]
+
+
+class Model(msgspec.Struct, frozen=True):
+    """What was decided of the model, and by what.
+
+    lobes:           number of lobes by illumination
+    held_out_loss:   after each round
+    specular:        whether a material has a specular part
+    self_shadowing_chosen_by: the held-out loss of each model that was tried
+    tone:            curves of the photos that have one;  tone_chosen_by: by illumination
+    """
+
+    solver: Literal["bundle", "paper"] = "bundle"
+    lobes: dict[str, int] = {}
+    lobes_chosen_by: str = ""
+    held_out_loss: list[float] = []
+    specular: dict[str, bool] = {}
+    specular_chosen_by: dict[str, Decision] = {}
+    self_shadowing: bool = False
+    self_shadowing_chosen_by: dict[str, float] = {}
+    tone: dict[str, Tone] = {}
+    tone_chosen_by: dict[str, Decision] = {}
+    started_from: Started | UnsetType = UNSET
+
+
+class MaterialTable(msgspec.Struct, frozen=True):
+    """The whole of materials.json."""
+
+    materials: dict[str, Solved]
+    gauge: Gauge = Gauge()
+    model: Model = Model()
+
+
+def solved(reflectance: Reflectance, stderr: StandardErrors) -> Solved:
+    """A reflectance with its standard errors and α."""
+    return Solved(reflectance.diffuse, reflectance.specular, reflectance.roughness, reflectance.roughness**2, stderr)
+
+
+def write_materials(path: str | Path, table: MaterialTable) -> None:
+    """Write materials.json."""
+    write_json(path, table)
+
+
+def read_materials(path: str | Path, cure: str = "") -> MaterialTable:
+    """Raises InputError for a file that is no table of materials."""
+    return read_result(path, MaterialTable, "solve", cure)
+
+
+def reflectances(table: MaterialTable) -> dict[str, Reflectance]:
+    """By name, without standard errors."""
+    return {name: material.reflectance for name, material in table.materials.items()}
+
+
+def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> list[Solved]:
+    """The materials called `names`; InputError where one is missing in the table, which was read from `path`."""
+    for name in names:
+        if name not in table.materials:
+            raise InputError(f"not the materials of this set: {name!r} is missing", file=path, cure="run the stage `solve` again")
+    return [table.materials[name] for name in names]

@@ -1,0 +1,151 @@
+"""poses.json of `align`, `fit_mesh` and `refine`: the camera and every object's pose, by photo, and how far to believe them.
+
+`align` and `refine` write the entry of one photo as <photo>.json; poses.json gathers those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose, is_pose
+from factorlib.jsonfile import write_json
+from factorlib.results.file import read_result
+
+FILE = "poses.json"
+SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
+AS_IT_IS = (1.0, 1.0, 1.0)
+CURE = "name the folder of a result of `align`, `fit_mesh` or `refine`"
+
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class PoseEntry(msgspec.Struct, frozen=True):
+    """cam_from_object: x_cam = rotation · (scale ∘ x_object) + translation, the scale being the object's."""
+
+    rotation: tuple[Vec3, Vec3, Vec3]
+    translation: Vec3
+
+    @property
+    def pose(self) -> Pose:
+        """As arrays."""
+        return Pose(np.array(self.rotation), np.array(self.translation))
+
+
+class RunnerUp(PoseEntry, frozen=True):
+    """The pose that came second: its labelled IoU, and how far its normals are from those of the pose found, degrees."""
+
+    score: float
+    normal_difference_deg: float
+
+
+class Moved(msgspec.Struct, frozen=True):
+    """How far shading turned a pose, and the normals that the photo sees, degrees."""
+
+    rotation_deg: float
+    normals_deg: float
+
+
+class CandidateEntry(msgspec.Struct, frozen=True):
+    """A pose that shading compared: gain is the share by which its held-out loss is below that of the pose found."""
+
+    held_out_loss: float
+    gain: float
+    gain_stderr: float
+    score: float
+
+
+class Refinement(msgspec.Struct, frozen=True):
+    """What `refine` decided.  chosen: found, moved or runner_up;  runner_up_ruled_out: None where it was not tried, or is chosen."""
+
+    chosen: str
+    runner_up_ruled_out: bool | None
+    moved: Moved
+    candidates: dict[str, CandidateEntry]
+
+
+class ObjectEntry(PoseEntry, frozen=True):
+    """An object's pose and how far to believe it (`factorlib.align.trust`); None for what was not measured.
+
+    scale: factors of the mesh's axes;  source: where the pose is from, one of SEARCHED or who gave it
+    doubts: what speaks against the pose, in words;  left_out: of the solve, for these doubts
+    refined: None where shading could not tell, unset where `refine` has not run
+    """
+
+    scale: tuple[Positive, Positive, Positive] = AS_IT_IS
+    silhouette_iou: float | None = None
+    label_agreement: float | None = None
+    source: str | None = None
+    score: float | None = None
+    runner_up: RunnerUp | None = None
+    contour_error: float | None = None
+    normal_stderr_deg: float | None = None
+    mirrored_score: float | None = None
+    doubts: list[str] = []
+    left_out: bool = False
+    refined: Refinement | UnsetType | None = UNSET
+
+
+class CameraEntry(msgspec.Struct, frozen=True):
+    """In pixels of masks' <photo>.exr, each of which stands for factor² of the photo's; focal_source as of `align`."""
+
+    focal_px: Positive
+    principal_point: tuple[float, float]
+    focal_source: str = "estimated"
+    focal_relative_stderr: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    factor: Annotated[int, msgspec.Meta(ge=1)] = 1
+
+    def camera(self, width: int, height: int) -> Camera:
+        """Of a picture of that many pixels."""
+        return Camera(width, height, self.focal_px, self.principal_point)
+
+
+class PhotoPoses(msgspec.Struct, frozen=True):
+    """The entry of one photo."""
+
+    camera: CameraEntry
+    objects: dict[str, ObjectEntry]
+
+
+def entry_of(pose: Pose) -> dict[str, list]:
+    """The fields of a `PoseEntry`."""
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def write_poses(path: str | Path, photos: Mapping[str, PhotoPoses]) -> None:
+    """Write poses.json."""
+    write_json(path, photos)
+
+
+def write_photo_poses(path: str | Path, photo: PhotoPoses) -> None:
+    """Write the entry of one photo."""
+    write_json(path, photo)
+
+
+def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
+    """By photo; raises InputError for a file that holds no poses."""
+    photos = read_result(path, dict[str, PhotoPoses], "align", cure)
+    for name, photo in photos.items():
+        _check(photo, path, f"{name}.objects", cure)
+    return photos
+
+
+def read_photo_poses(path: str | Path) -> PhotoPoses:
+    """The entry of one photo; raises InputError for a file that is none."""
+    photo = read_result(path, PhotoPoses, "align")
+    _check(photo, path, "objects", "run the stage `align` again")
+    return photo
+
+
+def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
+    for name, thing in photo.objects.items():
+        for entry in (thing, thing.runner_up):
+            if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
+                raise InputError("a pose that is no rotation and translation", file=path, key=f"{key}.{name}", cure=cure)

@@ -1,0 +1,52 @@
+"""An earlier solution, from which a solve may start: materials.json, lobes.parquet and exposures.json of a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from factorlib.errors import InputError
+from factorlib.light.lobes import Lobes
+from factorlib.results.exposures import read_exposures
+from factorlib.results.lobes import read_lobes
+from factorlib.results.materials import Channels, MaterialTable, read_materials
+
+FILES = ("materials.json", "lobes.parquet", "exposures.json")
+CURE = "name the folder of a result of `solve`, as it was written"
+
+
+class Earlier(msgspec.Struct, frozen=True):
+    """lights: in scene radiance, by illumination;  exposures: factor of each photo on its illumination, per channel."""
+
+    table: MaterialTable
+    lights: dict[str, Lobes]
+    exposures: dict[str, Channels]
+
+    @property
+    def self_shadowing(self) -> str | None:
+        """`on` or `off`, as it was decided, where both were tried; else None."""
+        return ("on" if self.table.model.self_shadowing else "off") if len(self.table.model.self_shadowing_chosen_by) == 2 else None
+
+    def beside(self, relative: dict[str, float]) -> Earlier:
+        """With exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
+        exposures = {photo: tuple(e / relative.get(photo, 1.0) for e in channels) for photo, channels in self.exposures.items()}
+        return msgspec.structs.replace(self, exposures=exposures)
+
+
+def read_earlier(folder: Path) -> Earlier:
+    """Raises InputError for files that the stage `solve` did not write."""
+    table, lobes, exposures = (folder / name for name in FILES)
+    earlier = Earlier(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
+    _check(set(earlier.table.gauge.component) == set(earlier.table.materials), table, "`gauge.component` names other materials")
+    for name, light in earlier.lights.items():
+        finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
+        good = finite and (light.weight >= 0).all() and (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
+        _check(good, lobes, f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis")
+    return earlier
+
+
+def _check(good: bool, path: Path, found: str) -> None:
+    if not good:
+        raise InputError(f"no earlier solution to start from: {found}", file=path, cure=CURE)
