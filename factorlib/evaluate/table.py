@@ -37,16 +37,17 @@ class Row(msgspec.Struct, frozen=True):
         return self.value is not None and COMPARISONS[self.bound.sense](self.value, self.bound.limit)
 
 
+# A quarter beyond the worst of five trained networks × two seeds of the solve (`python -m benchmarks.synthetic_spread`).
 SYNTHETIC = (
-    Bound("materials.worst_roughness", "≤", 0.025, "", "roughness, worst material"),
-    Bound("materials.worst_diffuse", "≤", 0.03, "", "diffuse, worst material and channel, relative"),
-    Bound("materials.worst_specular", "≤", 0.02, "", "specular, worst material and channel, relative"),
-    Bound("resynthesis.worst_psnr_linear_db", "≥", 38.0, "dB", "re-synthesis, worst photo, no gauge, linear"),
-    Bound("resynthesis.worst_psnr_tonemapped_db", "≥", 42.0, "dB", "re-synthesis, worst photo, no gauge, tone-mapped"),
-    Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 39.5, "dB", "relit balls, one scalar per set"),
-    Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.24, "", "mirror sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.06, "", "glossy sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.0045, "", "matte sphere, of the truth's RMS"),
+    Bound("materials.worst_roughness", "≤", 0.040, "", "roughness, worst material"),
+    Bound("materials.worst_diffuse", "≤", 0.055, "", "diffuse, worst material and channel, relative"),
+    Bound("materials.worst_specular", "≤", 0.038, "", "specular, worst material and channel, relative"),
+    Bound("resynthesis.worst_psnr_linear_db", "≥", 35.0, "dB", "re-synthesis, worst photo, no gauge, linear"),
+    Bound("resynthesis.worst_psnr_tonemapped_db", "≥", 40.4, "dB", "re-synthesis, worst photo, no gauge, tone-mapped"),
+    Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 38.0, "dB", "relit balls, one scalar per set"),
+    Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.276, "", "mirror sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.076, "", "glossy sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.005, "", "matte sphere, of the truth's RMS"),
 )
 
 
