@@ -7,27 +7,40 @@ chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from factorlib.generate.shapes import smooth
 from factorlib.meshes.mesh import Mesh
+from factorlib.yamlfile import read_yaml
 
 Part = tuple[np.ndarray, np.ndarray]  # vertices [V, 3], faces [F, 3]
 
-PROFILE = ((0.235, 0.405), (0.222, 0.428), (0.17, 0.436), (0.05, 0.420), (-0.07, 0.418), (-0.155, 0.447), (-0.200, 0.520),
-           (-0.222, 0.610), (-0.246, 0.710), (-0.272, 0.800), (-0.282, 0.815))  # z, y of the middle, front lip to top  # fmt: skip
-HALF_WIDTH = ((0.0, 0.212), (0.25, 0.228), (0.5, 0.235), (0.62, 0.222), (0.8, 0.210), (1.0, 0.190))  # at v along the profile
-CURL = ((0.0, 0.004), (0.15, 0.022), (0.35, 0.050), (0.52, 0.075), (0.66, 0.062), (0.85, 0.036), (1.0, 0.022))  # rise of the rim
-CORNERS = 0.5  # 0 a rectangular outline, 1 an oval one
-THICKNESS = 0.008
-TOPS = ((-0.105, 0.105), (0.105, 0.105), (0.105, -0.095), (-0.105, -0.095))  # x, z of the legs under the seat
-FEET = ((-0.225, 0.215), (0.225, 0.215), (0.225, -0.225), (-0.225, -0.225))
-SEAT_Y = 0.424
-LEG_RADII = (0.0125, 0.0155, 0.0105)  # top, middle, foot
-STRUTS = ((0, 0.36, 1, 0.62), (1, 0.36, 2, 0.62), (2, 0.36, 3, 0.62), (3, 0.36, 0, 0.62))  # leg, how far down, leg, how far down
-STRUT_RADIUS = 0.005
+Pair = tuple[float, float]
+
+
+class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What chair.yaml says, where each number is explained."""
+
+    profile: list[Pair]
+    half_width: list[Pair]
+    curl: list[Pair]
+    corners: float
+    thickness: float
+    tops: list[Pair]
+    feet: list[Pair]
+    seat_y: float
+    leg_radii: tuple[float, float, float]
+    rough_leg_radii: tuple[float, float, float]
+    struts: list[tuple[int, float, int, float]]
+    strut_radius: float
+
+
+SHAPE = read_yaml(Path(__file__).with_name("chair.yaml"), Shape)
 
 
 def chair() -> dict[str, Part]:
@@ -44,7 +57,7 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
         vertices, faces = part
         return vertices + np.sin(vertices @ axes.T + phases.T) @ shifts, faces
 
-    return {"shell": bent(shell(14, 22)), "legs": bent(legs(7, 3, radii=(0.0135, 0.0155, 0.0115)))}
+    return {"shell": bent(shell(14, 22)), "legs": bent(legs(7, 3, radii=SHAPE.rough_leg_radii))}
 
 
 def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
@@ -62,26 +75,26 @@ def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
 def shell(across: int, along: int) -> Part:
     """The shell's upper and lower sides, half a thickness off its middle surface, joined by a rounded rim."""
     s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
-    u, v = s * np.sqrt(1 - CORNERS * t**2 / 2), t * np.sqrt(1 - CORNERS * s**2 / 2)
+    u, v = s * np.sqrt(1 - SHAPE.corners * t**2 / 2), t * np.sqrt(1 - SHAPE.corners * s**2 / 2)
     middle, step = middle_surface(u, v), 1e-4
     normal = np.cross(middle_surface(u + step, v) - middle_surface(u - step, v), middle_surface(u, v - step) - middle_surface(u, v + step))
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
-    upper, lower = middle + normal * THICKNESS / 2, middle - normal * THICKNESS / 2
+    upper, lower = middle + normal * SHAPE.thickness / 2, middle - normal * SHAPE.thickness / 2
     border = ring(*u.shape)
     outward = rim_outward(middle.reshape(-1, 3)[border], normal.reshape(-1, 3)[border])
-    edge = middle.reshape(-1, 3)[border] + outward * THICKNESS / 2
+    edge = middle.reshape(-1, 3)[border] + outward * SHAPE.thickness / 2
     return stitched(upper, lower, edge, border)
 
 
 def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
     """A point of the shell: u from −1 to 1 across, v from −1 (front lip) to 1 (top of the back)."""
-    profile = np.array(PROFILE)
+    profile = np.array(SHAPE.profile)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = CubicSpline(length / length[-1], profile)
     at = (v + 1) / 2
     (z, y), (dz, dy) = np.moveaxis(curve(at), -1, 0), np.moveaxis(curve(at, 1), -1, 0)
     speed = np.hypot(dz, dy)
-    width, rise = (PchipInterpolator(*np.array(table).T)(at) for table in (HALF_WIDTH, CURL))
+    width, rise = (PchipInterpolator(*np.array(table).T)(at) for table in (SHAPE.half_width, SHAPE.curl))
     lift = rise * np.abs(u) ** 2.4
     return np.stack([u * (width - 0.35 * lift), y - lift * dz / speed, z + lift * dy / speed], axis=-1)
 
@@ -119,14 +132,14 @@ def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
-def legs(sides: int, rings: int, radii=LEG_RADII) -> Part:
+def legs(sides: int, rings: int, radii=SHAPE.leg_radii) -> Part:
     """Four legs and the struts between neighbours."""
-    top = [np.array([x, SEAT_Y, z]) for x, z in TOPS]
-    foot = [np.array([x, 0.0, z]) for x, z in FEET]
+    top = [np.array([x, SHAPE.seat_y, z]) for x, z in SHAPE.tops]
+    foot = [np.array([x, 0.0, z]) for x, z in SHAPE.feet]
     dowels = [dowel(a, b, radii, sides, rings) for a, b in zip(top, foot, strict=True)]
-    for one, low, other, high in STRUTS:
+    for one, low, other, high in SHAPE.struts:
         ends = top[one] + low * (foot[one] - top[one]), top[other] + high * (foot[other] - top[other])
-        dowels.append(dowel(*ends, (STRUT_RADIUS,) * 3, max(5, sides // 2), 2))
+        dowels.append(dowel(*ends, (SHAPE.strut_radius,) * 3, max(5, sides // 2), 2))
     first = np.cumsum([0] + [len(vertices) for vertices, _ in dowels])
     return np.concatenate([d[0] for d in dowels]), np.concatenate([d[1] + offset for d, offset in zip(dowels, first)])
 

@@ -25,9 +25,9 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
+from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
-MIDDLE = 0.42  # height of the chair's middle over the floor, metres
 
 
 class Parameters(msgspec.Struct, frozen=True):
@@ -40,7 +40,7 @@ class Parameters(msgspec.Struct, frozen=True):
     light_spp: int = 24
 
 
-class Shot(msgspec.Struct, frozen=True):
+class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A photo: shell colours of its chairs, how the first stands to the camera, the lens, and the surroundings.
 
     facing_deg    0 looks at the camera, positive turns its front to the photo's right
@@ -61,33 +61,27 @@ class Shot(msgspec.Struct, frozen=True):
     lamps: int = 2
 
 
-MATERIALS = {
-    "red": Material((0.55, 0.05, 0.035), (0.06, 0.06, 0.06), 0.32),
-    "yellow": Material((0.7, 0.42, 0.04), (0.06, 0.06, 0.06), 0.38),
-    "black": Material((0.022, 0.022, 0.025), (0.07, 0.07, 0.07), 0.25),
-    "white": Material((0.72, 0.71, 0.66), (0.06, 0.06, 0.06), 0.3),
-    "wood": Material((0.44, 0.27, 0.13), (0.04, 0.04, 0.04), 0.45),
-}
-SHOTS = (
-    Shot("terrace", ("red", "white"), -25, 2.5, 1.5, 45, "exif", sun=(48, 55)),
-    Shot("kitchen", ("yellow",), 38, 2.0, 1.35, 45, "nothing", windows=2, lamps=1),
-    Shot("hall", ("black", "yellow"), 20, 2.3, 1.5, 40, "given", windows=1, lamps=3),
-    Shot("garden", ("white",), 62, 2.3, 1.3, 55, "exif", sun=(18, -75), turbidity=6.0),
-    Shot("office", ("red",), -48, 2.1, 1.45, 43, "nothing", windows=3, lamps=1),
-    Shot("patio", ("black",), 150, 2.2, 1.2, 50, "exif", sun=(32, -30), turbidity=3.0),
-)
-CLIPPED = 0.02  # of the chairs' pixels
-APART = 0.42  # half the distance between two chairs, metres
+class Set(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What eames.yaml says, where each number is explained."""
+
+    materials: dict[str, Material]
+    shots: list[Shot]
+    clipped: float
+    apart: float
+    middle: float
+
+
+SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
 
 
 def generate(
-    out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SHOTS
+    out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
 ) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
     rng = np.random.default_rng([11, seed])
-    materials = drawn_materials(rng, 0.0 if seed == 0 else 0.2, MATERIALS)
+    materials = drawn_materials(rng, 0.0 if seed == 0 else 0.2, SET.materials)
     folder.write_obj(out / "meshes/chair.obj", rough_chair(rng))
     photos, poses = [], {}
     for number, shot in enumerate(shots):
@@ -120,9 +114,9 @@ def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.
     distance, eye = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1)), shot.eye + 0.15 * spread * rng.uniform(-1, 1)
     facing = shot.facing_deg + 40 * spread * rng.uniform(-1, 1)
     level = look(0, yaw)
-    down = np.degrees(np.arctan2(eye - MIDDLE, distance))
+    down = np.degrees(np.arctan2(eye - SET.middle, distance))
     place = -distance * level[:, 2] + [0, eye - EYE, 0]
-    sideways = [0.0] if len(shot.chairs) == 1 else [-APART, APART]
+    sideways = [0.0] if len(shot.chairs) == 1 else [-SET.apart, SET.apart]
     chairs = {}
     for k, (colour, aside) in enumerate(zip(shot.chairs, sideways)):
         turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])  # the chair's +z toward the camera
@@ -157,7 +151,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     for name, mask in own_masks(scene, meshes, poses).items():
         folder.write_labels(out / name, np.where(mask, 255, 0))
     turn = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
-    light = lights.map_of(scene.things, turn, parameters.light_rows, parameters.light_spp, seed, (0, MIDDLE - EYE, 0))
+    light = lights.map_of(scene.things, turn, parameters.light_rows, parameters.light_spp, seed, (0, SET.middle - EYE, 0))
     folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
     folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(meshes, scene.camera, poses).normal)
     return entry(scene)
@@ -174,8 +168,8 @@ def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material])
 
 
 def exposure_of(radiance: Float[np.ndarray, "h w 3"], on_chair: Bool[np.ndarray, "h w"]) -> float:
-    """The factor that clips CLIPPED of the chairs' pixels."""
-    return float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - CLIPPED))
+    """The factor that clips `clipped` of the chairs' pixels."""
+    return float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))
 
 
 def own_masks(scene: Scene, meshes: Sequence[Mesh], poses: Sequence[Pose]) -> dict[str, Bool[np.ndarray, "h w"]]:

@@ -38,7 +38,7 @@ def small(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def chairs(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("sets") / "chairs"
-    eames.generate(out, 3, [], TINY_PHOTO, quiet, eames.SHOTS[:2])
+    eames.generate(out, 3, [], TINY_PHOTO, quiet, eames.SET.shots[:2])
     return out
 
 
@@ -103,10 +103,10 @@ def test_the_chair_set_tells_no_pose_and_links_its_photos(chairs):
 
 
 def test_every_material_is_seen_in_two_photos_and_all_hang_together():
-    seen = {shot.name: set(shot.chairs) for shot in eames.SHOTS}
+    seen = {shot.name: set(shot.chairs) for shot in eames.SET.shots}
     for colour in ("red", "yellow", "black", "white"):
         assert sum(colour in colours for colours in seen.values()) == 2
-    assert {shot.told for shot in eames.SHOTS} == {"exif", "given", "nothing"}
+    assert {shot.told for shot in eames.SET.shots} == {"exif", "given", "nothing"}
 
 
 def test_the_mesh_given_is_coarser_and_a_few_millimetres_off(chairs):
