@@ -22,6 +22,7 @@ from factorlib.align.state import State
 from factorlib.align.target import extent_of
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
+from factorlib.geometry.sphere import fibonacci_directions
 
 GRID = 80  # pixels of the templates
 WHOLE, CUT = 36, 26  # mask's extent in them
