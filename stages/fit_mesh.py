@@ -104,5 +104,5 @@ def placed(entry: PhotoPoses, one: Found, state: State, factors: np.ndarray) -> 
     pose, seen = state.pose(caster), state.camera(one.sighting.camera)
     camera = msgspec.structs.replace(entry.camera, focal_px=float(seen.focal)) if one.sighting.prior.sigma > 0 else entry.camera
     iou = silhouette_iou(one.evidence, rasterise(caster, seen, pose).label)
-    changed = {**entry_of(pose), "scale": factors.tolist(), "silhouette_iou": iou, "runner_up": None}
+    changed = {**entry_of(pose), "scale": tuple(factors.tolist()), "silhouette_iou": iou, "runner_up": None}
     return PhotoPoses(camera, entry.objects | {one.thing: msgspec.structs.replace(entry.objects[one.thing], **changed)})

@@ -30,21 +30,29 @@ from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.jsonfile import read_json
 from factorlib.meshes.read import read_mesh
+from factorlib.results.file import read_result
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.stage import Inputs, silent
 from stages import align, masks
 
 REFERENCE = "reference_poses.json"
+CURE = "name a dataset whose poses are known, as align's poses.json has them"
+
+
+class Reference(PhotoPoses, frozen=True):
+    """A photo's entry of reference_poses.json; silhouette_iou: of all its objects together, None where it is not known."""
+
+    silhouette_iou: float | None = None
 
 
 def real_keys(folders: list[Path]) -> Iterator[tuple[Path, str]]:
     """(folder, photo) of every photo that has a reference pose.  Raises InputError for a folder without references."""
     for folder in folders:
         if not (folder / REFERENCE).is_file():
-            cure = "name a dataset whose poses are known, as align's poses.json has them"
-            raise InputError(f"there is no {REFERENCE}", file=folder, cure=cure)
-        known = read_json(folder / REFERENCE)
+            raise InputError(f"there is no {REFERENCE}", file=folder, cure=CURE)
+        known = read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)
         yield from ((folder, photo.name) for photo in read_dataset(folder).spec.photos if photo.name in known)
 
 
@@ -57,7 +65,7 @@ def measured_photo(key: tuple[Path, str]) -> list[dict]:
         entry, size = _aligned(dataset, photo, Path(made))
         taken = clock.taken()
     said = {"set": folder.resolve().name, "photo": photo, "wall_s": taken.wall, "processor_s": taken.processor}
-    reference = read_json(folder / REFERENCE)[photo]
+    reference = read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)[photo]
     return [said | _errors(dataset, thing, size, entry, reference) for thing in dataset.photo(photo).objects]
 
 
@@ -71,7 +79,7 @@ def withheld(dataset: Dataset) -> Dataset:
     return replace(dataset, spec=replace(dataset.spec, photos=photos), told={})
 
 
-def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[dict, tuple[int, int]]:
+def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[PhotoPoses, tuple[int, int]]:
     """The photo's entry of poses.json, and its width and height."""
     slices = {name: dataset_slice(dataset, name, photo) for name in ("photo", "materials", "objects")}
     facts = {f"dataset.{name}": part.facts for name, part in slices.items()}
@@ -82,15 +90,15 @@ def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[dict, tuple[in
     inputs = Inputs(folders, facts, files, photo)
     masks.main(masks.Params(), inputs, folders["masks"], silent)
     align.main(align.Params(), inputs, folders["align"], silent)
-    facts = read_json(folders["masks"] / f"{photo}.json")
-    return read_json(folders["align"] / f"{photo}.json"), (facts["width"], facts["height"])
+    facts = read_photo_facts(folders["masks"] / f"{photo}.json")
+    return read_photo_poses(folders["align"] / f"{photo}.json"), (facts.width, facts.height)
 
 
-def _errors(dataset: Dataset, thing: ObjectEntry, size: tuple[int, int], entry: dict, reference: dict) -> dict:
+def _errors(dataset: Dataset, thing: ObjectEntry, size: tuple[int, int], entry: PhotoPoses, reference: Reference) -> dict:
     mesh = dataset.spec.meshes[thing.mesh]
     caster = Caster(read_mesh(dataset.folder / mesh.file, dataset.spec.materials, mesh.parts, mesh.material, thing.materials))
     (camera, pose), (true_camera, true_pose) = (_seen(said, thing.name, size) for said in (entry, reference))
-    said = entry["objects"][thing.name]
+    found = entry.objects[thing.name]
     return {
         "object": thing.name,
         "turn": Rotation.from_matrix(true_pose.rotation.T @ pose.rotation).as_rotvec().tolist(),
@@ -98,9 +106,9 @@ def _errors(dataset: Dataset, thing: ObjectEntry, size: tuple[int, int], entry: 
         "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true_pose))),
         "normal_error_deg": normal_error_deg(rasterise(caster, true_camera, true_pose), rasterise(caster, camera, pose)),
         "focal_ratio": camera.focal / true_camera.focal,
-        "focal_source": entry["camera"]["focal_source"],
-        "reference_iou": reference.get("silhouette_iou"),
-        **{name: said[name] for name in ("silhouette_iou", "label_agreement", "contour_error", "normal_stderr_deg", "doubts")},
+        "focal_source": entry.camera.focal_source,
+        "reference_iou": reference.silhouette_iou,
+        **{name: getattr(found, name) for name in ("silhouette_iou", "label_agreement", "contour_error", "normal_stderr_deg", "doubts")},
     }
 
 
@@ -120,9 +128,5 @@ def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
     return float(np.rad2deg(each.mean().magnitude())), np.rad2deg((each * each.mean().inv()).magnitude()).tolist()
 
 
-def _seen(said: dict, name: str, size: tuple[int, int]) -> tuple[Camera, Pose]:
-    camera, thing = said["camera"], said["objects"][name]
-    return (
-        Camera(*size, camera["focal_px"], tuple(camera["principal_point"])),
-        Pose(np.array(thing["rotation"]), np.array(thing["translation"])),
-    )
+def _seen(entry: PhotoPoses, name: str, size: tuple[int, int]) -> tuple[Camera, Pose]:
+    return entry.camera.camera(*size), entry.objects[name].pose

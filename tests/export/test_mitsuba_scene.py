@@ -61,7 +61,7 @@ def test_scene_equals_resynthesis(exported, photo):
     inputs, out = exported
     geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))
     light = render.light_of_photo(made_export.of_photo(inputs, out, photo))
-    table = read_materials(out / "materials.json")
+    table = read_materials(out / "materials.json").materials
     pixels = whole_pixels(geometry["label"])
     reflector = Reflector(Reference(tolerance=1e-3), light)
     expected = resynthesised(reflector, [table[n] for n in made_export.NAMES], {"label": masks["label"] * pixels}, geometry)

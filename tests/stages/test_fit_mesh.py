@@ -99,10 +99,11 @@ def test_urm_and_export_place_the_fitted_mesh_alike(fitted, tmp_path):
     given = scaled(chair(), OFF)
     there = (given.vertices * mesh["factors"]) @ np.array(pose["rotation"]).T + pose["translation"]
     one = Inputs(inputs.folders, {**inputs.facts, "dataset.objects": inputs.facts["dataset.objects"]["a"]}, inputs.files, "a")
-    occluders = urm.occluders_of(one, poses["a"]["objects"])
+    objects = msgspec.convert(poses["a"], PhotoPoses).objects
+    occluders = urm.occluders_of(one, objects)
     assert np.allclose(occluders.centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
     (tmp_path / "meshes").mkdir()
-    shape = export.MeshFiles(inputs, tmp_path, ["white"], 60.0).shapes(slice_.objects[0], slice_.meshes, poses["a"]["objects"])[0]
+    shape = export.MeshFiles(inputs, tmp_path, ["white"], 60.0).shapes(slice_.objects[0], slice_.meshes, objects)[0]
     placed = given.vertices @ shape.cam_from_object[:3, :3].T + shape.cam_from_object[:3, 3]
     assert np.allclose(placed, there, atol=1e-4)
 
