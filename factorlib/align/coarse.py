@@ -24,6 +24,7 @@ from factorlib.align.state import State
 from factorlib.align.target import extent_of
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
+from factorlib.geometry.sphere import fibonacci_directions
 
 GRID = 80  # pixels of the templates
 WHOLE, CUT = 36, 26  # mask's extent in them
@@ -38,6 +39,19 @@ class Candidate(msgspec.Struct, frozen=True):
 
     state: State
     error: float
+
+
+class Density(msgspec.Struct, frozen=True):
+    """How densely rotations are tried, and which guesses are kept.
+
+    views      directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
+    keep       guesses at most, each turned by `apart_deg` at least against the others
+    """
+
+    views: int
+    rolls: int
+    keep: int
+    apart_deg: float
 
 
 def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
