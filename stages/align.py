@@ -11,12 +11,12 @@ from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.earlier import earlier_focal, earlier_pose
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
+from factorlib.align.external_camera import focal_and_centre
 from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
-from factorlib.align.place import Placed, Thing, placed
+from factorlib.align.place import KnownFocal, ObjectToPlace, Placed, placed
 from factorlib.align.search import Found, Search
-from factorlib.align.told import camera_told
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
@@ -33,7 +33,7 @@ from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
-CURE_OF_TOLD = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
+CURE_OF_EXTERNAL = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
@@ -48,65 +48,64 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Align the meshes of one photo and write its maps, its poses and the overlay."""
     name = inputs.photo
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
-    things = things_of(slice_, channels, inputs, params, facts.factor, earlier)
-    camera, focal, focal_source = camera_of(slice_, facts, name)
-    hold_against(slice_, things, channels["label"], inputs.facts["dataset.materials"], camera, focal, name)
+    objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
+    camera, known = camera_of(slice_, facts, name)
+    check_given_poses(slice_, objects, name)
+    warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], inputs.facts["dataset.materials"], name)
+    warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
     before = earlier_focal(earlier.camera, facts.factor) if earlier else None
-    result = placed(things, camera, focal, focal_source, name, params.search, before)
-    maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
+    result = placed(objects, camera, known, name, params.search, before)
+    maps = rasterise([each.caster for each in objects], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    told = slice_.told.source if slice_.told else None
-    sources = {thing.name: "given" if thing.pose else told for thing in slice_.objects}
-    objects = {thing.name: entry(thing, k, result, maps, params, sources[thing.name]) for k, thing in enumerate(things)}
-    for thing_name, found in objects.items():
-        complain(name, thing_name, found, params.strict)
-    left_out = np.isin(maps.object, [k for k, found in enumerate(objects.values(), start=1) if found.left_out])
+    external = slice_.external.source if slice_.external else None
+    sources = {thing.name: "given" if thing.pose else external for thing in slice_.objects}
+    entries = {each.name: entry(each, k, result, maps, params, sources[each.name]) for k, each in enumerate(objects)}
+    for object_name, found in entries.items():
+        complain(name, object_name, found, params.strict)
+    left_out = np.isin(maps.object, [k for k, found in enumerate(entries.values(), start=1) if found.left_out])
     write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
-    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), objects))
+    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), entries))
 
 
-def things_of(
+def objects_of(
     slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: PhotoPoses | None = None
-) -> list[Thing]:
+) -> list[ObjectToPlace]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
-    things = []
+    objects = []
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        pose = pose_of(thing, slice_.told)
+        pose = pose_of(thing, slice_.external)
         before = earlier.objects.get(thing.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
         caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         found = earlier_pose(before) if before else None
-        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
-    return things
+        objects.append(ObjectToPlace(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
+    return objects
 
 
 def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
     return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
 
 
-def hold_against(
-    slice_: schema.ObjectsSlice, things: list[Thing], label: np.ndarray, materials: list[str], camera: Camera, focal: float | None, photo: str
-) -> None:
-    """What dataset.yaml and its source of cameras give, against the photo: what cannot be is refused, what is odd is told."""
-    for thing, said in zip(things, slice_.objects, strict=True):
-        if thing.pose is not None:
-            check_before_camera(thing.caster.mesh, thing.pose, photo, thing.name, "dataset" if said.pose else slice_.told.source)
-    warn_of_materials(label, [thing.caster.mesh.labels for thing in things], materials, photo)
-    warn_of_camera(focal, camera.centre, (camera.width, camera.height), photo)
+def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace], photo: str) -> None:
+    """Raise InputError where a pose of dataset.yaml, or of its source of cameras, puts its object behind the camera."""
+    for each, said in zip(objects, slice_.objects, strict=True):
+        if each.pose is not None:
+            check_before_camera(each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source)
 
 
-def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:
+def pose_of(thing: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
     """The pose that dataset.yaml gives, or else its source of cameras."""
-    pose = thing.pose or (told.poses.get(thing.name) if told else None)
+    pose = thing.pose or (external.poses.get(thing.name) if external else None)
     return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
 
 
@@ -117,20 +116,20 @@ def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
     return Keypoints(np.array([k.pixel for k in thing.keypoints]) / factor, np.array([k.point for k in thing.keypoints]))
 
 
-def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, float | None, str | None]:
-    """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
+def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
+    """The photo's camera, its focal length to be found later, and what is known of that length.
 
-    What dataset.yaml gives goes before what its source of cameras tells, and that before EXIF and the middle of the photo.
+    What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
     Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
     """
     factor, (width, height) = facts.factor, facts.original_size
     focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
-    if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
-        told_focal, centre = camera_told(slice_.told, width, height, photo)
+    if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
+        external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
         if source != "dataset":
-            focal, source = told_focal / factor, slice_.told.source
+            focal, source = external_focal / factor, slice_.external.source
     across, down = slice_.camera.principal_point or centre
-    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), focal, source
+    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)
 
 
 def camera_entry(result: Placed, factor: int) -> CameraEntry:
@@ -140,7 +139,7 @@ def camera_entry(result: Placed, factor: int) -> CameraEntry:
     return CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, factor)
 
 
-def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
+def entry(thing: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
     """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
@@ -164,6 +163,7 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, sour
 
 
 def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
+    """The second-best pose as it stands in poses.json; None where no other was found."""
     if found is None or found.runner_up is None:
         return None
     other = found.runner_up
@@ -171,7 +171,8 @@ def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
 
 
 def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
-    cure = CURE_OF_TOLD if entry.source in schema.SOURCES else CURE
+    """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
+    cure = CURE_OF_EXTERNAL if entry.source in schema.SOURCES else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=cure)
@@ -181,6 +182,10 @@ def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
 
 
 def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:
+    """Write the maps of a photo as EXR; the channels are listed in docs/formats.md.
+
+    certainty: [h, w], how much a pixel's normal is to be believed, 0 to 1
+    """
     channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
     channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
     channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": certainty, "back": maps.back}

@@ -18,7 +18,7 @@ from factorlib.meshes.read import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.sample import sample
@@ -42,17 +42,16 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Write the observations of one photo."""
     name = inputs.photo
     light = inputs.facts["dataset.light"]
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     observations = observations_of_photo(
         photo,
         geometry,
-        name=name,
-        illumination=light["illumination"],
-        materials=inputs.facts["dataset.materials"],
-        least_confidence=params.least_confidence,
-        exposure=read_photo_facts(inputs["masks"] / f"{name}.json").exposure,
+        Taken(name, light["illumination"], read_photo_facts(inputs["masks"] / f"{name}.json").exposure),
+        inputs.facts["dataset.materials"],
+        params.least_confidence,
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)

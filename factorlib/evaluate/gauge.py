@@ -1,4 +1,4 @@
-"""What may be scaled before two things are compared.
+"""What may be scaled before an estimate is compared with the truth.
 
 A factor per colour channel can move between all materials and all lights that are linked by observations, and the
 exposure of a photo is not known: so an error is quoted three times.
@@ -40,7 +40,7 @@ def gauge_factors(
     }
 
 
-def _ratio(cross, square):
+def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
     """cross / square, and 1 where there is nothing to scale."""
     square = np.asarray(square)
     return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)

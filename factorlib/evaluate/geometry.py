@@ -8,6 +8,8 @@ Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the dista
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -18,7 +20,16 @@ from factorlib.results.metrics import AngleError, NormalError, PoseError
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
 
 
-def normal_error(estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]):
+class RigidLike(Protocol):
+    """A rigid transform: a rotation matrix [3, 3] and a translation [3], as arrays or as rows of numbers."""
+
+    rotation: Any
+    translation: Any
+
+
+def normal_error(
+    estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> NormalError | None:
     """Errors over the pixels of `mask` where both normals are known (not zero); None where there is none."""
     known = mask & (np.linalg.norm(estimate, axis=-1) > 0.5) & (np.linalg.norm(truth, axis=-1) > 0.5)
     if not known.any():
@@ -54,8 +65,8 @@ def rotation_angle_deg(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"])
     return float(np.degrees(2 * np.arcsin(min(1.0, chord / (2 * np.sqrt(2))))))
 
 
-def pose_error(estimate, truth) -> PoseError:
-    """Of two cam_from_object, each with `rotation` 3×3 and `translation` 3 (`Pose` of the dataset's schema)."""
+def pose_error(estimate: RigidLike, truth: RigidLike) -> PoseError:
+    """Of two cam_from_object, as `Pose` of the dataset's schema; the translations in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
     turned = rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float))

@@ -1,12 +1,12 @@
 """Errors of recovered light against true light.
 
-Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a matte (Lambert) white sphere, rendered in the estimated and
+Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a Lambertian (`matte`) white sphere, rendered in the estimated and
                in the true light, as LeGendre et al. 2019 ("DeepLight") and others do.
 Env map        the maps themselves, averaged to texels of equal solid angle about 3° across; all directions, and split
                into those that an observed pixel mirrors toward the camera (within about 6°) and the rest.
 Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black scores.  rmse_scale_invariant: the same after the best
                single factor (Grosse et al. 2009).  rgb_angle_deg: mean angle between the RGB vectors, in degrees.
-Null           a constant light of the true map's mean colour, which no method is told: a generous null.
+Null           a constant light of the true map's mean colour: a generous null, for no method knows that colour.
 """
 
 from __future__ import annotations
@@ -126,7 +126,14 @@ def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.minimum((t * n).astype(int), n - 1) for t, n in zip((row, column), mask.shape))
 
 
-def _scored_view(view, render, estimates, truths, names, seen) -> dict[str, dict[str, ScoredLight]]:
+def _scored_view(
+    view: str,
+    render: Callable[[Light], Samples],
+    estimates: Mapping[str, Light],
+    truths: Mapping[str, Light],
+    names: list[str],
+    seen: Mapping[str, np.ndarray],
+) -> dict[str, dict[str, ScoredLight]]:
     kept = {n: _part(view, seen.get(n)) for n in names}
     names = [n for n in names if kept[n] is not None]
     true = [render(truths[n])[kept[n]] for n in names]
@@ -140,7 +147,7 @@ def _scored_view(view, render, estimates, truths, names, seen) -> dict[str, dict
     }
 
 
-def _part(view: str, seen: Bool[np.ndarray, "t"] | None):
+def _part(view: str, seen: Bool[np.ndarray, "t"] | None) -> slice | np.ndarray | None:
     """The texels of a view: all of a sphere and of the whole map; None where a part of the map is empty or unknown."""
     if view not in ("map_mirrored", "map_unmirrored"):
         return slice(None)

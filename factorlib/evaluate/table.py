@@ -34,6 +34,7 @@ class Row(msgspec.Struct, frozen=True):
 
     @property
     def ok(self) -> bool:
+        """Whether the value is there and within its bound."""
         return self.value is not None and COMPARISONS[self.bound.sense](self.value, self.bound.limit)
 
 
@@ -47,7 +48,7 @@ SYNTHETIC = (
     Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 38.0, "dB", "relit balls, one scalar per set"),
     Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.276, "", "mirror sphere, of the truth's RMS"),
     Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.076, "", "glossy sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.005, "", "matte sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.005, "", "Lambertian sphere, of the truth's RMS"),
 )
 
 
@@ -68,6 +69,7 @@ def value_at(metrics: object, path: str) -> float | None:
 
 
 def rows_of(metrics: object, bounds: Iterable[Bound]) -> list[Row]:
+    """The value of every bound, looked up in `metrics` by the bound's dotted path."""
     return [Row(bound, value_at(metrics, bound.path)) for bound in bounds]
 
 

@@ -27,7 +27,7 @@ def lines_of(content: bytes) -> Iterator[str]:
 
 
 def check_length(letters: int) -> None:
-    """Words of a line are held one by one: ValueError for more of them than any polygon has corners."""
+    """Words of a line are objects of their own: ValueError for more of them than any polygon has corners."""
     if letters > LONGEST:
         raise ValueError(f"a line of more than {LONGEST:,} letters")
 
@@ -55,5 +55,6 @@ def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
 
 
 def shown(line: str) -> str:
+    """A line as messages quote it, cut to SHOWN characters."""
     line = line.strip()
     return repr(line if len(line) <= SHOWN else line[: SHOWN - 1] + "…")

@@ -3,12 +3,12 @@
     photometric    r_ic(θ, w) = (Σ_p w_pc B_ipc(θ) − radiance_ic)/σ_ic        θ: turn 3, place 3, focal length
     contours       the normal equations of `factorlib.align.refine`
 
-w is linear: with A = ∂r/∂w over the lobes that shine and J = ∂r/∂θ, the pose sees only what no change of light explains,
+The residual is linear in w.  With A = ∂r/∂w over the lobes of positive weight and J = ∂r/∂θ, elimination of w leaves
 
     H = JᵀWJ − JᵀWA (AᵀWA)⁻¹ AᵀWJ,        g = JᵀWr − JᵀWA (AᵀWA)⁻¹ AᵀWr                                        (1)
 
-(Golub and Pereyra's variable projection in Kaufman's form).  Without it the light, which was fitted to the pose as it is, would
-hold the pose where it is.  J is taken from normals of poses a little to either side; pixels near an edge do not vote.
+(Golub and Pereyra's variable projection in Kaufman's form).  Without the elimination the pose would hardly move, for the light was
+fitted to the present pose.  J is a central difference over normals of poses a little to either side; pixels near an edge are left out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.align.evidence import Evidence, labelled_iou
-from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
+from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations, rendered
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, Pose
@@ -35,18 +35,21 @@ RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
 EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
 DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
-MOST = 0.1  # of a step
+LARGEST_STEP = 0.1  # of each unknown, in its own unit
 
 
 class Moving(msgspec.Struct, frozen=True):
-    """The object that moves: what its contours are compared with, how all reflects, and observations of the photo with it in a state."""
+    """The object that moves: its mesh, what its contours are compared with, how surfaces reflect, and the photo's observations.
+
+    block: observations of all pixels with the object in a given state, and which of them show the material that the mask says
+    """
 
     caster: Caster
     target: Target
     camera: Camera
     prior: FocalPrior
     surfaces: Surfaces
-    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]  # all pixels, and which of them agree
+    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]
 
     def score(self, state: State) -> float:
         """Labelled IoU."""
@@ -55,7 +58,7 @@ class Moving(msgspec.Struct, frozen=True):
 
 
 class Photographed(msgspec.Struct, frozen=True):
-    """One object of a photo: the meshes over its pixels, the object's number, what its contours are, the camera and its focal length."""
+    """One object of a photo: the meshes over the pixels, the object's number, the camera, the masks, what is known of the focal length."""
 
     view: View
     number: int
@@ -113,16 +116,14 @@ def _step(
     moving: Moving, state: State, seen: Seen, lit: Illumination, residual: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "7"]:
     """The step of a state; lit: the fitted pixels in their light, whose whitened residual is `residual`."""
-    window = moving.target.camera(state.camera(moving.camera))
-    hits = moving.caster.cast(window, state.pose(moving.caster))
-    contours = normal_equations(moving.caster, moving.target, window, hits, state, moving.prior)
+    contours = normal_equations(rendered(moving.caster, moving.target, moving.camera, state), moving.target, moving.prior)
     free = 7 if moving.prior.sigma > 0 else 6
     jacobian = photometric_jacobian(moving, state, seen, lit.light, free)
     information, gradient = projected_equations(jacobian, residual, lit)
     hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
     step = np.zeros(7)
     step[:free] = -np.linalg.solve(hessian, contours.gradient[:free] + gradient)
-    return np.clip(step, -MOST, MOST)
+    return np.clip(step, -LARGEST_STEP, LARGEST_STEP)
 
 
 def photometric_jacobian(moving: Moving, state: State, seen: Seen, light: Light, free: int) -> Float[np.ndarray, "n 3 k"]:

@@ -1,8 +1,8 @@
 """The reflection networks' values and gradients as C functions, compiled on first use.
 
-The formulas stay where they are, in torch: they are run once on a `Tape`, which knows their derivatives and writes both
-as C into kernel.c, which can leave the derivatives out.  The network's derivative by its features comes between: with t = tanh(net/s) the result is
-R = formula · exp(fade · s · t), so that BACKWARD is seeded by ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
+The formulas are written once, in torch.  They are run on a `Tape`, which derives their derivatives and writes both as C into kernel.c;
+that code can leave the derivatives out.  With t = tanh(net/s) the result is R = formula · exp(fade · s · t).  kernel.c computes the
+network and its derivative by the features itself, and its part BACKWARD begins with ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
 
 Without a C compiler (`cc`, or what CC says) torch computes the same, an order of magnitude slower.
 """
@@ -18,6 +18,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from torch import Tensor
 from factorlib.errors import InputError
 from factorlib.reflection.diffuse import diffuse_of_moments
 from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
-from factorlib.reflection.filtering import filtered
+from factorlib.reflection.filtering import Width, filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value
@@ -54,7 +55,7 @@ class Fused:
         weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
         self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple:
         """A copy in another process compiles, or finds in the user's cache, its own."""
         return Fused, self.made_of
 
@@ -100,12 +101,13 @@ def _lobe_table_of(sharpness: bytes) -> Tensor:
 def specular_on(tape: Tape) -> tuple[Value, tuple]:
     """The formula and the features, of inputs named as in PLACES."""
     names = ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")
-    alpha, _, _, _, no, nz, oz = inputs = [tape.input(name) for name in names]
-    form = filtered(*inputs)
+    alpha, sharpness, lam, along, no, nz, oz = (tape.input(name) for name in names)
+    form = filtered(alpha, Width(sharpness, lam, along), no, nz, oz)
     return form.value, specular_columns(alpha, no, nz, oz, form)
 
 
 def diffuse_on(tape: Tape) -> tuple[Value, tuple]:
+    """The formula and the features of the diffuse part, of inputs named as in PLACES."""
     inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
     return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
 
@@ -144,7 +146,7 @@ def source(part: str, features: int, width: int, depth: int) -> str:
 
 
 @lru_cache(maxsize=8)
-def compiled(part: str, features: int, width: int, depth: int):
+def compiled(part: str, features: int, width: int, depth: int) -> Callable:
     """The C function; kept in the user's cache by what it was made of."""
     compiler = shlex.split(os.environ.get("CC", "cc"))
     text = source(part, features, width, depth)

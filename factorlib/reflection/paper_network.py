@@ -1,8 +1,8 @@
 """The paper's operator: plain fully connected networks, one for the diffuse part and one for the specular one.
 
 Wang, Ritschel and Mitra (arXiv 1710.08313) let networks of 288-wide layers, applied to every pixel and colour channel
-alike, answer for the reflection of one lobe, having learned it from 200,000 pixels of rendered spheres.  This is the
-baseline of every comparison: it knows nothing of what a reflection is.  Its 12 inputs, in the camera frame:
+alike, compute the reflection of one lobe; they are trained on 200,000 pixels of rendered spheres.  This is the baseline of every
+comparison: no formula of reflection is built in.  Its 12 inputs, in the camera frame:
 
     n, half       normal and half vector, (2(n·o)n − o + (0, 0, −1)) / 2      3 + 3    half: specular only
     z, log σ      the lobe's axis and precision, λ = 2σ                       3 + 1
@@ -17,7 +17,7 @@ Linearity     k · w multiplies what the other inputs give, and so does the lobe
 Depth         three hidden layers for the specular part, two for the diffuse one.
 Activation    SiLU, so that derivatives are continuous; at the end s tanh(x/s), s = 8, and an exponential: radiance is
               never negative, and bounded.
-Range         sharpness and roughness are held within what was rendered, `SHARPNESS` and `ROUGHNESS`.
+Range         sharpness and roughness are clamped to what was rendered, `SHARPNESS` and `ROUGHNESS`.
 Pixels        50 of each of 4000 spheres, lobes uniform in direction, seen from afar, so that every view is (0, 0, −1):
               `factorlib.generate.lobe_spheres`; Mitsuba renders them in place of Blender.
 Training      `paper_training`: relative error, Adam.
@@ -53,12 +53,14 @@ class PaperNetwork(Operator):
         self.layers = {part: read_layers(SHIPPED / f"paper_{part}.safetensors", INPUTS[part]).to(dtype) for part in INPUTS}
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`; λ is clamped to SHARPNESS."""
         sharpness, nz = torch.broadcast_tensors(sharpness, nz.clamp(-1, 1))
         zero = torch.zeros_like(nz)
         normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
         roughness, sharpness, no, nz, oz = torch.broadcast_tensors(roughness, sharpness, columns(no), nz, oz)
         normal, half, axis = frame_of_cosines(no, nz, oz)
         return self._reflected("specular", sharpness, specular_inputs(normal, half, axis, sharpness, roughness))
@@ -77,16 +79,19 @@ def frame_of_cosines(no: Tensor, nz: Tensor, oz: Tensor) -> tuple[tuple[Tensor, 
 
 
 def soft_root(square: Tensor) -> Tensor:
+    """√(max(x, 0) + SOFTENED): a root whose derivative is bounded."""
     return torch.sqrt(square.clamp_min(0) + SOFTENED)
 
 
 def diffuse_inputs(normal: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor) -> Float[Tensor, "*b 7"]:
+    """Inputs of the diffuse network: normal, axis (three components each, camera frame), log σ."""
     return torch.stack([*normal, *axis, log_precision(sharpness)], -1)
 
 
 def specular_inputs(
     normal: tuple[Tensor, ...], half: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor, roughness: Tensor
 ) -> Float[Tensor, "*b 11"]:
+    """Inputs of the specular network: normal, half vector, axis (three components each, camera frame), log σ, roughness."""
     return torch.stack([*normal, *half, *axis, log_precision(sharpness), roughness.clamp(*ROUGHNESS)], -1)
 
 

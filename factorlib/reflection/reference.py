@@ -1,4 +1,4 @@
-"""The reflection of one lobe by quadrature in float64: slow, obvious, and what the others are held to.
+"""The reflection of one lobe by quadrature in float64: slow, obvious, and what the others are compared with.
 
 The specular part ∫_{n·i>0} SG(i) D(h) G1(n·i) di · G1(n·o) / (4 n·o) has two sharp factors, each symmetric about its own
 axis, and one quadrature in polar coordinates about each:
@@ -17,6 +17,7 @@ The diffuse part is one integral over i·z, its azimuthal integral being element
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -42,9 +43,11 @@ class Reference(Operator):
         self.tolerance = tolerance
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by quadrature."""
         return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by quadrature, converged to the tolerance."""
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
@@ -75,6 +78,7 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
 
 
 def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, "b"]:
+    """`specular_quadrature`, of so many elements at a time that memory stays small; scalars [b]."""
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
     return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in range(0, len(scalars[0]), rows)])
 
@@ -158,7 +162,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
 
 
-def over_circles(nodes: int, low: Tensor, high: Tensor, integrand) -> Float[Tensor, "b"]:
+def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, "b"]:
     """∫ over whole circles at radii [low, high]; limits [b, 1, 1]."""
     x, w = gauss(nodes, low.dtype)
     phi = 2 * math.pi * (torch.arange(2 * nodes, dtype=low.dtype) + 0.5) / (2 * nodes)
@@ -167,7 +171,9 @@ def over_circles(nodes: int, low: Tensor, high: Tensor, integrand) -> Float[Tens
     return (inner * w * (high - low)[:, :, 0]).sum(1)
 
 
-def over_arcs(nodes: int, low: Tensor, high: Tensor, integrand, cos_arc) -> Float[Tensor, "b"]:
+def over_arcs(
+    nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "b"]:
     """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], whose length goes like a root at both ends."""
     x, w = gauss(nodes, low.dtype)
     radius = low + (high - low) * (torch.sin(math.pi / 2 * x) ** 2)[None, :, None]

@@ -62,7 +62,7 @@ class Closure(msgspec.Struct, frozen=True):
     files: dict[str, Path]
 
     def record(self) -> dict[str, str]:
-        """The part of a step's record that is its code, and what the code is told by the environment now."""
+        """The part of a step's record that is its code, and the environment variables that the code reads, as they are now."""
         record = {f"source:{module}": digest for module, digest in self.modules.items()}
         record |= {f"data:{file}": digest for file, digest in self.data.items()}
         record |= {f"environment:{name}": os.environ[name] for name in self.environment if name in os.environ}
@@ -153,6 +153,10 @@ class Sources:
         return self._source(module, file).names if file else None
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
+        """All modules of the project that `stage` imports, with their hashes, and the names of installed packages among its imports.
+
+        Raises InputError where the stage has no module, or a module of the project cannot be parsed.
+        """
         first = f"{package}.{stage}"
         self._stage_file(package, stage, pipeline_file)
         seen: dict[str, Path] = {}

@@ -12,12 +12,13 @@ import time
 class Meter:
     """Started where it is made."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         _reset_peak()
         self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
 
     def read(self, threads: int, cores: int) -> dict:
+        """Cost since the meter was made: wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
         return {
             "started": self.started,
             "seconds": round(time.perf_counter() - self.wall, 3),

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from factorlib import arithmetic
 from factorlib.runner.stop import whole
@@ -27,17 +27,19 @@ class Pools:
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or _cores()
-        self._idle: dict[int, list[Executor]] = {}
+        self._spare: dict[int, list[Executor]] = {}
         self._busy: dict[Future, tuple[int, Executor]] = {}
 
     def free(self, cores: int) -> bool:
+        """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
         busy = sum(taken for taken, _, _ in self._busy.values())
         return busy == 0 or busy + cores <= self.cores
 
-    def submit(self, cores: int, threads: int, function: Callable, *arguments) -> Future:
+    def submit(self, cores: int, threads: int, function: Callable, *arguments: Any) -> Future:
+        """Start `function(*arguments)` in a worker process of `threads` threads, which takes `cores` cores; returns its future."""
         with whole(), _OfWorkers():
-            idle = self._idle.setdefault(threads, [])
-            executor = idle.pop() if idle else _executor(threads)
+            spare = self._spare.setdefault(threads, [])
+            executor = spare.pop() if spare else _executor(threads)
             try:
                 future = executor.submit(function, *arguments)
             except BrokenProcessPool:  # its process was killed while it had nothing to do
@@ -47,11 +49,13 @@ class Pools:
             return future
 
     def done(self, future: Future) -> None:
+        """Take a finished future's worker back, for the next step of as many threads."""
         _, threads, executor = self._busy.pop(future)
-        self._idle[threads].append(executor)
+        self._spare[threads].append(executor)
 
     def close(self, kill: bool = False) -> None:
-        executors = [e for idle in self._idle.values() for e in idle] + [executor for _, _, executor in self._busy.values()]
+        """End all worker processes; `kill`: at once, whatever they do."""
+        executors = [e for spare in self._spare.values() for e in spare] + [executor for _, _, executor in self._busy.values()]
         for executor in executors:
             executor.shutdown(wait=False, cancel_futures=True)
         if kill:
@@ -78,7 +82,7 @@ class _OfWorkers:
         self.before = {name: os.environ.get(name) for name in self.VARIABLES}
         os.environ.update(self.VARIABLES)
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         for name, value in self.before.items():
             if value is None:
                 del os.environ[name]

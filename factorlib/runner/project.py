@@ -30,6 +30,7 @@ class Slice(Protocol):
 
 
 def nothing_to_look_at(slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
+    """Stands in for a validation where a data set has none: no faults."""
     return []
 
 
@@ -67,11 +68,11 @@ def photo_sets() -> Provider:
     return Provider(SLICES, read)
 
 
-def _looking_at(dataset) -> Callable[..., list[InputError]]:
+def _looking_at(dataset: Any) -> Callable[..., list[InputError]]:
     """`factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
 
     @cache
-    def validation():
+    def validation() -> Any:
         return importlib.import_module("factorlib.validation").Validation(dataset)
 
     return lambda *arguments: validation().faults(*arguments)
@@ -86,14 +87,17 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def pipeline_file(self) -> Path:
+        """The file that declares the stages."""
         return self.root / PIPELINE
 
     @property
     def build(self) -> Path:
+        """The folder of all results."""
         return self.root / "build"
 
     @property
     def source_roots(self) -> list[Path]:
+        """Folders in which modules of the project are found: the checkout, and the library where it lies elsewhere."""
         return list(dict.fromkeys([self.root, LIBRARY]))
 
     def shown(self, path: Path) -> str:

@@ -21,6 +21,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -56,9 +57,11 @@ class Store:
         return entry if output_of(entry.files) == entry.output else None
 
     def tree(self, output: str) -> Path:
+        """Folder of the tree with hash `output`."""
         return self.trees / output
 
     def log(self, key: str) -> Path:
+        """File with the log of the result of `key`."""
         return self.logs / f"{key}.jsonl"
 
     def take_in(self, record: dict, folder: Path) -> tuple[Entry, Path | None]:
@@ -115,7 +118,8 @@ class Outputs(Mapping):
         self.damaged: dict[str, list[str]] = {}
         self._known: dict[str, str] = {}
 
-    def get(self, key, default=None):
+    def get(self, key: str, default: Any = None) -> Any:
+        """Tree hash of a key; `default` where there is no result, or its tree is damaged (then `damaged` says how)."""
         if key not in self._known:
             entry = self.store.entry(key)
             if entry is None:
@@ -128,6 +132,7 @@ class Outputs(Mapping):
         return self._known[key]
 
     def forget(self, key: str) -> None:
+        """Look `key` up again when it is asked for next."""
         self._known.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:
@@ -136,7 +141,7 @@ class Outputs(Mapping):
         now = {key: self.get(key) for key in before}
         return None not in now.values() and now == before
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: str) -> str:
         found = self.get(key)
         if found is None:
             raise KeyError(key)
@@ -145,7 +150,7 @@ class Outputs(Mapping):
     def __iter__(self) -> Iterator[str]:
         return (path.stem for path in self.store.keys.glob("*.json"))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return sum(1 for _ in self)
 
 

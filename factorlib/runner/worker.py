@@ -66,7 +66,7 @@ class Code(msgspec.Struct, frozen=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """All a worker is told.
+    """All that a worker knows of a step.
 
     hashes:  of the dataset's files, as they were when the key was made
     shipped: where the package may have the result already; None where it is to be made in any case
@@ -101,6 +101,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def run_step(task: Task) -> Outcome:
+    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
     meter = Meter()
     with Events(task) as events:
         try:
@@ -131,6 +132,7 @@ def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome
 
 
 def load_stage(code: Code) -> ModuleType:
+    """Import a stage's module from the project and limit the process to the stage's threads."""
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
@@ -147,7 +149,7 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
         return list(pool.map(function, items))
 
 
-def params_of(module: ModuleType, code: Code):
+def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
     """The stage's parameters as its own struct, every bound checked."""
     return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
 
@@ -252,19 +254,21 @@ class Events(logging.Handler):
             logging.getLogger(name).propagate = False
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         for name in ("factorlib", "py.warnings"):
             logging.getLogger(name).removeHandler(self)
         with contextlib.suppress(OSError):  # what could not be said, see `_say`
             self._stream.close()
 
     def progress(self, done: float, total: float, text: str = "") -> None:
+        """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
         now = time.monotonic()
         if now - self._last >= EVERY:
             self._last = now
             self._say({"done": float(done), "total": float(total), "text": text})
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Report a warning of the log, each text once (as a `logging.Handler`)."""
         text = record.getMessage().strip()
         if text not in self.warnings:
             self.warnings.append(text)

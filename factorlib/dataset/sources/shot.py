@@ -21,7 +21,7 @@ DAMAGED = "the file is damaged: copy it again from where it came"
 class Shot(msgspec.Struct, frozen=True):
     """An image of a source: its name or id, its camera, and what it shows from where.
 
-    size            of the image in pixels, as in `schema.Told`
+    size            of the image in pixels, as in `schema.ExternalCamera`
     centred         the source does not say where the principal point is
     cam_from_world  None where the source knows no world
     poses           obj_id -> cam_from_object of each instance, in millimetres
@@ -99,10 +99,12 @@ def _cure(camera: pycolmap.Camera) -> str:
 
 
 def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
+    """cam_from_world of a rotation matrix (made orthonormal) and a translation."""
     turn = pycolmap.Rotation3d(rotation)
     turn.normalize()
     return pycolmap.Rigid3d(turn, translation)
 
 
 def as_rows(rotation: pycolmap.Rotation3d) -> Mat3:
+    """The rotation as the rows of its matrix."""
     return tuple(tuple(map(float, row)) for row in rotation.matrix())
