@@ -22,6 +22,7 @@ class Verbs(typer.core.TyperGroup):
     """A word that is no verb is the name of a stage."""
 
     def resolve_command(self, ctx, args):
+        """Read a first word that is neither an option nor a verb as `stage <word>`."""
         if args and not args[0].startswith("-") and args[0] not in self.commands:
             args = ["stage", *args]
         return super().resolve_command(ctx, args)
@@ -62,14 +63,17 @@ def named(dataset: str | None) -> str:
 
 
 def named_if_any(dataset: str | None) -> str | None:
+    """The data set's name or path: the option's, else the environment's DATASET, else None."""
     return os.environ.get("DATASET") if dataset is None else dataset
 
 
 def chosen(settings: list[str] | None) -> list[str]:
+    """Parameters `stage.name=value` as they were written: the options', else the environment's SET."""
     return settings or [os.environ.get("SET", "")]
 
 
 def forced(force: bool) -> bool:
+    """Whether to run again what is current: --force or FORCE=1.  InputError where FORCE is neither 0, 1 nor empty."""
     word = os.environ.get("FORCE", "")
     if not force and word not in ("", "0", "1"):
         raise InputError(f"{word!r} is neither 1 nor 0", key="FORCE", cure="write FORCE=1 to run again, or leave it out")
@@ -154,6 +158,7 @@ def ship(stage: str, dataset: Dataset = None) -> None:
 
 
 def main() -> None:
+    """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
     sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:

@@ -22,6 +22,7 @@ def json_text(value: Any) -> str:
 
 
 def write_json(path: str | Path, value: Any) -> None:
+    """Write `value` as JSON, whole or not at all; ValueError for NaN and infinities."""
     write_text(path, json_text(value))
 
 

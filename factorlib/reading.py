@@ -96,6 +96,7 @@ def found_in(error: BaseException, what: str) -> str:
 
 
 def cure_of(error: BaseException, otherwise: str) -> str:
+    """The cure for an OSError of a known kind; `otherwise` for any other error."""
     return CURES.get(error.errno, otherwise) if isinstance(error, OSError) and error.errno is not None else otherwise
 
 

@@ -29,6 +29,7 @@ LIBRARIES = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": 
 
 
 def main() -> None:
+    """Make .venv for requirements.lock and this Python, unless it is there already.  Ends the program, with a cure, where it cannot."""
     state = hashlib.sha256(LOCK.read_bytes() + sys.version.encode() + os.environ.get("TORCH_INDEX", "").encode()).hexdigest()
     if READY.exists() and READY.read_text() == state:
         READY.touch()
@@ -46,6 +47,7 @@ def main() -> None:
 
 
 def say(text: str) -> None:
+    """Print a line, marked as set-up's."""
     print(f"set-up: {text}", flush=True)
 
 
@@ -53,6 +55,7 @@ def say(text: str) -> None:
 
 
 def make_venv() -> None:
+    """Create .venv with pip; one of another Python version is replaced."""
     READY.unlink(missing_ok=True)
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if (VENV / "bin" / "python").exists() and (VENV / "lib" / f"python{version}").is_dir():
@@ -94,6 +97,7 @@ def install_torch() -> None:
 
 
 def answers(url: str) -> bool:
+    """Whether a HEAD request to `url` succeeds within PROBE_SECONDS."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=PROBE_SECONDS) as reply:
             return reply.status == 200
@@ -123,10 +127,12 @@ def check_system() -> None:
 
 
 def missing_libraries() -> list[str]:
+    """Names of system libraries that this Linux lacks; nothing elsewhere."""
     return [name for name in LIBRARIES if not loads(name)] if sys.platform == "linux" else []
 
 
 def loads(library: str) -> bool:
+    """Whether the dynamic linker finds and loads a shared library."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -135,6 +141,7 @@ def loads(library: str) -> bool:
 
 
 def command_for(missing: list[str]) -> str:
+    """The command that installs the missing libraries on this system, to be shown to the user."""
     if shutil.which("apt-get"):
         return f"sudo apt-get update && sudo apt-get install -y {' '.join(LIBRARIES[name] for name in missing)}"
     if shutil.which("dnf"):

@@ -25,6 +25,7 @@ def silent(done: float, total: float, text: str = "") -> None:
 
 
 def serial_map(function: Callable, items: Iterable) -> list:
+    """`map` in this process, all results at once, in the order of `items`."""
     return [function(item) for item in items]
 
 
@@ -53,4 +54,5 @@ class Inputs(msgspec.Struct, frozen=True):
         return self.folders[stage]
 
     def file(self, relative: str) -> Path:
+        """Absolute path of a file that dataset.yaml names; KeyError for one that this step did not declare."""
         return self.files[relative]

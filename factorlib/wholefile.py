@@ -27,11 +27,13 @@ def writing(path: str | Path) -> Iterator[Path]:
 
 
 def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
+    """Write a file, whole or not at all; OSError, with the file's name, where that fails."""
     with writing(path), open(path, "wb") as stream:
         stream.write(data)
 
 
 def write_text(path: str | Path, text: str, encoding: str = "utf-8") -> None:
+    """Write a text file, whole or not at all; OSError, with the file's name, where that fails."""
     write_bytes(path, text.encode(encoding))
 
 

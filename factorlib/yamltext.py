@@ -78,6 +78,7 @@ class _Document:
             raise _syntax_error(error, self.path) from error
 
     def value(self) -> Any:
+        """The value of the one document in the text, None for an empty text.  InputError where there is a second."""
         next(self.events)  # the stream
         if isinstance(next(self.events), yaml.StreamEndEvent):
             return None
@@ -209,4 +210,5 @@ def key_path(keys: Keys) -> str | None:
 
 
 def at_line(path: str | Path, line: int | None) -> str:
+    """`path:line`, the form in which editors find a place; the path alone where the line is not known."""
     return f"{path}:{line}" if line else str(path)

@@ -48,6 +48,7 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Align the meshes of one photo and write its maps, its poses and the overlay."""
     name = inputs.photo
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
@@ -181,6 +182,10 @@ def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
 
 
 def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:
+    """Write the maps of a photo as EXR; the channels are listed in docs/formats.md.
+
+    certainty: [h, w], how much a pixel's normal is to be believed, 0 to 1
+    """
     channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
     channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
     channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": certainty, "back": maps.back}

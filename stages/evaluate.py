@@ -38,6 +38,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Compare everything that was solved with the photos and the truth, and write metrics.json."""
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     progress(0, 3, "re-synthesis")

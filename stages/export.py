@@ -49,6 +49,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Write materials, lights, coverage and scenes in the forms of other programs."""
     names: list[str] = inputs.facts["dataset.materials"]
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
@@ -136,6 +137,7 @@ class MeshFiles:
         self._stems: dict[tuple, str] = {}
 
     def mesh(self, name: str, entry: MeshEntry, overrides: dict[str, str]) -> Mesh:
+        """The mesh `name` with `overrides` of its parts' materials, read when first asked for."""
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.inputs.file(entry.file)

@@ -47,6 +47,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Render a photo again, and balls and reflectance maps of every material in its light."""
     name, names = inputs.photo, inputs.facts["dataset.materials"]
     file = inputs["export"] / "materials.json"
     materials = in_order(read_materials(file), names, file)

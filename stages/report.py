@@ -26,6 +26,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Write the page and its figures."""
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     errors = run.metrics().resynthesis.photos
     rows, tags = [], material_tags(run)

@@ -60,6 +60,7 @@ WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Train the diffuse and the specular network, and write weights, curves and accuracy."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
     try:

@@ -22,10 +22,12 @@ class Evidence(msgspec.Struct, frozen=True):
 
     @property
     def inside(self) -> Bool[np.ndarray, "h w"]:
+        """Where the photo shows some material of the object."""
         return self.label > 0
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
+        """Where the photo says what is seen."""
         return self.label != UNKNOWN
 
 

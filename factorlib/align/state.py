@@ -25,6 +25,7 @@ class State(msgspec.Struct, frozen=True):
     log_focal: float
 
     def middle(self) -> Float[np.ndarray, "3"]:
+        """The mesh's centre in camera coordinates, mesh units."""
         return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
 
     def pose(self, mesh) -> Pose:
@@ -32,6 +33,7 @@ class State(msgspec.Struct, frozen=True):
         return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
 
     def camera(self, like: Camera) -> Camera:
+        """`like` with this state's focal length."""
         return msgspec.structs.replace(like, focal=float(np.exp(self.log_focal)))
 
     def moved(self, step: Float[np.ndarray, "7"]) -> "State":

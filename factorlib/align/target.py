@@ -41,6 +41,7 @@ class Target(msgspec.Struct, frozen=True):
     regions: dict[int, Region]
 
     def camera(self, photo_camera: Camera) -> Camera:
+        """The photo's camera seen through the window, in the window's pixels."""
         height, width = self.evidence.label.shape
         return photo_camera.window(self.left, self.top, self.pixel, width, height)
 

@@ -96,6 +96,7 @@ def _check_name(key: str, name: str, refuse: Refusal) -> None:
 
 
 def check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:
+    """Refuse a name that is not among `known`, and suggest the nearest one."""
     known = list(known)
     if name not in known:
         refuse(key, f"unknown {kind} {name!r}", did_you_mean(name, known) if known else f"the dataset has no {kind} here")

@@ -60,6 +60,7 @@ def check_centre(key: str, centre: Sequence[float], refuse: Refusal) -> None:
 
 
 def check_unit(key: str, number: float, refuse: Refusal) -> None:
+    """A ratio of two units of length, more than 0 and within UNITS."""
     if number <= 0:
         refuse(key, f"{number} is not more than 0", "give how many units of the one are one of the other")
     if not UNITS[0] <= number <= UNITS[1]:
@@ -73,6 +74,7 @@ def check_share(key: str, number: float, refuse: Refusal) -> None:
 
 
 def check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
+    """Three rows of a rotation matrix: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
     gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
     worst = max(abs(entry) for row in gram for entry in row)
     if not worst <= ROTATION_TOLERANCE:

@@ -166,9 +166,11 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def name(self) -> str:
+        """Name of the data set: its folder's."""
         return self.folder.name
 
     def photo(self, name: str) -> PhotoEntry:
+        """The entry of a photo; KeyError where there is none of that name."""
         return self._photos[name]
 
     @cached_property

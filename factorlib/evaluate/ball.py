@@ -48,6 +48,7 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def mean(self) -> Float[np.ndarray, "3"]:
+        """Mean radiance over the sphere, RGB."""
         return self.levels[-1][0, 0]
 
 

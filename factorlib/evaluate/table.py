@@ -34,6 +34,7 @@ class Row(msgspec.Struct, frozen=True):
 
     @property
     def ok(self) -> bool:
+        """Whether the value is there and within its bound."""
         return self.value is not None and COMPARISONS[self.bound.sense](self.value, self.bound.limit)
 
 
@@ -68,6 +69,7 @@ def value_at(metrics: object, path: str) -> float | None:
 
 
 def rows_of(metrics: object, bounds: Iterable[Bound]) -> list[Row]:
+    """The value of every bound, looked up in `metrics` by the bound's dotted path."""
     return [Row(bound, value_at(metrics, bound.path)) for bound in bounds]
 
 

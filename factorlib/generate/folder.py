@@ -57,6 +57,7 @@ def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> No
 
 
 def write_light(path: Path, lat_long: Float[np.ndarray, "h w 3"]) -> None:
+    """Write a map of linear radiance, lat-long as in `factorlib.conventions`, as EXR."""
     write_rgb_exr(path, lat_long, LAT_LONG)
 
 

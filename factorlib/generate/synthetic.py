@@ -128,6 +128,10 @@ def light_of(
 
 
 def surroundings(number: int, world_from_camera, rng: np.random.Generator, sky_rows: int) -> Things:
+    """Light number 0 is a street by day, the others rooms with as many lamps as their number.
+
+    world_from_camera: rotation [3, 3]; the sun stands behind the camera, to its left or right
+    """
     if number:
         return lights.room(rng, windows=2, lamps=number)
     forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
@@ -145,6 +149,7 @@ def placements(shot: Shot, world_from_camera, rng: np.random.Generator, spread: 
 
 
 def name_of(placed: Placed) -> str:
+    """Name of an object: its material and its shape."""
     return f"{placed.material}_{placed.shape}"
 
 

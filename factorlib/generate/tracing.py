@@ -53,14 +53,17 @@ def bsdf(material: Material) -> dict[str, Any]:
 
 
 def rgb(value) -> dict[str, Any]:
+    """A colour as a Mitsuba dictionary; a single number is grey."""
     return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(value, 3)]}
 
 
 def transform(matrix: Float[np.ndarray, "4 4"]):
+    """Mitsuba's transform of a 4 × 4 matrix."""
     return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
 
 
 def rigid(rotation: Float[np.ndarray, "3 3"], translation) -> Float[np.ndarray, "4 4"]:
+    """The 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix

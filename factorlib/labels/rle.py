@@ -31,6 +31,7 @@ class Union:
         np.add.at(self._edges, borders[1::2], -1)
 
     def mask(self) -> Bool[np.ndarray, "height width"]:
+        """The union as a mask."""
         inside = np.cumsum(self._edges[:-1], dtype=np.int32) > 0
         return np.ascontiguousarray(inside.reshape(self.shape[::-1]).T)
 

@@ -142,6 +142,7 @@ class Buffers:
         self._read: dict[int, bytes] = {}
 
     def buffer(self, index: int) -> bytes:
+        """The bytes of buffer `index`; InputError where it is shorter than the header says, or larger than the limits."""
         if index not in self._read:
             said = self.header.buffers[index]
             content = self._content(said.uri)

@@ -21,6 +21,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def bytes(self) -> int:
+        """The limit of a file in bytes."""
         return int(self.megabytes * 1e6)
 
     def check(self, vertices: int, triangles: int, file) -> None:

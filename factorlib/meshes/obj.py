@@ -68,6 +68,7 @@ class _Reader:
         self.current: int | None = None  # the part that faces belong to now; None until one asks
 
     def take(self, key: str, words: list[str]) -> None:
+        """Take in one line: its first word `key` and the words after it.  ValueError where they are malformed."""
         if key == "v":
             self.vertices.extend(_three(words, "coordinates"))
         elif key == "vn":
@@ -78,6 +79,7 @@ class _Reader:
             self.name(key, words)
 
     def name(self, key: str, words: list[str]) -> None:
+        """Faces that follow are of another material, group or object."""
         self.current = None
         if key == "usemtl":
             self.material = " ".join(words)
@@ -87,6 +89,7 @@ class _Reader:
             self.object = " ".join(words)
 
     def face(self, words: list[str]) -> None:
+        """Add a polygon as a fan of triangles; a corner of it is `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
         corners = [self.corner(word) for word in words]
         if len(corners) < 3:
             raise ValueError("a face has three corners at least")
@@ -99,14 +102,17 @@ class _Reader:
             self.part.append(self.current)
 
     def corner(self, word: str) -> tuple[int, int]:
+        """Index of a corner's vertex and of its normal, from 0; −1 where it has no normal."""
         fields = word.split("/")
         vertex = _index(fields[0], len(self.vertices) // 3)
         return vertex, _index(fields[2], len(self.vertex_normals) // 3) if len(fields) > 2 and fields[2] else -1
 
     def check(self, limits: Limits, path: Path) -> None:
+        """Raise InputError where more has been read than the limits allow."""
         limits.check(len(self.vertices) // 3, len(self.part), path)
 
     def soup(self) -> Soup:
+        """All that was read, as arrays; corners without a normal have NaN."""
         normal_table = np.concatenate([np.array(self.vertex_normals), np.full(3, np.nan)]).reshape(-1, 3)
         index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
         index[(index < 0) | (index >= len(normal_table))] = len(normal_table) - 1

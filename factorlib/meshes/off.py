@@ -17,6 +17,7 @@ CURE = "is it whole? export it again"
 
 
 def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
+    """Read an OFF file; polygons become fans of triangles.  InputError for a malformed or too large one."""
     lines = [line for line in (line.split("#", 1)[0].strip() for line in lines_of(content)) if line]
     keyword = KEYWORD.match(lines[0]) if lines else None
     if keyword is None:

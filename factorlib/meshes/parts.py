@@ -13,6 +13,7 @@ MOST_PARTS = 100_000  # of one file
 
 
 def check_count(parts: int, file) -> None:
+    """Raise InputError for more than MOST_PARTS parts in one file."""
     if parts > MOST_PARTS:
         raise InputError(f"has {parts:,} parts", file=file, cure=f"join parts of one material: at most {MOST_PARTS:,} are read")
 

@@ -49,6 +49,7 @@ class Header(msgspec.Struct, frozen=True):
     start: int
 
     def element(self, name: str) -> Element | None:
+        """The element of that name, None where there is none."""
         return next((element for element in self.elements if element.name == name), None)
 
 

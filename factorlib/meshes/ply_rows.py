@@ -37,6 +37,7 @@ class _Rows:
     at = 0
 
     def columns(self, element: Element) -> Columns:
+        """All rows of an element as columns, by property; `at` moves behind them."""
         if not element.count or not element.properties:
             return {p.name: Column(np.empty(0), np.zeros(0, np.int64)) for p in element.properties}
         lengths = list(self._lengths(element.properties, self.at))
@@ -51,6 +52,7 @@ class _Rows:
         raise NotImplementedError
 
     def numbers(self, kind: np.dtype, count: int, at: int) -> tuple[np.ndarray, int]:
+        """`count` numbers from position `at`, and the position after them; ValueError where the file ends before."""
         raise NotImplementedError
 
     def _lengths(self, properties: list[Property], at: int) -> Iterator[int]:
@@ -85,16 +87,19 @@ class _Binary(_Rows):
         self.content, self.at = content, start
 
     def number(self, kind: np.dtype, at: int) -> tuple[float, int]:
+        """As of `_Rows`; `at` in bytes."""
         found, after = self.numbers(kind, 1, at)
         return found[0].item(), after
 
     def numbers(self, kind: np.dtype, count: int, at: int) -> tuple[np.ndarray, int]:
+        """As of `_Rows`; `at` in bytes."""
         after = at + count * kind.itemsize
         if after > len(self.content):
             raise ValueError("its rows end early")
         return np.frombuffer(self.content, kind, count, at), after
 
     def alike(self, element: Element, lengths: list[int]) -> Columns | None:
+        """As of `_Rows`: the rows are read as one structured array."""
         size = sum((p.length.itemsize if p.length else 0) + n * p.type.itemsize for p, n in zip(element.properties, lengths))
         if self.at + element.count * size > len(self.content):
             return None
@@ -114,15 +119,18 @@ class _Text(_Rows):
         self.table = numbers_in(content)
 
     def number(self, kind: np.dtype, at: int) -> tuple[float, int]:
+        """As of `_Rows`; `at` in numbers from the first."""
         found, after = self.numbers(kind, 1, at)
         return found[0].item(), after
 
     def numbers(self, kind: np.dtype, count: int, at: int) -> tuple[np.ndarray, int]:
+        """As of `_Rows`; `at` in numbers from the first."""
         if at + count > len(self.table):
             raise ValueError("its rows end early")
         return self.table[at : at + int(count)], at + int(count)
 
     def alike(self, element: Element, lengths: list[int]) -> Columns | None:
+        """As of `_Rows`: the rows are one table."""
         ends = np.cumsum([n + (p.length is not None) for p, n in zip(element.properties, lengths)]).tolist()
         if self.at + element.count * ends[-1] > len(self.table):
             return None

@@ -45,6 +45,7 @@ def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.
 
 
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
+    """Corner normals of a file that gives none: NaN."""
     return np.full((faces, 3, 3), np.nan)
 
 

@@ -55,5 +55,6 @@ def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
 
 
 def shown(line: str) -> str:
+    """A line as messages quote it, cut to SHOWN characters."""
     line = line.strip()
     return repr(line if len(line) <= SHOWN else line[: SHOWN - 1] + "…")

@@ -15,7 +15,9 @@ class ClosedForm(Operator):
     """Formulas alone."""
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by `factorlib.reflection.diffuse`."""
         return diffuse(sharpness, nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by `factorlib.reflection.filtering`; at most MOST."""
         return filtered_specular(*torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)).value.clamp_max(MOST)

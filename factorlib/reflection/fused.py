@@ -106,6 +106,7 @@ def specular_on(tape: Tape) -> tuple[Value, tuple]:
 
 
 def diffuse_on(tape: Tape) -> tuple[Value, tuple]:
+    """The formula and the features of the diffuse part, of inputs named as in PLACES."""
     inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
     return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
 

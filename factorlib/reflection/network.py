@@ -38,10 +38,12 @@ def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
 
 
 def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> Float[Tensor, "*b features"]:
+    """The inputs of the specular network, from tensors that broadcast; `form` is `filtered_specular` of the same."""
     return torch.stack(torch.broadcast_tensors(*specular_columns(alpha, no, nz, oz, form)), -1)
 
 
 def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "*b features"]:
+    """The inputs of the diffuse network, from tensors that broadcast."""
     columns = diffuse_columns(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)
     return torch.stack(torch.broadcast_tensors(*columns), -1)
 
@@ -73,6 +75,7 @@ class Network(Operator):
         return Response(diffuse, diffuse_by_log_sharpness, diffuse_by_nz, *self.fused["specular"](float(roughness), sharpness, no, nz, oz))
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if self._compiled(sharpness, nz):
             return self.fused["diffuse"].value(0.0, sharpness, nz.new_ones(len(nz)), nz, nz)
         nz = nz.clamp(-1, 1)
@@ -81,6 +84,7 @@ class Network(Operator):
         )
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`, at most MOST; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if roughness.ndim == 0 and no.ndim == 1 and self._compiled(sharpness, no, nz, oz, roughness):
             return self.fused["specular"].value(float(roughness), sharpness, no, nz, oz)
         alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)

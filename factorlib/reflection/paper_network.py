@@ -53,12 +53,14 @@ class PaperNetwork(Operator):
         self.layers = {part: read_layers(SHIPPED / f"paper_{part}.safetensors", INPUTS[part]).to(dtype) for part in INPUTS}
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`; λ is clamped to SHARPNESS."""
         sharpness, nz = torch.broadcast_tensors(sharpness, nz.clamp(-1, 1))
         zero = torch.zeros_like(nz)
         normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
         roughness, sharpness, no, nz, oz = torch.broadcast_tensors(roughness, sharpness, columns(no), nz, oz)
         normal, half, axis = frame_of_cosines(no, nz, oz)
         return self._reflected("specular", sharpness, specular_inputs(normal, half, axis, sharpness, roughness))
@@ -77,16 +79,19 @@ def frame_of_cosines(no: Tensor, nz: Tensor, oz: Tensor) -> tuple[tuple[Tensor, 
 
 
 def soft_root(square: Tensor) -> Tensor:
+    """√(max(x, 0) + SOFTENED): a root whose derivative is bounded."""
     return torch.sqrt(square.clamp_min(0) + SOFTENED)
 
 
 def diffuse_inputs(normal: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor) -> Float[Tensor, "*b 7"]:
+    """Inputs of the diffuse network: normal, axis (three components each, camera frame), log σ."""
     return torch.stack([*normal, *axis, log_precision(sharpness)], -1)
 
 
 def specular_inputs(
     normal: tuple[Tensor, ...], half: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor, roughness: Tensor
 ) -> Float[Tensor, "*b 11"]:
+    """Inputs of the specular network: normal, half vector, axis (three components each, camera frame), log σ, roughness."""
     return torch.stack([*normal, *half, *axis, log_precision(sharpness), roughness.clamp(*ROUGHNESS)], -1)
 
 

@@ -42,9 +42,11 @@ class Reference(Operator):
         self.tolerance = tolerance
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by quadrature."""
         return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+        """As of `Operator`, by quadrature, converged to the tolerance."""
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
@@ -75,6 +77,7 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
 
 
 def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, "b"]:
+    """`specular_quadrature`, of so many elements at a time that memory stays small; scalars [b]."""
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
     return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in range(0, len(scalars[0]), rows)])
 

@@ -32,6 +32,7 @@ class Samples(msgspec.Struct, frozen=True):
     value: Float[Tensor, "n"]
 
     def inputs(self) -> tuple[Tensor, ...]:
+        """α, λ, n·o, n·z, o·z: the arguments of the specular formula."""
         return self.alpha, self.sharpness, self.no, self.nz, self.oz
 
     def scale(self) -> Float[Tensor, "n"]:
@@ -42,6 +43,7 @@ class Samples(msgspec.Struct, frozen=True):
         return len(self.alpha)
 
     def joined(self, other: Samples) -> Samples:
+        """These samples, then the others."""
         return Samples(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in self.__struct_fields__))
 
 

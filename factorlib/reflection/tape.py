@@ -27,9 +27,11 @@ class Tape:
         self.known: dict[tuple, int] = {}
 
     def input(self, name: str) -> Value:
+        """The input of that name, on the tape once however often it is asked for."""
         return self._record("input", (name,))
 
     def apply(self, name: str, *arguments) -> Value | float:
+        """Record operation `name` of C on values or numbers; a number where all arguments are."""
         arguments = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
         plain = _simplified(name, arguments)
         if plain is not None:
@@ -124,9 +126,11 @@ class Value:
         return self * self if exponent == 2 else NotImplemented
 
     def clamp(self, low: float, high: float):
+        """As torch's."""
         return self.clamp_min(low).clamp_max(high)
 
     def sqrt(self):
+        """As torch's."""
         return self.tape.apply("sqrt", self)
 
     @classmethod

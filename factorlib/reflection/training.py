@@ -48,22 +48,27 @@ class Problem(msgspec.Struct, frozen=True):
     unit: Float[Tensor, "n"]
 
     def rows(self, index) -> Problem:
+        """The problem of some samples, by index [k]."""
         return Problem(*(getattr(self, name)[index] for name in self.__struct_fields__))
 
     def float(self) -> Problem:
+        """The same in float32, in which networks are trained."""
         return Problem(*(getattr(self, name).float() for name in self.__struct_fields__))
 
     def errors(self, layers: Layers) -> Float[Tensor, "n"]:
+        """(R − S) / unit of every sample: the network's value R against the exact value S."""
         return (self.formula * torch.exp(correction(layers, self.features, self.sharpness)) - self.exact) / self.unit
 
 
 def specular_problem(samples: Samples) -> Problem:
+    """What the specular network is fitted to, at `samples`."""
     form = filtered_specular(*samples.inputs())
     features = specular_features(samples.alpha, samples.no, samples.nz, samples.oz, form)
     return Problem(features, samples.sharpness, form.value, samples.value, samples.scale())
 
 
 def diffuse_problem(samples: DiffuseSamples) -> Problem:
+    """What the diffuse network is fitted to, at `samples`."""
     formula = diffuse(samples.sharpness, samples.nz)
     return Problem(diffuse_features(samples.sharpness, samples.nz), samples.sharpness, formula, samples.value, samples.scale())
 
@@ -147,6 +152,7 @@ class Run:
         return rows[torch.randperm(len(rows), generator=self.generator)]
 
     def state(self) -> dict:
+        """All that `load_state` needs to go on to the same bytes."""
         return {
             "parameters": [p.detach() for p in self.parameters],
             "kept": [*self.kept.weights, *self.kept.biases],
@@ -157,6 +163,7 @@ class Run:
         }
 
     def load_state(self, state: dict) -> None:
+        """Go on from a `state` of a run with the same problem and schedule."""
         with torch.no_grad():
             for parameter, value in zip(self.parameters, state["parameters"], strict=True):
                 parameter.copy_(value)
@@ -174,6 +181,7 @@ def robust(error: Tensor) -> Tensor:
 
 
 def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator: torch.Generator) -> Layers:
+    """Random weights of variance 1.7 over the number of inputs, the last layer's a tenth as large, so that the correction begins near 0."""
     sizes = [features.shape[1], *[schedule.width] * schedule.depth, 1]
     weights = [torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in zip(sizes, sizes[1:], strict=False)]
     weights[-1] *= 0.1

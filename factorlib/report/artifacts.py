@@ -81,36 +81,46 @@ class Artifacts(msgspec.Struct, frozen=True):
         return found
 
     def masks(self, photo: str) -> Channels:
+        """Linear radiance R, G, B, `label`, `valid` and `clipped.*` of a photo."""
         return read_exr(self.folders["masks"] / f"{photo}.exr")
 
     def geometry(self, photo: str) -> Channels:
+        """Normals, view directions, depth and labels of a photo, as `align` writes them."""
         return read_exr(self.folders["align"] / f"{photo}.exr")
 
     def overlay(self, photo: str) -> np.ndarray | None:
+        """The mesh drawn over the photo, sRGB."""
         path = self.folders["align"] / f"{photo}_overlay.png"
         return read_png(path) if path.exists() else None
 
     def observations(self, photo: str) -> Observations | None:
+        """The photo's observations."""
         path = self.folders["urm"] / f"{photo}.parquet"
         return read_observations(path) if path.exists() else None
 
     def resynthesis(self, photo: str) -> Picture | None:
+        """The photo rendered again, linear radiance."""
         return self._rgb(self.folders["render"] / "resynthesis" / f"{photo}.exr")
 
     def ball(self, photo: str, material: str) -> Picture | None:
+        """A ball of a material in the photo's light, linear radiance."""
         return self._rgb(self.folders["render"] / "materials" / photo / f"{material}.exr")
 
     def reflectance_map(self, photo: str, material: str) -> Channels | None:
+        """Radiance of a material by normal in the photo's light, with the channel `observed`."""
         path = self.folders["render"] / "reflectance_maps" / photo / f"{material}.exr"
         return read_exr(path) if path.exists() else None
 
     def illumination(self, name: str) -> Picture | None:
+        """The solved map of a light, linear radiance."""
         return self._rgb(self.folders["export"] / "illumination" / f"{name}.exr")
 
     def coverage(self, name: str) -> Picture | None:
+        """The standard error of a light's map over its mean radiance."""
         return self._rgb(self.folders["export"] / "coverage" / f"{name}.exr")
 
     def true_illumination(self, name: str) -> Picture | None:
+        """The true map of a light, linear radiance."""
         return self._rgb(self.folders["evaluate"] / "illumination" / f"{name}.exr")
 
     def spheres(self, name: str, which: str) -> Picture | None:
@@ -118,9 +128,11 @@ class Artifacts(msgspec.Struct, frozen=True):
         return self._rgb(self.folders["evaluate"] / "spheres" / f"{name}_{which}.exr")
 
     def convergence(self) -> dict[str, list]:
+        """The history of the solve, as columns."""
         return self._table(self.folders["solve"] / "convergence.parquet")
 
     def training(self) -> dict[str, list]:
+        """The curve of the networks' training, as columns."""
         return self._table(self.folders["train"] / "training.parquet")
 
     def events(self) -> list[dict]:

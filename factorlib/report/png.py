@@ -28,6 +28,7 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
 
 
 def data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
+    """Pixels as a PNG in a `data:` URI, for the `src` of an image."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
 
 

@@ -22,30 +22,36 @@ class Bars(Display):
         self.bars.start()
 
     def say(self, text: str) -> None:
+        """Print a line above the bars."""
         self.bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def start(self, step: Step) -> None:
+        """Count a step as running; its stage gets a bar if it has none."""
         self._running[step] = 0.0
         if step.stage not in self._rows:
             self._rows[step.stage] = self.bars.add_task(step.stage, total=1.0, count="", words="")
         self._refresh(step.stage)
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
+        """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does."""
         self._running[step] = min(done / total, 1.0) if total else 0.0
         self._words[step] = text
         self._refresh(step.stage)
 
     def tick(self) -> None:
+        """Draw every bar anew; called about once a second."""
         for stage in self._rows:
             self._refresh(stage)
 
     def finish(self, step: Step, seconds: float) -> None:
+        """Count a step as done; `seconds` is not shown here."""
         self.count_off(step)
         self._running.pop(step, None)
         self._words.pop(step, None)
         self._refresh(step.stage)
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
+        """Count a step as ended, and print its error."""
         self._running.pop(step, None)
         self._refresh(step.stage)
         super().fail(step, error, traceback)
@@ -61,5 +67,6 @@ class Bars(Display):
             self.bars.stop_task(self._rows[stage])
 
     def close(self) -> None:
+        """Draw the bars a last time and give the terminal back."""
         self.tick()
         self.bars.stop()

@@ -153,6 +153,10 @@ class Sources:
         return self._source(module, file).names if file else None
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
+        """All modules of the project that `stage` imports, with their hashes, and the names of installed packages among its imports.
+
+        Raises InputError where the stage has no module, or a module of the project cannot be parsed.
+        """
         first = f"{package}.{stage}"
         self._stage_file(package, stage, pipeline_file)
         seen: dict[str, Path] = {}

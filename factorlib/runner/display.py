@@ -36,9 +36,11 @@ class Display:
         self.left[step.stage] = self.left.get(step.stage, 1) - 1
 
     def say(self, text: str) -> None:
+        """Print a line."""
         print(text, file=self.stream, flush=True)
 
     def start(self, step: Step) -> None:
+        """A step begins; printed for the first step of a stage only."""
         self._started[step] = self._spoke[step] = time.monotonic()
         if step.stage not in self._begun:
             self._begun.add(step.stage)
@@ -46,15 +48,18 @@ class Display:
             self.say(f"{step.stage:<10} " + ("…" if step.photo is None else f"{left} photo{'s' * (left > 1)} …"))
 
     def waits(self, step: Step) -> None:
+        """A step waits for another run to make its result; printed once."""
         if step not in self._waited:
             self._waited.add(step)
             self.say(f"{step}: waiting: another run is making it")
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
+        """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does; `tick` prints it."""
         share = f"{done / total:4.0%}" if total else ""
         self._words[step] = f"{share} {text}".strip()
 
     def tick(self) -> None:
+        """Print a line for every step that has been silent for BEAT seconds."""
         now = time.monotonic()
         for step, spoke in self._spoke.items():
             if now - spoke >= BEAT:
@@ -64,16 +69,19 @@ class Display:
                 )
 
     def warn(self, step: Step, text: str) -> None:
+        """Print a warning; one that was printed before is left out."""
         if text not in self._warned:
             self._warned.add(text)
             self.say(f"warning: {step}: {text}")
 
     def finish(self, step: Step, seconds: float) -> None:
+        """A step is done, after `seconds`."""
         self.count_off(step)
         self._spoke.pop(step, None)
         self.say(f"{step.stage:<10} {step.photo or '':<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
+        """A step ended with an error; `traceback` names the file with details of a defect of the program."""
         self._spoke.pop(step, None)
         self.say(f"error: {step}: {error}")
         if traceback:

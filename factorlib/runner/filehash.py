@@ -28,6 +28,7 @@ def signature(path: Path) -> Signature:
 
 
 def hash_of_file(path: Path) -> str:
+    """First 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
 
@@ -57,6 +58,7 @@ class FileHashes:
         self._changed = False
 
     def content(self, path: Path) -> str:
+        """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
         return self._remembered(self._contents, path, lambda: hash_of_file(path), Hash)
 
     def source(self, path: Path, parse: Callable[[], T], type_: type[T]) -> T:
@@ -81,6 +83,7 @@ class FileHashes:
             return {}, {}
 
     def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
         if not self._changed or self.cache is None:
             return
         write_cache(self.cache, {"format": FORMAT, "contents": self._contents, "sources": self._sources})

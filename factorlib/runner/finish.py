@@ -56,6 +56,10 @@ def label(step: Step) -> str:
 
 
 def folder_of(survey: Survey, stage: str, outputs: dict[str | None, str]) -> Path:
+    """Where a stage's result lies: its tree in the store, or for a stage over photos a view of all photos' trees.
+
+    outputs: tree hash by photo; by None for a stage over the whole set
+    """
     spec = survey.spec.pipeline.stages[stage]
     return view_of(survey.store, survey.outputs.inspector, outputs, spec.gather) if spec.over else survey.store.tree(outputs[None])
 

@@ -23,6 +23,7 @@ class Gone(msgspec.Struct, frozen=True):
     left: list[Path]
 
     def lines(self, shown: Callable[[Path], str]) -> list[str]:
+        """A line for each path, as `shown` writes paths."""
         said = [f"deleted {shown(path)}" for path in self.deleted] or ["nothing to delete"]
         return said + [f"left    {shown(path)}" for path in self.left]
 

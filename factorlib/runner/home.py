@@ -32,18 +32,22 @@ class Home(msgspec.Struct, frozen=True):
 
     @property
     def log(self) -> Path:
+        """What the runs of this data set cost and reported, one JSON object a line."""
         return self.folder / "log.jsonl"
 
     @property
     def keys_file(self) -> Path:
+        """Which result of each step is current, as JSON: {step: key}."""
         return self.folder / "current.json"
 
     @property
     def errors(self) -> Path:
+        """Folder of the errors of steps that failed, a text file each."""
         return self.folder / "errors"
 
     @property
     def mark(self) -> Path:
+        """The file that says whose results these are: the path of the dataset's folder."""
         return self.folder / "dataset.txt"
 
     def keys(self) -> dict[str, str]:
@@ -65,6 +69,7 @@ class Home(msgspec.Struct, frozen=True):
             return {}
 
     def write_keys(self, keys: dict[str, str]) -> None:
+        """Replace the table of current results, step -> key."""
         replace_file(self.keys_file, json_text(keys).encode())
 
 

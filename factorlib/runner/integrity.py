@@ -107,6 +107,7 @@ class Inspector:
             return f"{name}: cannot be read ({error.strerror})"
 
     def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
+        """Note the stamps of a tree whose contents were right."""
         if self.known.get(name) != stamps:
             self.known[name], self._changed = stamps, True
 

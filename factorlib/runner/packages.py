@@ -53,6 +53,7 @@ class Packages:
             return {}
 
     def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
         if self._changed and self.cache is not None:
             write_cache(self.cache, {"state": self.state, "versions": self._known})
             self._changed = False

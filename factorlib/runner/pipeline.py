@@ -61,10 +61,12 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def slices(self) -> list[str]:
+        """Names of the slices of dataset.yaml that the stage takes."""
         return [name.removeprefix(DATASET) for name in self.inputs if name.startswith(DATASET)]
 
     @property
     def upstream(self) -> list[str]:
+        """Names of the stages whose results the stage takes."""
         return [name for name in self.inputs if not name.startswith(DATASET)]
 
     @property
@@ -99,6 +101,10 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
+    """Read and check pipeline.yaml; `known_slices` are the slices that a data set can give.
+
+    Raises InputError for another format, an unknown name, or stages that need each other.
+    """
     pipeline = read_yaml(path, Pipeline)
     if pipeline.format != FORMAT:
         raise InputError(f"format {pipeline.format} is not known", file=path, key="format", cure=f"this version reads format: {FORMAT}")

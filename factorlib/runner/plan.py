@@ -41,9 +41,11 @@ class Spec(msgspec.Struct, frozen=True):
     forced: frozenset[Step] = frozenset()
 
     def steps(self) -> list[Step]:
+        """All steps of the wanted stages and of what they need, upstream first."""
         return [step for name in self.pipeline.needed(self.targets) for step in self.steps_of(name)]
 
     def steps_of(self, stage: str) -> list[Step]:
+        """The steps of one stage: one per photo, or one for the whole set."""
         return [Step(stage, photo) for photo in self.photos] if self.pipeline.stages[stage].over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:

@@ -30,6 +30,7 @@ class Slice(Protocol):
 
 
 def nothing_to_look_at(slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
+    """Stands in for a validation where a data set has none: no faults."""
     return []
 
 
@@ -90,10 +91,12 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def build(self) -> Path:
+        """The folder of all results."""
         return self.root / "build"
 
     @property
     def source_roots(self) -> list[Path]:
+        """Folders in which modules of the project are found: the checkout, and the library where it lies elsewhere."""
         return list(dict.fromkeys([self.root, LIBRARY]))
 
     def shown(self, path: Path) -> str:

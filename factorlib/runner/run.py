@@ -89,6 +89,7 @@ class Run:
         self.made: set[str] = set()  # keys
 
     def go(self) -> None:
+        """Run all that can run; returns when nothing is running, and what is left waits for a step that failed."""
         self._plan()
         while True:
             self._start_ready()
@@ -116,6 +117,7 @@ class Run:
             raise Refused(self.tally.failed)
 
     def release(self) -> None:
+        """Give back the locks of all steps that run."""
         for work in self.running.values():
             work.lock.release()
 

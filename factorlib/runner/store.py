@@ -56,9 +56,11 @@ class Store:
         return entry if output_of(entry.files) == entry.output else None
 
     def tree(self, output: str) -> Path:
+        """Folder of the tree with hash `output`."""
         return self.trees / output
 
     def log(self, key: str) -> Path:
+        """File with the log of the result of `key`."""
         return self.logs / f"{key}.jsonl"
 
     def take_in(self, record: dict, folder: Path) -> tuple[Entry, Path | None]:
@@ -116,6 +118,7 @@ class Outputs(Mapping):
         self._known: dict[str, str] = {}
 
     def get(self, key, default=None):
+        """Tree hash of a key; `default` where there is no result, or its tree is damaged (then `damaged` says how)."""
         if key not in self._known:
             entry = self.store.entry(key)
             if entry is None:
@@ -128,6 +131,7 @@ class Outputs(Mapping):
         return self._known[key]
 
     def forget(self, key: str) -> None:
+        """Look `key` up again when it is asked for next."""
         self._known.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:

@@ -42,6 +42,7 @@ class Survey:
     previous: dict[str, Record]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
+        """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
 

@@ -87,16 +87,19 @@ def _name_results(seen: Survey, targets: list[str] | None) -> None:
 
 
 def show_plan(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+    """Print what would run."""
     print("\n".join(words.plan_lines(survey(project, dataset, targets, settings, force).planned())))
     return 0
 
 
 def show_why(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+    """Print why each step would run."""
     print("\n".join(words.why_lines(survey(project, dataset, targets, settings, force).planned())))
     return 0
 
 
 def show_status(project: Project, dataset: str, targets: list[str] | None, settings: list[str]) -> int:
+    """Print how far each stage is, and its warnings."""
     seen = survey(project, dataset, targets, settings)
     print("\n".join(words.status_lines(seen.planned(), lambda p: is_running(seen, p), lambda p: warnings_of(seen, p))))
     return 0
@@ -123,6 +126,7 @@ def warnings_of(seen: Survey, planned: Planned) -> list[str]:
 
 
 def show_graph(project: Project, mermaid: bool) -> int:
+    """Print the stages and what each takes, as text or as a Mermaid diagram."""
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
     print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
     return 0
@@ -173,6 +177,7 @@ def clean(project: Project, dataset: str | None) -> int:
 
 
 def collect(project: Project) -> int:
+    """Delete results in the store that no data set names."""
     from factorlib.runner.gc import collect as delete_unused
 
     freed = delete_unused(project)

@@ -36,10 +36,12 @@ def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather:
 
 
 def name_of(outputs: dict[str, str], gather: str | None) -> str:
+    """Name of a view: a hash of the trees it shows and of the file that gathers their JSON."""
     return hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
 
 
 def gathered(store: Store, outputs: dict[str, str]) -> str:
+    """One JSON text of the `<photo>.json` of every tree: {photo: content}."""
     return json_text({photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
 
 

@@ -78,6 +78,7 @@ def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
 
 
 def mermaid_lines(pipeline: Pipeline) -> list[str]:
+    """The graph of stages in Mermaid's language; stages over photos have double frames."""
     edges = [f"  {above} --> {name}" for name in pipeline.order() for above in pipeline.stages[name].upstream]
     nodes = [f"  {name}[[{name}]]" if pipeline.stages[name].over else f"  {name}[{name}]" for name in pipeline.order()]
     return ["graph TD", *nodes, *edges]

@@ -101,6 +101,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def run_step(task: Task) -> Outcome:
+    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
     meter = Meter()
     with Events(task) as events:
         try:
@@ -131,6 +132,7 @@ def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome
 
 
 def load_stage(code: Code) -> ModuleType:
+    """Import a stage's module from the project and limit the process to the stage's threads."""
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
@@ -259,12 +261,14 @@ class Events(logging.Handler):
             self._stream.close()
 
     def progress(self, done: float, total: float, text: str = "") -> None:
+        """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
         now = time.monotonic()
         if now - self._last >= EVERY:
             self._last = now
             self._say({"done": float(done), "total": float(total), "text": text})
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Report a warning of the log, each text once (as a `logging.Handler`)."""
         text = record.getMessage().strip()
         if text not in self.warnings:
             self.warnings.append(text)

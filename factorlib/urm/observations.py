@@ -61,6 +61,7 @@ class Observations(msgspec.Struct, frozen=True):
 
     @property
     def half(self) -> Float[np.ndarray, "n 3"]:
+        """The paper's half vector, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, of the stored float32 normals and views."""
         return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
     def take(self, rows: np.ndarray) -> Observations:

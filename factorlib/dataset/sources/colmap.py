@@ -92,11 +92,13 @@ class Records:
         self.content, self.place = content, 0
 
     def take(self, layout: str) -> tuple:
+        """The next values of a `struct` layout, little-endian."""
         values = struct.unpack_from(f"<{layout}", self.content, self.place)
         self.place += struct.calcsize(f"<{layout}")
         return values
 
     def word(self) -> str:
+        """The next UTF-8 text, which a zero byte ends."""
         end = self.content.find(b"\0", self.place, self.place + MOST_NAME)
         if end < 0:
             raise ValueError("the name of an image does not end")
@@ -105,6 +107,7 @@ class Records:
         return text
 
     def skip(self, count: int) -> None:
+        """Pass over `count` bytes."""
         self.place += count
         if self.place > len(self.content):
             raise ValueError("it ends in the middle of an image")

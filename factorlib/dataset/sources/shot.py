@@ -99,10 +99,12 @@ def _cure(camera: pycolmap.Camera) -> str:
 
 
 def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
+    """cam_from_world of a rotation matrix (made orthonormal) and a translation."""
     turn = pycolmap.Rotation3d(rotation)
     turn.normalize()
     return pycolmap.Rigid3d(turn, translation)
 
 
 def as_rows(rotation: pycolmap.Rotation3d) -> Mat3:
+    """The rotation as the rows of its matrix."""
     return tuple(tuple(map(float, row)) for row in rotation.matrix())
