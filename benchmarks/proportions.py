@@ -1,6 +1,6 @@
 """Meshes with wrong proportions: `python -m benchmarks.proportions [--photos 4 --shape chair,jug --off 1,1.1,1.15]`.
 
-Photos of a shape of `benchmarks.align.shapes`, told to be of that shape with one axis too long.  Poses and focal lengths are searched
+Photos of a shape of `benchmarks.align.shapes`, with a mesh of that shape, one axis of which is too long.  Poses and focal lengths are searched
 with the wrong mesh, as `align` does; then factors are fitted, as `fit_mesh` does.
 """
 
@@ -46,7 +46,7 @@ def measured(shape: str, axis: int, off: float, photos: int, rough: bool = False
     wanted = 1 / factors / (1 / factors).prod() ** (1 / 3)
 
     def errors(mesh: Mesh, states: list[State]) -> list[float]:
-        return [normal_error(true, *told, mesh, one.camera, state) for told, one, state in zip(truth, sightings, states, strict=True)]
+        return [normal_error(true, *posed, mesh, one.camera, state) for posed, one, state in zip(truth, sightings, states, strict=True)]
 
     return {
         "shape": shape, "axis": axis, "off": off, "rough": rough, "used": verdict.used, "seconds": seconds,

@@ -26,7 +26,7 @@ SAID = {  # words of a message -> what the table calls it
     "clipped and say": "clipped",
     "so dark": "dark",
     "part look alike": "reflectance",
-    "cannot be told": "roughness",
+    "cannot be determined": "roughness",
     "may be smoother": "smoothest",
     "differ from the answer": "ill explained",
 }

@@ -90,8 +90,8 @@ def found_in(error: BaseException, what: str) -> str:
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
     words = one_line(str(error))
-    bare = isinstance(error, (LookupError, TypeError, AttributeError, AssertionError)) or not words  # says little without its name
-    said = ": ".join(part for part in (type(error).__name__ if bare else "", words) if part)
+    needs_type = isinstance(error, (LookupError, TypeError, AttributeError, AssertionError)) or not words  # says little without its name
+    said = ": ".join(part for part in (type(error).__name__ if needs_type else "", words) if part)
     return f"not readable as {what} ({said})"
 
 

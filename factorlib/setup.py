@@ -1,6 +1,6 @@
 """The environment: .venv with the pinned packages, and the few system libraries they need.
 
-Run by the Makefile as a script, on a bare Python: nothing but the standard library may be imported here.
+Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
 """

@@ -11,12 +11,12 @@ from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.earlier import earlier_focal, earlier_pose
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
+from factorlib.align.external_camera import focal_and_centre
 from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import Placed, Thing, placed
 from factorlib.align.search import Found, Search
-from factorlib.align.told import camera_told
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
@@ -33,7 +33,7 @@ from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
-CURE_OF_TOLD = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
+CURE_OF_EXTERNAL = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
@@ -61,8 +61,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    told = slice_.told.source if slice_.told else None
-    sources = {thing.name: "given" if thing.pose else told for thing in slice_.objects}
+    external = slice_.external.source if slice_.external else None
+    sources = {thing.name: "given" if thing.pose else external for thing in slice_.objects}
     objects = {thing.name: entry(thing, k, result, maps, params, sources[thing.name]) for k, thing in enumerate(things)}
     for thing_name, found in objects.items():
         complain(name, thing_name, found, params.strict)
@@ -80,7 +80,7 @@ def things_of(
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        pose = pose_of(thing, slice_.told)
+        pose = pose_of(thing, slice_.external)
         before = earlier.objects.get(thing.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
         caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
@@ -97,17 +97,17 @@ def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materia
 def hold_against(
     slice_: schema.ObjectsSlice, things: list[Thing], label: np.ndarray, materials: list[str], camera: Camera, focal: float | None, photo: str
 ) -> None:
-    """What dataset.yaml and its source of cameras give, against the photo: what cannot be is refused, what is odd is told."""
+    """What dataset.yaml and its source of cameras give, against the photo: InputError for what is impossible, a warning for what is odd."""
     for thing, said in zip(things, slice_.objects, strict=True):
         if thing.pose is not None:
-            check_before_camera(thing.caster.mesh, thing.pose, photo, thing.name, "dataset" if said.pose else slice_.told.source)
+            check_before_camera(thing.caster.mesh, thing.pose, photo, thing.name, "dataset" if said.pose else slice_.external.source)
     warn_of_materials(label, [thing.caster.mesh.labels for thing in things], materials, photo)
     warn_of_camera(focal, camera.centre, (camera.width, camera.height), photo)
 
 
-def pose_of(thing: schema.ObjectEntry, told: schema.Told | None) -> Pose | None:
+def pose_of(thing: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
     """The pose that dataset.yaml gives, or else its source of cameras."""
-    pose = thing.pose or (told.poses.get(thing.name) if told else None)
+    pose = thing.pose or (external.poses.get(thing.name) if external else None)
     return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
 
 
@@ -129,7 +129,7 @@ def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tup
     if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
         told_focal, centre = camera_told(slice_.told, width, height, photo)
         if source != "dataset":
-            focal, source = told_focal / factor, slice_.told.source
+            focal, source = external_focal / factor, slice_.external.source
     across, down = slice_.camera.principal_point or centre
     return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), focal, source
 

@@ -80,7 +80,7 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
 
 
 def _valid(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:
-    """Pixels of a material that are numbers, [h, w]; some that are not are told, all are refused."""
+    """Pixels of a material that are numbers, [h, w]; if some are not, a warning; if none are, InputError."""
     inside = labels.label > 0
     lost = int((inside & ~photo.finite).sum())
     if lost == int(inside.sum()):

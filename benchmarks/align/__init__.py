@@ -1,1 +1,1 @@
-"""Alignment against rendered truth: time, success, error, and whether a wrong pose is told from a right one."""
+"""Alignment against rendered truth: time, success, error, and whether doubts separate wrong poses from right ones."""

@@ -2,7 +2,7 @@
 
 Writes align.json to build/bench/align, after every photo anew, and prints the tables; --docs also refreshes docs/align.md.
 The whole set: `python -m benchmarks.align --views 20 --seeds 3 --wrong-views 2`.  Rows of kinds that are not run stay as they
-were, so that the kinds can be run one after another; only their doubts are told anew, by the standards of now (`--kinds ""`: of all).
+were, so that the kinds can be run one after another; only their doubts are found anew, by today's standards (`--kinds ""`: of all).
 
 `--real FOLDER` aligns real photographs instead, a dataset with reference_poses.json, and writes real.json: see `real`.
 """

@@ -76,7 +76,7 @@ def withheld(dataset: Dataset) -> Dataset:
         replace(photo, camera=None, objects=[replace(thing, pose=None, keypoints=[]) for thing in photo.objects])
         for photo in dataset.spec.photos
     ]
-    return replace(dataset, spec=replace(dataset.spec, photos=photos), told={})
+    return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
 
 
 def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[PhotoPoses, tuple[int, int]]:

@@ -1,7 +1,7 @@
 """The hard cases of the joint solve: what is seen, what is true, and how far the answer is from it.
 
 Observations of spheres under lights made of a few lobes, rendered by the operator that solves, with 2 % noise, go the way of
-the stage: `blocks_of_observations`, `solve`, standard errors, what cannot be told.  `CASES` are worse in one way each.
+the stage: `blocks_of_observations`, `solve`, standard errors, what cannot be determined.  `CASES` are worse in one way each.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def with_invalid(seen: Observations, seed: int) -> Observations:
     return msgspec.structs.replace(seen, radiance=radiance, normal=normal, view=view)
 
 
-MATTE = Materials(TWO.diffuse, TWO.specular * 0, TWO.roughness)
+LAMBERTIAN = Materials(TWO.diffuse, TWO.specular * 0, TWO.roughness)
 MIRRORS = Materials(TWO.diffuse * 0.05, TWO.specular + 0.3, np.full(2, 0.1))
 WITH_BLACK = Materials(THREE.diffuse * [[0], [1], [1]], THREE.specular * [[0], [1], [1]], THREE.roughness)
 PATCH = sphere_normals(10)[::2][:30]
@@ -193,7 +193,7 @@ CASES: dict[str, Callable[[int], Case]] = {
     "flat objects": case(TWO, ROOMS[:2], normals=FLAT),
     "an object of 30 pixels": case(chosen([1]), ROOMS[:1], normals=PATCH),
     "a single pixel": case(chosen([1]), ROOMS[:1], normals=FLAT[:1]),
-    "all matte": case(MATTE, ROOMS[:2]),
+    "all Lambertian": case(LAMBERTIAN, ROOMS[:2]),
     "all mirror-like: roughness .1": case(MIRRORS, ROOMS[:2]),
     "a black material": case(WITH_BLACK, ROOMS[:2]),
     "a light of one point": case(TWO, [POINT]),
@@ -216,7 +216,7 @@ CASES: dict[str, Callable[[int], Case]] = {
 
 class Bound(msgspec.Struct, frozen=True):
     """Largest errors of an `Answer`: a quarter more than the worst of four differently trained weights and two seeds of noise each
-    (`python -m benchmarks.solve_spread`).  None: cannot be told, and is said."""
+    (`python -m benchmarks.solve_spread`).  None: cannot be determined, and is said."""
 
     k: float | None
     roughness: float | None
@@ -231,15 +231,15 @@ BOUNDS = {
     "1 material × 5 lights": Bound(0.013, 0.019, 0.0063, ("by convention only. A photo",)),
     "5 materials × 1 light": Bound(0.0082, 0.0097, 0.0035),
     "unconnected: 2 × 1 and 3 × 1": Bound(0.0093, 0.025, 0.0045),
-    "flat objects": Bound(None, None, 0.0025, ("'red' is flat", "'green' is flat", "roughness of material 'red' cannot be told")),
+    "flat objects": Bound(None, None, 0.0025, ("'red' is flat", "'green' is flat", "roughness of material 'red' cannot be determined")),
     "an object of 30 pixels": Bound(None, None, 0.037, ("30 observation(s)", "by convention only")),
     "a single pixel": Bound(None, None, 0.0074, ("1 observation(s)", "'red' is flat")),
-    "all matte": Bound(0.0049, None, 0.0097, ("roughness of material 'red' cannot be told", "roughness of material 'green' cannot be told")),
+    "all Lambertian": Bound(0.0049, None, 0.0097, ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined")),
     "all mirror-like: roughness .1": Bound(0.0044, 0.017, 0.0052, may_say="the least the model knows: it may be smoother"),
-    "a black material": Bound(0.0055, 0.0068, 0.0049, ("'red' is so dark", "roughness of material 'red' cannot be told")),
+    "a black material": Bound(0.0055, 0.0068, 0.0049, ("'red' is so dark", "roughness of material 'red' cannot be determined")),
     "a light of one point": Bound(0.017, 0.0039, 0.0042),
     "constant light": Bound(
-        None, None, 0.0043, ("roughness of material 'red' cannot be told", "roughness of material 'green' cannot be told")
+        None, None, 0.0043, ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined")
     ),
     "radiances × 10⁻⁴": Bound(0.0044, 0.022, 0.0048),
     "radiances × 10⁴": Bound(0.0044, 0.022, 0.0048),

@@ -28,8 +28,8 @@ UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected 
 UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
 EXIF_SIGMA = 0.05  # whole millimetres, and focus
 WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
-HOPELESS = 4.0  # times as much left unexplained as by the best, or HOPELESS_LEFT: not refined further
-HOPELESS_LEFT = 0.04
+GIVEN_UP_RATIO = 4.0  # times as much left unexplained as by the best, or GIVEN_UP_UNEXPLAINED: not refined further
+GIVEN_UP_UNEXPLAINED = 0.04
 CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
@@ -102,7 +102,7 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
         kept = states[: keep if others else effort * keep]
         target = target_of(evidence, caster.mesh.labels, resolution, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
-        states = [result.state for result in ranked if 1 - result.score <= max(HOPELESS * (1 - ranked[0].score), HOPELESS_LEFT)]
+        states = [result.state for result in ranked if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)]
         others = ranked + others
     ranked = _distinct(ranked + _rivals(caster, target, camera, ranked[0], others[len(ranked) :], prior, search), prior)
     best = ranked[0]

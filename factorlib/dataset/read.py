@@ -38,13 +38,13 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name")
     spec = read_yaml(file, DatasetFile)
     check_dataset(spec, file)
-    companions, told = _companions(spec, file), {}
+    companions, external = _companions(spec, file), {}
     if spec.cameras is not None:
-        from factorlib.dataset.sources.told import told_by_source
+        from factorlib.dataset.sources.external import external_cameras
 
-        spec, told = told_by_source(spec, file)
+        spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
-    return Dataset(folder=folder, spec=spec, companions=companions, told=told, truth=_read_truth(spec, file))
+    return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
 
 
 def _companions(spec: DatasetFile, file: Path) -> dict[str, list[str]]:

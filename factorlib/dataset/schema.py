@@ -137,7 +137,7 @@ class TruthFile(_Format):
     poses: dict[str, dict[str, Pose]] = {}
 
 
-class Told(msgspec.Struct, frozen=True):
+class ExternalCamera(msgspec.Struct, frozen=True):
     """What a source of cameras says of one photo, in its own pixels: of an image of `size` (width, height).
 
     size: None where the source does not say it, the height None where only the width counts (a focal length in widths);
@@ -155,13 +155,13 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
     """A dataset that has been read and found good.
 
     companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
-    told: photo -> what the source of cameras says of it
+    external: photo -> what the source of cameras says of it
     """
 
     folder: Path
     spec: DatasetFile
     companions: dict[str, list[str]] = {}
-    told: dict[str, Told] = {}
+    external: dict[str, ExternalCamera] = {}
     truth: TruthFile | None = None
 
     @property
@@ -202,7 +202,7 @@ class ObjectsSlice(msgspec.Struct, frozen=True):
     camera: Camera
     objects: list[ObjectEntry]
     meshes: dict[str, MeshEntry]
-    told: Told | None = None
+    external: ExternalCamera | None = None
 
 
 class LightSlice(msgspec.Struct, frozen=True):

@@ -68,7 +68,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {thing.mesh: dataset.spec.meshes[thing.mesh] for thing in photo.objects}
     camera = photo.camera or schema.Camera()
-    facts = schema.ObjectsSlice(camera=camera, objects=photo.objects, meshes=meshes, told=dataset.told.get(photo.name))
+    facts = schema.ObjectsSlice(camera=camera, objects=photo.objects, meshes=meshes, external=dataset.external.get(photo.name))
     files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
     return facts, files + _object_masks(photo)
 
@@ -102,8 +102,8 @@ def _json_able(facts: Any) -> Any:
 
 
 def _fields_of_photo(facts: dict[str, Any], photo: str) -> dict[str, Any]:
-    """Most are keys of the photo; meshes stand beside the photos, and what is told comes from the source of cameras."""
-    places = {"focal_px": f"photos.{photo}.camera.focal_px", "meshes": "meshes", "told": f"cameras.{photo}"}
+    """Most are keys of the photo; meshes stand beside the photos, and `external` comes from the source of cameras."""
+    places = {"focal_px": f"photos.{photo}.camera.focal_px", "meshes": "meshes", "external": f"cameras.{photo}"}
     parts = [_fields(value, places.get(key, f"photos.{photo}.{key}")) for key, value in facts.items()]
     return {name: value for part in parts for name, value in part.items()}
 

@@ -56,7 +56,7 @@ def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]
     if all(_spread(block, rows) < FLAT_DEG for block, rows in shown):
         yield (
             f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of it is specular "
-            "cannot be told. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
+            "cannot be determined. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
         )
     clipped = np.concatenate([block.clipped[rows] for block, rows in shown]).mean()
     if clipped >= CLIPPED:
@@ -75,7 +75,7 @@ def _spread(block: Block, rows: Bool[np.ndarray, "n"]) -> float:
 
 
 def _alone(name: str, lights: Sequence[str]) -> str:
-    said = f"material '{name}' shares no light with another: its colour and brightness are told from the light's by convention only"
+    said = f"material '{name}' shares no light with another: its colour and brightness are separated from the light's by convention only"
     if len(lights) == 1:
         said += ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
     else:
@@ -97,17 +97,17 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
     whole = found[:3] + found[3:6]
     if whole.max() < error[:6].max() <= DARK:
         yield (
-            f"material '{name}' is so dark that of its reflectance only a bound, about {whole.max() + 2 * error[:6].max():.2g}, can be told. "
+            f"material '{name}' is so dark that of its reflectance only a bound, about {whole.max() + 2 * error[:6].max():.2g}, can be given. "
             "A photo of longer exposure would help"
         )
     elif not error[:6].max() <= SHARE_ERROR * whole.max():
         yield (
-            f"the reflectance of material '{name}' is told to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
+            f"the reflectance of material '{name}' is known to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
             "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
         )
     if not (error[6] <= ROUGHNESS_ERROR and (found[3:6] > 2 * error[3:6]).any()):
         yield (
-            f"the roughness of material '{name}' cannot be told (±{error[6]:.2g}): no highlight stands out. "
+            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out. "
             "A photo in light with a small bright source would help"
         )
     elif found[6] <= ROUGHNESS[0] + 1e-9:

@@ -1,12 +1,12 @@
 """Errors of recovered light against true light.
 
-Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a matte (Lambert) white sphere, rendered in the estimated and
+Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a Lambertian (`matte`) white sphere, rendered in the estimated and
                in the true light, as LeGendre et al. 2019 ("DeepLight") and others do.
 Env map        the maps themselves, averaged to texels of equal solid angle about 3° across; all directions, and split
                into those that an observed pixel mirrors toward the camera (within about 6°) and the rest.
 Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black scores.  rmse_scale_invariant: the same after the best
                single factor (Grosse et al. 2009).  rgb_angle_deg: mean angle between the RGB vectors, in degrees.
-Null           a constant light of the true map's mean colour, which no method is told: a generous null.
+Null           a constant light of the true map's mean colour: a generous null, for no method knows that colour.
 """
 
 from __future__ import annotations

@@ -58,9 +58,9 @@ def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator, progress: 
     for k, (axis, sharpness, roughness) in enumerate(zip(spheres.axis, spheres.sharpness, spheres.roughness, strict=True)):
         normal = _normals(axis, sharpness, alpha_of_roughness(roughness), pixels, rng)
         light, sensor = _envmap(axis, sharpness), _sensor(normal)
-        matte = {"type": "diffuse", "reflectance": rgb(1.0)}
-        gloss = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha_of_roughness(roughness))}
-        rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (matte, gloss))))
+        lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
+        glossy = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha_of_roughness(roughness))}
+        rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (lambertian, glossy))))
         progress(k + 1, len(spheres.axis))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
 

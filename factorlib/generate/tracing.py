@@ -42,14 +42,14 @@ def bsdf(material: Material) -> dict[str, Any]:
     """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
     diffuse, specular = np.array(material.diffuse), np.array(material.specular)
     share = specular.max() / (diffuse.max() + specular.max())
-    matte = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
+    lambertian = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
     if share == 0:
-        return matte
-    gloss = {
+        return lambertian
+    glossy = {
         "type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": material.roughness**2,
         "specular_reflectance": rgb(specular / share),
     }  # fmt: skip
-    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": matte, "bsdf_1": gloss}
+    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": glossy}
 
 
 def rgb(value) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The labels of a photo, whichever way its masks are given, as one map of material labels.
 
-A mask has the photo's own pixels, as displayed.  Whatever cannot be told apart for certain is refused: another size,
+A mask has the photo's own pixels, as displayed.  Whatever is ambiguous is refused: another size,
 a label without a material, two materials in one pixel, no labelled pixel at all.
 """
 

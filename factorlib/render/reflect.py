@@ -81,11 +81,11 @@ class Reflector:
     def _radiance(self, material, normals: Tensor, views: Tensor, shadows: Shadows | None) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
-        matte, glossy = (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
-        radiance = kd * ((matte * self._diffuse(nz)) @ self.weight)
+        diffuse_seen, specular_seen = (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
+        radiance = kd * ((diffuse_seen * self._diffuse(nz)) @ self.weight)
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)
-            radiance = radiance + ks * ((glossy * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight)
+            radiance = radiance + ks * ((specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
 
     def _seen(self, shadows: Shadows, normals: Tensor, views: Tensor, roughness: float) -> tuple[Tensor, Tensor]:

@@ -124,7 +124,7 @@ class Artifacts(msgspec.Struct, frozen=True):
         return self._rgb(self.folders["evaluate"] / "illumination" / f"{name}.exr")
 
     def spheres(self, name: str, which: str) -> Picture | None:
-        """Mirror, glossy and matte sphere side by side; `which` is estimate or truth."""
+        """Mirror, glossy and Lambertian sphere side by side; `which` is estimate or truth."""
         return self._rgb(self.folders["evaluate"] / "spheres" / f"{name}_{which}.exr")
 
     def convergence(self) -> dict[str, list]:

@@ -125,7 +125,7 @@ def _of_set(run: Artifacts, metrics: Metrics) -> list[str]:
             "brightness cannot be compared. A photo that shows a material of each group would link them."
         )
     if len(run.illuminations()) == 1:
-        found.append("There is one light only: what belongs to the light and what to the material is told apart by shape alone.")
+        found.append("There is one light only: only the objects' shape separates light from material.")
     facts = run.photo_facts()
     for material in run.set.materials:
         pixels = sum(f.pixels.get(material, 0) for f in facts.values())

@@ -1,4 +1,4 @@
-"""Looking at a dataset's files before anything runs: a fault in the last photo is told before the first is worked on.
+"""Looking at a dataset's files before anything runs: a fault in the last photo is reported before the first is worked on.
 
 What there is to look at, and how, the dataset's provider knows; here is which files a run has not used yet.
 """

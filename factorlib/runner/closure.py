@@ -62,7 +62,7 @@ class Closure(msgspec.Struct, frozen=True):
     files: dict[str, Path]
 
     def record(self) -> dict[str, str]:
-        """The part of a step's record that is its code, and what the code is told by the environment now."""
+        """The part of a step's record that is its code, and the environment variables that the code reads, as they are now."""
         record = {f"source:{module}": digest for module, digest in self.modules.items()}
         record |= {f"data:{file}": digest for file, digest in self.data.items()}
         record |= {f"environment:{name}": os.environ[name] for name in self.environment if name in os.environ}

@@ -66,7 +66,7 @@ class Code(msgspec.Struct, frozen=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """All a worker is told.
+    """All that a worker knows of a step.
 
     hashes:  of the dataset's files, as they were when the key was made
     shipped: where the package may have the result already; None where it is to be made in any case

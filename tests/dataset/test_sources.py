@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.align.told import camera_told
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import Told
+from factorlib.dataset.schema import ExternalCamera
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
@@ -45,10 +45,10 @@ def write(folder, cameras, things=({"name": "thing", "mesh": "thing"},), names=P
     return folder
 
 
-def seen(told, points, name="thing", size=SIZE):
-    """Where the photo shows points of the mesh, by what was told."""
-    focal, centre = camera_told(told, *size, "hall")
-    pose = told.poses[name]
+def seen(external, points, name="thing", size=SIZE):
+    """Where the photo shows points of the mesh, by the external camera."""
+    focal, centre = focal_and_centre(external, *size, "hall")
+    pose = external.poses[name]
     return Camera(*size, focal, centre).project(Pose(np.array(pose.rotation), np.array(pose.translation)).apply(points))
 
 
@@ -71,26 +71,26 @@ def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE
 def test_points_of_the_mesh_are_where_colmap_puts_them_in_its_world(folder, form):
     images = colmap(folder, form=form)
     world_from_object = {"scale": 2.5, "rotation": TURN.tolist(), "translation": [0.3, -0.2, 0.5]}
-    told = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": world_from_object}})).told
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": world_from_object}})).external
     in_world = np.array([2.5 * TURN @ point + [0.3, -0.2, 0.5] for point in POINTS])
     for name in PHOTOS:
-        assert np.allclose(seen(told[name], POINTS), [images[f"{name}.png"].project_point(p) for p in in_world], atol=1e-9)
-        assert told[name].source == "colmap"
+        assert np.allclose(seen(external[name], POINTS), [images[f"{name}.png"].project_point(p) for p in in_world], atol=1e-9)
+        assert external[name].source == "colmap"
 
 
 def test_a_mesh_in_the_worlds_frame_gets_the_models_pose_exactly(folder):
     images = colmap(folder)
-    told = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).told
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).external
     rigid = images["attic.png"].cam_from_world()
-    assert np.allclose(told["attic"].poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-14)
-    assert np.allclose(told["attic"].poses["thing"].translation, rigid.translation, atol=1e-14)
-    assert told["attic"].focal_px == 300.0 and told["attic"].principal_point == (104.0, 71.0)
+    assert np.allclose(external["attic"].poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-14)
+    assert np.allclose(external["attic"].poses["thing"].translation, rigid.translation, atol=1e-14)
+    assert external["attic"].focal_px == 300.0 and external["attic"].principal_point == (104.0, 71.0)
 
 
-def test_without_world_from_object_only_the_camera_is_told(folder):
+def test_without_world_from_object_only_the_camera_is_known(folder):
     colmap(folder)
-    told = read_dataset(write(folder, {"colmap": "sparse/0"})).told
-    assert told["hall"].poses == {} and told["hall"].focal_px == 300.0
+    external = read_dataset(write(folder, {"colmap": "sparse/0"})).external
+    assert external["hall"].poses == {} and external["hall"].focal_px == 300.0
 
 
 def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
@@ -123,15 +123,15 @@ def test_a_light_of_photos_of_which_one_is_not_in_the_model_is_refused(folder):
 )
 def test_a_photo_is_found_by_path_then_file_name_then_that_without_suffix(folder, names, found):
     images = colmap(folder, names)
-    told = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).told["hall"]
-    assert np.allclose(told.poses["thing"].rotation, images[found].cam_from_world().rotation.matrix())
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).external["hall"]
+    assert np.allclose(external.poses["thing"].rotation, images[found].cam_from_world().rotation.matrix())
 
 
 def test_what_follows_a_dot_is_no_suffix_unless_of_an_image(folder):
     (folder / "photos/r_0.5.png").write_text("")
     transforms(folder, [frame("train/r_0.5", np.eye(3), (0, 0, 5)), frame("train/r_0", np.eye(3), (0, 0, 6))])
-    told = read_dataset(write(folder, {"transforms": "transforms.json"}, photo={"image": "photos/r_0.5.png"})).told
-    assert set(told) == {"hall"}
+    external = read_dataset(write(folder, {"transforms": "transforms.json"}, photo={"image": "photos/r_0.5.png"})).external
+    assert set(external) == {"hall"}
 
 
 def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(folder):
@@ -140,16 +140,16 @@ def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(
         read_dataset(write(folder, {"colmap": "sparse/0"}))
     assert caught.value.key == "cameras.images.hall"
     cameras = {"colmap": "sparse/0", "images": {"hall": "y/hall.png", "attic": "x/hall.png"}, "world_from_object": {"thing": {}}}
-    told = read_dataset(write(folder, cameras)).told
-    assert np.allclose(told["hall"].poses["thing"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
+    external = read_dataset(write(folder, cameras)).external
+    assert np.allclose(external["hall"].poses["thing"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
 
 
-def test_a_photo_that_is_not_in_the_model_is_told_and_searched(folder, caplog):
+def test_a_photo_that_is_not_in_the_model_is_warned_of_and_searched(folder, caplog):
     colmap(folder, names=("hall.png",))
     with caplog.at_level(logging.WARNING):
         dataset = read_dataset(write(folder, {"colmap": "sparse/0"}))
-    assert set(dataset.told) == {"hall"} and "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
-    assert dataset_slice(dataset, "objects", "attic").facts["told"] is None
+    assert set(dataset.external) == {"hall"} and "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
+    assert dataset_slice(dataset, "objects", "attic").facts["external"] is None
 
 
 def test_an_image_without_a_pose_is_not_in_the_model(folder):
@@ -157,7 +157,7 @@ def test_an_image_without_a_pose_is_not_in_the_model(folder):
     model = pycolmap.Reconstruction(str(folder / "sparse/0"))
     model.deregister_frame(next(image.frame_id for image in model.images.values() if image.name == "attic.png"))
     model.write_binary(str(folder / "sparse/0"))
-    assert set(read_dataset(write(folder, {"colmap": "sparse/0"})).told) == {"hall"}
+    assert set(read_dataset(write(folder, {"colmap": "sparse/0"})).external) == {"hall"}
 
 
 def test_keypoints_go_before_the_sources_pose(folder):
@@ -166,7 +166,7 @@ def test_keypoints_go_before_the_sources_pose(folder):
     keypoints = [{"pixel": [10.0 * k, 5.0 * k * k], "point": point} for k, point in enumerate(corners)]
     things = ({"name": "thing", "mesh": "thing", "keypoints": keypoints}, {"name": "other", "mesh": "thing"})
     cameras = {"colmap": "sparse/0", "world_from_object": {"thing": {}, "other": {}}}
-    assert set(read_dataset(write(folder, cameras, things)).told["hall"].poses) == {"other"}
+    assert set(read_dataset(write(folder, cameras, things)).external["hall"].poses) == {"other"}
 
 
 def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
@@ -175,7 +175,7 @@ def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
     given = {"rotation": TURN.tolist(), "translation": [0, 0, 3]}
     own = {"camera": {"focal_px": 99.0, "principal_point": [100, 75]}, "objects": [{"name": "thing", "mesh": "thing", "pose": given}]}
     dataset = read_dataset(write(folder, cameras, names=("hall",), photo=own))  # its lens is not even looked at
-    assert dataset.told["hall"].poses == {} and dataset.told["hall"].focal_px == 99.0
+    assert dataset.external["hall"].poses == {} and dataset.external["hall"].focal_px == 99.0
 
 
 def test_a_change_of_one_pose_changes_the_slice_of_that_photo_only(folder):
@@ -216,11 +216,11 @@ def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused(folder, mode
 def test_less_than_half_a_pixel_does_not_matter_and_stays_so(folder, model, params):
     """Nowhere in the image does the pinhole that is taken differ from the camera by more."""
     colmap(folder, model=model, params=params)
-    told = read_dataset(write(folder, {"colmap": "sparse/0"})).told["hall"]
+    external = read_dataset(write(folder, {"colmap": "sparse/0"})).external["hall"]
     true = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params)
     corners = np.array([[x, y] for x in np.linspace(0, 200, 9) for y in np.linspace(0, 150, 9)])
     rays = np.column_stack([true.cam_from_img(corners), np.ones(len(corners))])
-    off = np.linalg.norm(Camera(*SIZE, told.focal_px, told.principal_point).project(rays) - corners, axis=1)
+    off = np.linalg.norm(Camera(*SIZE, external.focal_px, external.principal_point).project(rays) - corners, axis=1)
     assert 0.05 < off.max() <= 0.5
 
 
@@ -243,10 +243,10 @@ def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(f
     """5 away, 1 to the right and 2 up: 300 · 1/5 px to the right of the principal point and 300 · 2/5 px above it."""
     write(folder, {"transforms": "transforms.json", "world_from_object": {"thing": {}}})
     transforms(folder, [frame("./images/hall", np.eye(3), (0, 0, 5)), frame("images/attic.jpg", FROM_X, (5, 0, 0))])
-    told = read_dataset(folder).told
+    external = read_dataset(folder).external
     expected = [[104 + 60, 71 - 120]]
-    assert np.allclose(seen(told["hall"], np.array([[1.0, 2.0, 0.0]])), expected)
-    assert np.allclose(seen(told["attic"], np.array([[0.0, 2.0, -1.0]])), expected)
+    assert np.allclose(seen(external["hall"], np.array([[1.0, 2.0, 0.0]])), expected)
+    assert np.allclose(seen(external["attic"], np.array([[0.0, 2.0, -1.0]])), expected)
     world = read_dataset(write(folder, {"transforms": "transforms.json", "world_from_camera": True})).spec.photos[1].world_from_camera
     assert np.allclose(np.array(world) @ [0, 0, 1], (-1, 0, 0)) and np.allclose(np.array(world) @ [0, 1, 0], (0, -1, 0))
 
@@ -256,17 +256,17 @@ def test_a_field_of_view_is_a_focal_length_at_any_size(folder):
     angle = 2 * math.atan(100 / 300)
     write(folder, {"transforms": "transforms.json", "world_from_object": {"thing": {}}})
     transforms(folder, [frame("hall", np.eye(3), (0, 0, 5)), frame("attic", np.eye(3), (0, 0, 5), w=200, h=150)], {"camera_angle_x": angle})
-    told = read_dataset(folder).told
+    external = read_dataset(folder).external
     for name in PHOTOS:
-        assert camera_told(told[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
-        assert camera_told(told[name], 400, 300, name) == (pytest.approx(600), (200.0, 150.0))
+        assert focal_and_centre(external[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
+        assert focal_and_centre(external[name], 400, 300, name) == (pytest.approx(600), (200.0, 150.0))
 
 
 def test_a_frames_own_lens_goes_before_the_files(folder):
     write(folder, {"transforms": "transforms.json"})
     transforms(folder, [frame("hall", np.eye(3), (0, 0, 5), fl_x=320.0), frame("attic", np.eye(3), (0, 0, 5))])
-    told = read_dataset(folder).told
-    assert told["hall"].focal_px == 320.0 and told["attic"].focal_px == 300.0
+    external = read_dataset(folder).external
+    assert external["hall"].focal_px == 320.0 and external["attic"].focal_px == 300.0
 
 
 FRAMES = [frame("hall", np.eye(3), (0, 0, 5))]
@@ -311,28 +311,28 @@ def bop(folder, cameras=None, poses=None):
 def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folder, unit_mm):
     """150 mm to the right at 1500 mm: 30 px; the centre of pixel (103.5, 70.5) lies at (104, 71) here."""
     bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}, "mesh_unit_mm": unit_mm}, names=("000007",)))
-    told = read_dataset(folder).told["seven"]
-    assert told.source == "bop" and told.poses["thing"].translation[2] == 1500 / unit_mm
-    assert np.allclose(seen(told, np.array([[150.0, 0, 0]]) / unit_mm), [[104 + 30, 71]])
+    external = read_dataset(folder).external["seven"]
+    assert external.source == "bop" and external.poses["thing"].translation[2] == 1500 / unit_mm
+    assert np.allclose(seen(external, np.array([[150.0, 0, 0]]) / unit_mm), [[104 + 30, 71]])
 
 
 def test_bop_turns_the_model_into_the_camera(folder):
     bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}}, names=("000007",)))
     bop(folder, poses={"7": [GT | {"cam_R_m2c": TURN.ravel().tolist()}]})
     x, y, z = TURN @ [100, 50, 20] + [0, 0, 1500]
-    assert np.allclose(seen(read_dataset(folder).told["seven"], np.array([[100.0, 50, 20]])), [[104 + 300 * x / z, 71 + 300 * y / z]])
+    assert np.allclose(seen(read_dataset(folder).external["seven"], np.array([[100.0, 50, 20]])), [[104 + 300 * x / z, 71 + 300 * y / z]])
 
 
 def test_a_scene_without_poses_or_without_this_one_is_searched(folder, caplog):
     bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}}, names=("000007",)), poses={"7": [GT | {"obj_id": 1}]})
     with caplog.at_level(logging.WARNING):
-        told = read_dataset(folder).told["seven"]
-    assert told.poses == {} and told.focal_px == 300.0 and "no obj_id 5 in image 7" in caplog.text
+        external = read_dataset(folder).external["seven"]
+    assert external.poses == {} and external.focal_px == 300.0 and "no obj_id 5 in image 7" in caplog.text
 
 
 def test_ids_of_photos_can_be_said(folder):
     bop(write(folder, {"bop": "scene", "images": {"hall": 7}}))
-    assert set(read_dataset(folder).told) == {"hall"}
+    assert set(read_dataset(folder).external) == {"hall"}
 
 
 @pytest.mark.parametrize(
@@ -409,12 +409,12 @@ def test_objects_of_one_photo_share_a_scale(folder):
 
 # ---- photos of another size ----------------------------------------------------------------------------------
 
-TOLD = Told("colmap", 300.0, (104.0, 71.0), (200, 150), {})
+EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 
 
 @pytest.mark.parametrize("width, height, scale", [(200, 150, 1), (400, 300, 2), (100, 75, 0.5), (67, 50, 0.335), (133, 100, 0.665)])
 def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(width, height, scale):
-    focal, centre = camera_told(TOLD, width, height, "hall")
+    focal, centre = focal_and_centre(EXTERNAL, width, height, "hall")
     point = np.array([0.2, -0.1, 1.0])
     place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
     assert np.allclose(Camera(width, height, focal, centre).project(point), place, atol=0 if scale in (1, 2, 0.5) else 0.5)
@@ -422,19 +422,19 @@ def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(
 
 @pytest.mark.parametrize("width, height", [(67, 50), (50, 67)])
 def test_the_longer_side_says_how_much_smaller_a_photo_is(width, height):
-    told = Told("colmap", 300.0, None, (200, 150) if width > height else (150, 200), {})
-    assert camera_told(told, width, height, "hall") == (300.0 * 67 / 200, (width / 2, height / 2))
+    external = ExternalCamera("colmap", 300.0, None, (200, 150) if width > height else (150, 200), {})
+    assert focal_and_centre(external, width, height, "hall") == (300.0 * 67 / 200, (width / 2, height / 2))
 
 
 @pytest.mark.parametrize(
-    "told, width, height, words",
+    "external, width, height, words",
     [
-        (TOLD, 200, 140, "cropped or squeezed"),
-        (TOLD, 150, 200, "EXIF orientation"),
-        (Told("bop", 300.0, (104.0, 71.0), None, {}), 100, 75, "at the size that the source was made of"),
+        (EXTERNAL, 200, 140, "cropped or squeezed"),
+        (EXTERNAL, 150, 200, "EXIF orientation"),
+        (ExternalCamera("bop", 300.0, (104.0, 71.0), None, {}), 100, 75, "at the size that the source was made of"),
     ],
 )
-def test_another_picture_is_refused(told, width, height, words):
+def test_another_picture_is_refused(external, width, height, words):
     with pytest.raises(InputError, match=words) as caught:
-        camera_told(told, width, height, "hall")
-    assert caught.value.key == f"cameras.{told.source}: hall" and caught.value.cure
+        focal_and_centre(external, width, height, "hall")
+    assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure

@@ -68,12 +68,12 @@ def text(folder, camera="1 SIMPLE_PINHOLE 200 150 300 104 71", image="1 .7 .1 -.
 @pytest.mark.parametrize("form", [binary, text])
 def test_poses_are_those_that_pycolmap_reads(folder, form):
     (form(folder) / "model" / f"points3D.{'bin' if form is binary else 'txt'}").write_bytes(bytes(8) if form is binary else b"")
-    told = read(folder, colmap="model", world_from_object={"thing": {}}).told["hall"]
+    external = read(folder, colmap="model", world_from_object={"thing": {}}).external["hall"]
     model = pycolmap.Reconstruction(str(folder / "model"))
     rigid = model.images[1].cam_from_world()
-    assert np.allclose(told.poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-15)
-    assert np.allclose(told.poses["thing"].translation, rigid.translation)
-    assert (told.focal_px, told.principal_point, told.size) == (300.0, (104.0, 71.0), (200, 150))
+    assert np.allclose(external.poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-15)
+    assert np.allclose(external.poses["thing"].translation, rigid.translation)
+    assert (external.focal_px, external.principal_point, external.size) == (300.0, (104.0, 71.0), (200, 150))
 
 
 @pytest.mark.parametrize("count", [2, 10**7, 2**40, 2**63, 2**64 - 1])
@@ -195,7 +195,7 @@ def test_a_matrix_that_is_none(folder, matrix):
 
 def test_what_else_stands_in_a_json_is_left_alone(folder):
     """A time stamp in nanoseconds is larger than any length."""
-    assert read(transforms(folder, {**LENS, "stamp": 1.7e18, "note": [[[]]]}), transforms="t.json").told["hall"].focal_px == 300
+    assert read(transforms(folder, {**LENS, "stamp": 1.7e18, "note": [[[]]]}), transforms="t.json").external["hall"].focal_px == 300
 
 
 # ── BOP ──────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -254,8 +254,8 @@ def test_a_photo_named_by_a_superscript_is_looked_for(folder):
 
 def test_thousands_of_photos_find_their_images_in_a_moment(folder):
     from factorlib.dataset.schema import CameraSource, DatasetFile, PhotoEntry
+    from factorlib.dataset.sources.external import matched
     from factorlib.dataset.sources.shot import Shot
-    from factorlib.dataset.sources.told import matched
 
     photos = [PhotoEntry(name=f"p{i}", image=f"photos/p{i}.png", masks="m.png") for i in range(5000)]
     shots = [Shot(image=f"images/p{i}.jpg", camera=None, size=None, key="") for i in range(5000)]

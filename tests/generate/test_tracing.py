@@ -11,7 +11,7 @@ from factorlib.light.latlong import sampled
 
 pytest.importorskip("mitsuba")
 GREEN = tracing.Material((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)
-MATTE = tracing.Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6)
+RED = tracing.Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6)
 PIXEL = Camera(1, 1, 400.0, (0.5, 0.5))
 BALL = np.array([0.6, -0.3, 4.0])  # centre, camera frame; radius 1
 CAMERA = Camera(24, 16, 30.0, (12.0, 8.0))
@@ -39,7 +39,7 @@ def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
     assert (image[unlit] < 0.01 * expected.max()).all()
 
 
-@pytest.mark.parametrize("material", [GREEN, MATTE])
+@pytest.mark.parametrize("material", [GREEN, RED])
 def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
     """One pixel's worth: a ball's radiance in a smooth light against a sum over directions of the written formula."""
     light = smooth_light(32)

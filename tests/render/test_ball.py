@@ -14,7 +14,7 @@ MATTE = Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)
 def brightest(axis) -> tuple[float, float]:
     """Row and column of the brightest pixel of a ball lit from `axis`, from −1 to 1."""
     lobe = Lobes(np.array([axis]) / np.linalg.norm(axis), np.array([50.0]), np.ones((1, 3)))
-    picture = ball(Reflector(reflection_operator("closed_form"), lobe), MATTE, 32)
+    picture = ball(Reflector(reflection_operator("closed_form"), lobe), LAMBERTIAN, 32)
     return tuple((i + 0.5) / 16 - 1 for i in np.unravel_index(picture[..., 0].argmax(), (32, 32)))
 
 
@@ -27,7 +27,7 @@ def test_light_comes_from_the_side_it_is_on():
 
 def test_black_beside_the_ball():
     lobe = Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.5]), np.ones((1, 3)))
-    picture = ball(Reflector(reflection_operator("closed_form"), lobe), MATTE, 32)
+    picture = ball(Reflector(reflection_operator("closed_form"), lobe), LAMBERTIAN, 32)
     assert ((picture.max(-1) > 0) == ball_normals(32)[1]).all()
 
 

@@ -156,7 +156,7 @@ def test_black_photos_are_named_and_nothing_but_black_is_an_error(tmp_path, capl
 def test_what_cannot_be_told_is_in_the_log_of_the_stage(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         run_stage(tmp_path, observed(chosen([1]), ROOMS[:1], [[0]], normals=FLAT))
-    for words in ("is flat", "by convention only", "roughness of material 'red' cannot be told"):
+    for words in ("is flat", "by convention only", "roughness of material 'red' cannot be determined"):
         assert words in caplog.text
 
 

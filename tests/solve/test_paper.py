@@ -31,7 +31,7 @@ def solved():
 def test_roughly_recovers_the_materials_it_was_rendered_with(solved):
     found = solved[1].point.materials
     factor = factor_between(found, MATERIALS)
-    np.testing.assert_allclose(found.roughness[1:], MATERIALS.roughness[1:], atol=0.15)  # the first is all but matte
+    np.testing.assert_allclose(found.roughness[1:], MATERIALS.roughness[1:], atol=0.15)  # the first is all but Lambertian
     np.testing.assert_allclose(found.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05)  # the glossy one is split badly
 
 

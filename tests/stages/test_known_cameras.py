@@ -28,8 +28,8 @@ WORLD = {"scale": 2.0, "rotation": rotation_of_vector(np.array([-0.3, 0.2, 1.5])
 CASTER = Caster(chair())
 
 
-def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, told=True):
-    """A dataset of one photo of a chair, `scale` times as large as the image of the source; `told` poses, or the camera only."""
+def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, posed=True):
+    """A dataset of one photo of a chair, `scale` times as large as the image of the source; `posed` poses, or the camera only."""
     for name in ("photos", "masks"):
         (folder / name).mkdir(parents=True)
     seen = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
@@ -40,7 +40,7 @@ def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, told=Tru
     thing = {"name": "thing", "mesh": "chair"}
     entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [thing]} | (photo or {})
     meshes = {"chair": {"file": "chair.ply", "material": "white"}}
-    cameras = SOURCES[source](folder, pose) if told else {source: SOURCES[source](folder, pose)[source]}
+    cameras = SOURCES[source](folder, pose) if posed else {source: SOURCES[source](folder, pose)[source]}
     spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
     return folder
@@ -118,14 +118,14 @@ def test_a_photo_of_twice_the_size_is_the_same_scene(tmp_path, source):
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_told_camera_follows_a_photo_that_is_averaged_down(tmp_path, source):
+def test_a_known_camera_follows_a_photo_that_is_averaged_down(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source), averaged=masks.Params(frame=200 * 150 // 4))
     assert entry["camera"]["focal_px"] == 150.0 and np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
     assert entry["objects"]["thing"]["silhouette_iou"] > 0.98
 
 
-def test_where_only_the_camera_is_told_the_pose_is_searched(tmp_path):
-    entry = aligned(scene(tmp_path / "set", "colmap", told=False))
+def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
+    entry = aligned(scene(tmp_path / "set", "colmap", posed=False))
     camera, thing = entry["camera"], entry["objects"]["thing"]
     assert (camera["focal_source"], thing["source"]) == ("colmap", "found") and camera["focal_px"] == 300.0
     assert camera["principal_point"] == list(CAMERA.centre)
@@ -149,7 +149,7 @@ def test_a_pose_in_dataset_yaml_wins(tmp_path):
     assert entry["objects"]["thing"]["source"] == "given" and entry["objects"]["thing"]["translation"] == [0.0, 0.0, 6.0]
 
 
-def test_a_told_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
+def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         thing = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["thing"]
     assert thing["doubts"] and not thing["left_out"] and "world_from_object" in caplog.text
@@ -166,8 +166,8 @@ def test_a_photo_that_was_cropped_is_refused(tmp_path):
     assert caught.value.key == "cameras.colmap: hall" and "cropped" in str(caught.value)
 
 
-def test_the_slice_of_a_told_photo_is_of_its_type(tmp_path):
+def test_the_slice_of_a_posed_photo_is_of_its_type(tmp_path):
     from factorlib.dataset.schema import ObjectsSlice
 
     facts = dataset_slice(read_dataset(scene(tmp_path / "set", "bop")), "objects", "hall").facts
-    assert msgspec.convert(json.loads(json.dumps(facts)), ObjectsSlice).told.source == "bop"
+    assert msgspec.convert(json.loads(json.dumps(facts)), ObjectsSlice).external.source == "bop"

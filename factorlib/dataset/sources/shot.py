@@ -21,7 +21,7 @@ DAMAGED = "the file is damaged: copy it again from where it came"
 class Shot(msgspec.Struct, frozen=True):
     """An image of a source: its name or id, its camera, and what it shows from where.
 
-    size            of the image in pixels, as in `schema.Told`
+    size            of the image in pixels, as in `schema.ExternalCamera`
     centred         the source does not say where the principal point is
     cam_from_world  None where the source knows no world
     poses           obj_id -> cam_from_object of each instance, in millimetres

@@ -12,7 +12,7 @@ import msgspec
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ObjectEntry, PhotoEntry, Pose, Told
+from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, ObjectEntry, PhotoEntry, Pose
 from factorlib.dataset.sources.bop import bop_shots
 from factorlib.dataset.sources.colmap import colmap_shots
 from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
@@ -24,7 +24,7 @@ READERS = {"colmap": colmap_shots, "transforms": transforms_shots, "bop": bop_sh
 log = logging.getLogger("factorlib.dataset")
 
 
-def told_by_source(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str, Told]]:
+def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str, ExternalCamera]]:
     """The dataset with world_from_camera filled in, where `cameras` asks for it, and what the source says of its photos.
 
     Photos that the source does not have are named in a warning.  Raises InputError, naming file, key and cure, for a source
@@ -33,13 +33,13 @@ def told_by_source(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str
     refuse = Refusal(file, file.parent)
     kind = next(kind for kind in SOURCES if getattr(spec.cameras, kind) is not None)
     shots = matched(spec, kind, READERS[kind](getattr(spec.cameras, kind), refuse), refuse)
-    told = {photo.name: _told(kind, photo, shots[photo.name], spec.cameras, refuse) for photo in spec.photos if photo.name in shots}
+    external = {photo.name: _external(kind, photo, shots[photo.name], spec.cameras, refuse) for photo in spec.photos if photo.name in shots}
     for name in [photo.name for photo in spec.photos if photo.name not in shots]:
         log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name it: "
                     "cameras.images: {%s: …}", file, kind, name, name)  # fmt: skip
     if spec.cameras.world_from_camera:
         spec = msgspec.structs.replace(spec, photos=[_fixed_to_world(photo, shots.get(photo.name)) for photo in spec.photos])
-    return spec, told
+    return spec, external
 
 
 def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) -> dict[str, Shot]:
@@ -90,16 +90,16 @@ class _Named:
         return next((found for found in ways if found), [])
 
 
-def _told(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Told:
+def _external(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> ExternalCamera:
     poses, given = _poses(photo, shot, source, refuse), photo.camera
     if given is not None and given.focal_px is not None and given.principal_point is not None:
-        return Told(kind, given.focal_px, given.principal_point, None, poses)
+        return ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
     found = pinhole(shot.camera, shot.key, refuse)
-    return Told(kind, found.focal_px, None if shot.centred else found.principal_point, shot.size, poses)
+    return ExternalCamera(kind, found.focal_px, None if shot.centred else found.principal_point, shot.size, poses)
 
 
 def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> dict[str, Pose]:
-    """object -> pose, of those whose place the source tells and dataset.yaml does not."""
+    """object -> pose, of those whose place the source gives and dataset.yaml does not."""
     things = [thing for thing in photo.objects if thing.pose is None and not thing.keypoints]
     if source.bop is not None:
         found = {thing.name: _instance(photo, thing, shot, source, refuse) for thing in things if thing.mesh in source.obj_ids}
@@ -113,7 +113,7 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal)
 
 
 def _pose(name: str, shot: Shot, source: CameraSource) -> Pose:
-    """cam_from_object of scale 1: the camera's unit becomes the mesh's, which no picture can tell."""
+    """cam_from_object of scale 1: the camera's unit becomes the mesh's, which no picture shows."""
     similarity = source.world_from_object[name]
     cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
     return Pose(as_rows(cam_from_object.rotation), tuple(float(x) / similarity.scale for x in cam_from_object.translation))
