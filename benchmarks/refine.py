@@ -45,7 +45,7 @@ from factorlib.solve.bundle import solve
 from factorlib.solve.history import Run
 from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
-from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
 
@@ -152,7 +152,7 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
         geometry = {f"normal.{a}": maps.normal[..., i] for i, a in enumerate("xyz")} | {f"view.{a}": maps.view[..., i] for i, a in enumerate("xyz")}
         geometry |= {"label": maps.label, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
         name = f"photo{k}"
-        seen.append(merge(observations_of_photo(photo.channels, geometry, name=name, illumination=name, materials=["a", "b", "c"]), 2.0))
+        seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
     bundle = Bundle(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
     return solve(JointProblem(blocks, operator), from_nothing(3), Run(bundle)).point.materials

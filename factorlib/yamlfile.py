@@ -19,10 +19,18 @@ from factorlib.yamltext import LIMITS, Keys, Limits, at_line, key_path, line_of,
 T = TypeVar("T")
 
 
+class Source(msgspec.Struct, frozen=True):
+    """Where a value was written: file (or what errors call it), its text, if lines are to be named, and a prefix of its keys."""
+
+    path: str | Path
+    text: str | None = None
+    prefix: str = ""
+
+
 def read_yaml(path: str | Path, type_: type[T], limits: Limits = LIMITS) -> T:
     """The file as a value of a msgspec type; InputError with file, line, key and cure for whatever does not fit."""
     text = _text_of(path, limits)
-    return _convert(plain_value(text, path, limits), type_, path, text)
+    return _convert(plain_value(text, path, limits), type_, Source(path, text))
 
 
 def load_yaml(path: str | Path) -> Any:
@@ -41,7 +49,7 @@ def parse_yaml(text: str, name: str | Path = "") -> Any:
 
 def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "") -> T:
     """Plain data, wherever it came from, as a value of a msgspec type; errors as in `read_yaml`, `prefix` before keys."""
-    return _convert(value, type_, name, None, prefix)
+    return _convert(value, type_, Source(name, prefix=prefix))
 
 
 def _text_of(path: str | Path, limits: Limits) -> str:
@@ -54,13 +62,12 @@ _UNKNOWN = re.compile(r"unknown field `(.*)`", re.DOTALL)
 _MISSING = re.compile(r"missing required field `(.*)`", re.DOTALL)
 
 
-def _convert(value: Any, type_: type[T], path: str | Path, text: str | None, prefix: str = "") -> T:
-    """text: what `value` was read from, for its lines."""
+def _convert(value: Any, type_: type[T], source: Source) -> T:
     try:
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
         message, keys = _found_at(str(error), value, type_)
-        raise _refusal(message, keys, value, type_, path, text, prefix) from None
+        raise _refusal(message, keys, value, type_, source) from None
 
 
 def _found_at(error: str, value: Any, type_: type) -> tuple[str, Keys]:
@@ -112,7 +119,8 @@ def _with(value: Any, keys: Keys, new: Any) -> Any:
     return copy
 
 
-def _refusal(message: str, keys: Keys, value: Any, type_: type, path, text: str | None, prefix: str) -> InputError:
+def _refusal(message: str, keys: Keys, value: Any, type_: type, source: Source) -> InputError:
+    """msgspec's message in the user's terms, with file, line, key and cure."""
     if unknown := _UNKNOWN.search(message):
         keys = (*keys, unknown[1])
         message, cure = f"unknown key {one_line(repr(unknown[1]))}", did_you_mean(unknown[1], _fields_at(type_, keys[:-1]))
@@ -123,8 +131,9 @@ def _refusal(message: str, keys: Keys, value: Any, type_: type, path, text: str 
         message = f"{message[:1].lower()}{message[1:]}" + (f": {one_line(repr(given))}" if not isinstance(given, dict | list) else "")
         quoted = isinstance(given, int | float) and "expected `str" in message
         cure = f'put it in quotes: "{one_line(str(given))}"' if quoted else _choices(type_, keys) or "write a value of that kind"
-    key = ".".join(part for part in (prefix, key_path(keys)) if part)
-    return InputError(message, file=at_line(path, line_of(text, keys) if text is not None else None), key=key or None, cure=cure)
+    key = ".".join(part for part in (source.prefix, key_path(keys)) if part)
+    line = line_of(source.text, keys) if source.text is not None else None
+    return InputError(message, file=at_line(source.path, line), key=key or None, cure=cure)
 
 
 def _choices(type_: type, keys: Keys) -> str | None:

@@ -76,7 +76,7 @@ def things_of(
 ) -> list[Thing]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
-    things = []
+    objects = []
     for number, thing in enumerate(slice_.objects, start=1):
         mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
@@ -94,15 +94,11 @@ def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materia
     return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
 
 
-def hold_against(
-    slice_: schema.ObjectsSlice, things: list[Thing], label: np.ndarray, materials: list[str], camera: Camera, focal: float | None, photo: str
-) -> None:
-    """What dataset.yaml and its source of cameras give, against the photo: InputError for what is impossible, a warning for what is odd."""
-    for thing, said in zip(things, slice_.objects, strict=True):
-        if thing.pose is not None:
-            check_before_camera(thing.caster.mesh, thing.pose, photo, thing.name, "dataset" if said.pose else slice_.external.source)
-    warn_of_materials(label, [thing.caster.mesh.labels for thing in things], materials, photo)
-    warn_of_camera(focal, camera.centre, (camera.width, camera.height), photo)
+def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace], photo: str) -> None:
+    """Raise InputError where a pose of dataset.yaml, or of its source of cameras, puts its object behind the camera."""
+    for each, said in zip(objects, slice_.objects, strict=True):
+        if each.pose is not None:
+            check_before_camera(each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source)
 
 
 def pose_of(thing: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
@@ -121,7 +117,7 @@ def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
 def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, float | None, str | None]:
     """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
 
-    What dataset.yaml gives goes before what its source of cameras tells, and that before EXIF and the middle of the photo.
+    What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
     Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
     """
     factor, (width, height) = facts.factor, facts.original_size

@@ -18,7 +18,7 @@ from factorlib.meshes.read import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.sample import sample

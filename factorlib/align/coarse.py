@@ -11,6 +11,8 @@ where frame or occluder cut the mask the areas do not say it, and several sizes 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -58,33 +60,35 @@ def is_cut(evidence: Evidence) -> bool:
     return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
 
 
-def candidates(caster: Caster, evidence: Evidence, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float) -> list[Candidate]:
-    """The `keep` best guesses that differ by `apart_deg` in rotation, best first."""
+def candidates(caster: Caster, evidence: Evidence, camera: Camera, density: Density) -> list[Candidate]:
+    """The best guesses that differ in rotation, best first; the evidence must show some pixel of the object."""
     labels = caster.mesh.labels
     low, high, extent = extent_of(evidence)
     cut = is_cut(evidence)
     pixel = extent / (CUT if cut else WHOLE)
     middle = (low + high) / 2
-    angles = np.arange(rolls) * 2 * np.pi / rolls
+    angles = np.arange(density.rolls) * 2 * np.pi / density.rolls
     costs, area = _cost_images(evidence, labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
     found = []
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
-    for direction in fibonacci_directions(views):
+    for direction in fibonacci_directions(density.views):
         turn = looking_along(direction)
         for template, focal in _templates(caster, labels, turn, distance, area, cut):
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
-            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(rolls, -1)
+            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(density.rolls, -1)
             best = errors.argmin(axis=1)
-            error = 1 + errors[np.arange(rolls), best] / area
+            error = 1 + errors[np.arange(density.rolls), best] / area
             shift = np.stack([best % GRID, best // GRID], axis=1)
             shift = (shift + GRID // 2) % GRID - GRID // 2
-            found += [(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
-    chosen = _apart(found, keep, apart_deg)
+            found += [(error[k], turn, angles[k], shift[k], focal) for k in range(density.rolls)]
+    chosen = _apart(found, density.keep, density.apart_deg)
     return [Candidate(_state(c, caster, camera, middle, pixel, distance), float(c[0])) for c in chosen]
 
 
-def _cost_images(evidence: Evidence, labels, middle, pixel: float, angles) -> tuple[np.ndarray, float]:
+def _cost_images(
+    evidence: Evidence, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, "rolls"]
+) -> tuple[np.ndarray, float]:
     """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
     sums = [_block_means(np.where(evidence.label == 0, 1.0, np.where(evidence.label == label, -1.0, 0.0)), step) for label in labels]
@@ -107,7 +111,9 @@ def _block_means(image: np.ndarray, step: int) -> np.ndarray:
     return padded.reshape(height // step, step, width // step, step).mean(axis=(1, 3))
 
 
-def _templates(caster: Caster, labels, turn: np.ndarray, distance: float, area: float, cut: bool):
+def _templates(
+    caster: Caster, labels: Sequence[int], turn: np.ndarray, distance: float, area: float, cut: bool
+) -> Iterator[tuple[np.ndarray, float]]:
     """Label images of the mesh at each size, [labels, GRID, GRID], and the focal length (grid pixels) that gives it."""
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
@@ -144,7 +150,7 @@ def _apart(found: list, keep: int, apart_deg: float) -> list:
     return chosen
 
 
-def _state(found, caster: Caster, camera: Camera, middle, pixel: float, distance: float) -> State:
+def _state(found: tuple, caster: Caster, camera: Camera, middle: Float[np.ndarray, "2"], pixel: float, distance: float) -> State:
     """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
     _, turn, angle, shift, focal = found
     cos, sin = np.cos(angle), np.sin(angle)

@@ -51,7 +51,17 @@ class EarlierFocal(msgspec.Struct, frozen=True):
     log_sigma: float
 
 
-class Thing(msgspec.Struct, frozen=True):
+class KnownFocal(msgspec.Struct, frozen=True):
+    """What is known of the focal length beforehand, photo pixels; None where nothing is.
+
+    source: dataset | colmap | transforms | bop | exif
+    """
+
+    focal: float | None = None
+    source: str | None = None
+
+
+class ObjectToPlace(msgspec.Struct, frozen=True):
     """An object to place: its mesh, what the photo says about it, and what the user, or an earlier result, said of its pose."""
 
     name: str
@@ -75,29 +85,29 @@ class Placed(msgspec.Struct, frozen=True):
 
 
 def placed(
-    things: Sequence[Thing],
+    objects: Sequence[ObjectToPlace],
     camera: Camera,
-    focal: float | None,
-    source: str | None,
+    known: KnownFocal,
     photo: str,
     search: Search = Search(),
     before: EarlierFocal | None = None,
 ) -> Placed:
-    """Poses of all things.  The focal length, where neither given nor found `before`, is found with the object that shows most.
+    """Poses of all objects.  The focal length, where neither known nor found `before`, is found with the object that shows most.
 
-    Raises InputError for an object to search whose mask has no pixel.
+    camera: of the photo; its focal length is not used.  Raises InputError for an object to search whose mask has no pixel.
     """
-    prior = beforehand = focal_prior(focal, source, camera.width, camera.height)
+    source = known.source
+    prior = beforehand = focal_prior(known.focal, source, camera.width, camera.height)
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     sigma, found = 0.0, {}
     if before is not None:
         prior, source, sigma = FocalPrior(before.focal, 0.0), before.source, before.log_sigma
         camera = msgspec.structs.replace(camera, focal=before.focal)
-    if prior.sigma > 0 and any(thing.pose is not None for thing in things):
-        camera, source = _focal_of_given(things, camera), "estimated"
+    if prior.sigma > 0 and any(each.pose is not None for each in objects):
+        camera, source = _focal_of_given(objects, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
-    for k in sorted(range(len(things)), key=lambda k: (-int(things[k].evidence.inside.sum()), k)):
-        thing = things[k]
+    for k in sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k)):
+        thing = objects[k]
         if thing.pose is not None:
             continue
         if not thing.evidence.inside.any():
@@ -113,32 +123,32 @@ def placed(
             start = state_of_keypoints(thing.keypoints, thing.caster, camera, prior, photo, thing.name)
             found[k] = found_near(thing.caster, thing.evidence, camera, start, prior, search)
         if prior.sigma > 0:
-            found[k], source = _judged(thing, camera, prior, found[k], source, photo, search)
+            found[k], source = _judged(thing, camera, found[k], source, photo, search)
             sigma = found[k].log_focal_sigma
             camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [_pose(thing, found.get(k)) for k, thing in enumerate(things)]
-    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(things))], beforehand)
+    poses = [_pose(each, found.get(k)) for k, each in enumerate(objects)]
+    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
 
 
-def _pose(thing: Thing, found: Found | None) -> Pose:
+def _pose(thing: ObjectToPlace, found: Found | None) -> Pose:
     """What was said or found before is used to the last digit."""
     if thing.pose is None and thing.earlier is None:
         return found.state.pose(thing.caster)
     return thing.pose or thing.earlier.pose
 
 
-def _found_before(thing: Thing, camera: Camera, sigma: float, search: Search) -> Found:
-    earlier, other = thing.earlier, None
-    if earlier.runner_up is not None:
-        state = state_of(earlier.runner_up, camera, thing.caster)
-        other = RunnerUp(state, earlier.runner_up_score, earlier.runner_up_difference_deg)
-    return found_before(thing.caster, thing.evidence, camera, state_of(earlier.pose, camera, thing.caster), sigma, other, search)
+def _found_before(thing: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
+    earlier = thing.earlier
+    found = found_before(thing.caster, thing.evidence, camera, state_of(earlier.pose, camera, thing.caster), sigma, search)
+    if earlier.runner_up is None:
+        return found
+    state = state_of(earlier.runner_up, camera, thing.caster)
+    other = RunnerUp(state, earlier.runner_up_score, earlier.runner_up_difference_deg)
+    return msgspec.structs.replace(found, runner_up=other)
 
 
-def _judged(
-    thing: Thing, camera: Camera, prior: FocalPrior, found: Found, source: str | None, photo: str, search: Search
-) -> tuple[Found, str]:
+def _judged(thing: ObjectToPlace, camera: Camera, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
     """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
     if source != "exif":
         return found, "estimated"
@@ -151,14 +161,14 @@ def _judged(
         return found, "exif"
     log.warning(
         "%s: the EXIF focal length (%.0f px) does not fit the mask, %.0f px does (%.3f against %.3f): is the photo a crop? "
-        "give camera.focal_px to settle it", photo, prior.focal, np.exp(free.state.log_focal), free.score, found.score,
+        "give camera.focal_px to settle it", photo, camera.focal, np.exp(free.state.log_focal), free.score, found.score,
     )  # fmt: skip
     return free, "estimated"
 
 
-def _focal_of_given(things: Sequence[Thing], camera: Camera) -> Camera:
+def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    fixed = [(t.caster, t.pose, target_of(t.evidence, t.caster.mesh.labels, 200)) for t in things if t.pose and t.evidence.inside.any()]
+    fixed = [(t.caster, t.pose, target_of(t.evidence, t.caster.mesh.labels, 200)) for t in objects if t.pose and t.evidence.inside.any()]
 
     def misfit(log_focal: float) -> float:
         trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))

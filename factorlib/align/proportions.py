@@ -137,10 +137,9 @@ def factors_of(shape: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
 
 
 def _equations(one: Sighting, caster: Caster, state: State) -> tuple[Equations, float]:
-    window = one.target.camera(state.camera(one.camera))
-    hits = caster.cast(window, state.pose(caster))
-    equations = normal_equations(caster, one.target, window, hits, state, one.prior, jacobian_with_shape)
-    return equations, labelled_iou(one.target.evidence, caster.labels(hits))
+    seen = rendered(caster, one.target, one.camera, state)
+    equations = normal_equations(seen, one.target, one.prior, jacobian_with_shape)
+    return equations, labelled_iou(one.target.evidence, caster.labels(seen.hits))
 
 
 def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:

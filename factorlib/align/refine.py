@@ -56,15 +56,29 @@ class Refined(msgspec.Struct, frozen=True):
         return float(np.sqrt(max(np.linalg.pinv(self.information)[6, 6], 0.0)))
 
 
+class Rendered(msgspec.Struct, frozen=True):
+    """A mesh in a state, as a target's window sees it: the camera of the window, and what its pixels' rays hit."""
+
+    caster: Caster
+    state: State
+    window: Camera
+    hits: Hits
+
+
+def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Rendered:
+    """The mesh in `state`, cast in the target's window of the photo with camera `camera`."""
+    window = target.camera(state.camera(camera))
+    return Rendered(caster, state, window, caster.cast(window, state.pose(caster)))
+
+
 def refined(caster: Caster, target: Target, camera: Camera, start: State, prior: FocalPrior, steps: int) -> Refined:
     """The best-scoring state met in `steps` steps from `start`."""
     state, best = start, None
     failures = 0
     for k in range(steps + 1):
-        window = target.camera(state.camera(camera))
-        hits = caster.cast(window, state.pose(caster))
-        score = labelled_iou(target.evidence, caster.labels(hits))
-        equations = normal_equations(caster, target, window, hits, state, prior)
+        seen = rendered(caster, target, camera, state)
+        score = labelled_iou(target.evidence, caster.labels(seen.hits))
+        equations = normal_equations(seen, target, prior)
         if best is None or score > best.score:
             best, failures = Refined(state, score, equations.scale, equations.information), 0
         else:
@@ -95,15 +109,18 @@ class Equations(msgspec.Struct, frozen=True):
 
 
 def normal_equations(
-    caster: Caster, target: Target, window: Camera, hits: Hits, state: State, prior: FocalPrior, jacobian_of: Callable = State.jacobian
+    seen: Rendered, target: Target, prior: FocalPrior, jacobian_of: Callable[[State, np.ndarray], np.ndarray] = State.jacobian
 ) -> Equations:
-    """jacobian_of: of the image points by all unknowns, from the state and the points' arms, as `State.jacobian`."""
-    residuals, rows = [np.zeros(0)], [np.zeros((0, jacobian_of(state, np.zeros((0, 3))).shape[-1]))]
+    """The contours' residuals by all unknowns, robustly weighted, with the prior of the focal length.
+
+    jacobian_of: derivative of image points by all unknowns, from the state and the points' arms, as `State.jacobian`
+    """
+    residuals, rows = [np.zeros(0)], [np.zeros((0, jacobian_of(seen.state, np.zeros((0, 3))).shape[-1]))]
     for name, region in target.regions.items():
-        points, arms = contour_of(caster, name, hits, window, state)
+        points, arms = contour_of(seen, name)
         if len(points) == 0:
             continue
-        jacobian = jacobian_of(state, arms) / target.pixel
+        jacobian = jacobian_of(seen.state, arms) / target.pixel
         for residual, row in (_mesh_to_mask(region, points, jacobian), _mask_to_mesh(region, points, jacobian)):
             residuals.append(residual)
             rows.append(row)
@@ -114,27 +131,26 @@ def normal_equations(
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
     if prior.sigma > 0:
         information[6, 6] += prior.sigma**-2
-        gradient[6] += (state.log_focal - np.log(prior.focal)) / prior.sigma**2
+        gradient[6] += (seen.state.log_focal - np.log(prior.focal)) / prior.sigma**2
     return Equations(information, gradient, scale)
 
 
-def contour_of(
-    caster: Caster, name: int, hits: Hits, window: Camera, state: State
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Points (x, y) of the contour of the mesh's part of label `name`, and the arms from the mesh's centre to the surface
-    points that move them: where another part covers it, the contour moves with the nearer surface.
+def contour_of(seen: Rendered, name: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
+    """Points (x, y) of the contour of the mesh's part of label `name`, window pixels, and the arms from the mesh's centre to the
+    surface points that move them (camera axes, mesh units): where another part covers it, the contour moves with the nearer surface.
     """
+    caster, window, hits = seen.caster, seen.window, seen.hits
     inside = caster.labels(hits) == name
     pixel_in, pixel_out = border_pairs(inside, ~inside)
     depth = np.minimum(hits.depth[tuple(pixel_in.T)], hits.depth[tuple(pixel_out.T)])
-    near, far, pose = pixel_in[:, ::-1] + 0.5, pixel_out[:, ::-1] + 0.5, state.pose(caster)
+    near, far, pose = pixel_in[:, ::-1] + 0.5, pixel_out[:, ::-1] + 0.5, seen.state.pose(caster)
     for _ in range(HALVINGS):
         middle = (near + far) / 2
         there = caster.cast_along(window.rays_through(middle), pose)
         within = caster.labels(there) == name
         near, far = np.where(within[:, None], middle, near), np.where(within[:, None], far, middle)
     points = (near + far) / 2
-    return points, window.rays_through(points) * depth[:, None] - state.middle()
+    return points, window.rays_through(points) * depth[:, None] - seen.state.middle()
 
 
 def _mesh_to_mask(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,7 +95,8 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     effort = search.cut_effort if is_cut(evidence) else 1
-    guesses = candidates(caster, evidence, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
+    density = Density(effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
+    guesses = candidates(caster, evidence, camera, density)
     states = [guess.state for guess in guesses]
     others: list[Refined] = []
     for keep, steps, resolution, margin in zip(search.keep, search.steps, search.resolution, search.margin):
@@ -104,7 +105,8 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
         states = [result.state for result in ranked if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)]
         others = ranked + others
-    ranked = _distinct(ranked + _rivals(caster, target, camera, ranked[0], others[len(ranked) :], prior, search), prior)
+    rivals = _rivals(ranked[0], others[len(ranked) :], search.rivals)  # refined anew: scores of different resolutions do not compare
+    ranked = _distinct(ranked + [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals], prior)
     best = ranked[0]
     return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
 
@@ -121,11 +123,11 @@ def found_near(caster: Caster, evidence: Evidence, camera: Camera, start: State,
     return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
 
 
-def found_before(caster: Caster, evidence: Evidence, camera: Camera, state: State, log_focal_sigma: float, other: RunnerUp | None, search: Search) -> Found:
-    """An earlier answer as it is, scored anew; `other` is its runner-up."""
+def found_before(caster: Caster, evidence: Evidence, camera: Camera, state: State, log_focal_sigma: float, search: Search) -> Found:
+    """An earlier answer as it is, without a runner-up, scored anew at the finest resolution."""
     target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     score = refined(caster, target, camera, state, FocalPrior(camera.focal, 0.0), 0).score
-    return Found(state, score, log_focal_sigma, other, earlier=True)
+    return Found(state, score, log_focal_sigma, None, earlier=True)
 
 
 def with_focal_free(caster: Caster, evidence: Evidence, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
@@ -151,17 +153,14 @@ def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
     return kept
 
 
-def _rivals(
-    caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined], prior: FocalPrior, search: Search
-) -> list[Refined]:
-    """The best of `others` that are turned by more than DISTINCT_DEG, refined in the finest window: scores of
-    different resolutions do not compare."""
+def _rivals(best: Refined, others: list[Refined], count: int) -> list[Refined]:
+    """The first `count` of `others` that are turned by more than DISTINCT_DEG against the best and each other."""
     rivals: list[Refined] = []
     for other in others:
         distinct = all(angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals))
-        if distinct and len(rivals) < search.rivals:
+        if distinct and len(rivals) < count:
             rivals.append(other)
-    return [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
+    return rivals
 
 
 def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:

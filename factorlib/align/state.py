@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+
+
+class Centred(Protocol):
+    """What has a centre in its own frame: a mesh, or its caster."""
+
+    centre: Float[np.ndarray, "3"]
 
 
 class State(msgspec.Struct, frozen=True):
@@ -28,7 +36,7 @@ class State(msgspec.Struct, frozen=True):
         """The mesh's centre in camera coordinates, mesh units."""
         return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
 
-    def pose(self, mesh) -> Pose:
+    def pose(self, mesh: Centred) -> Pose:
         """cam_from_object of a mesh (or caster) with this centre."""
         return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
 
@@ -64,8 +72,8 @@ class State(msgspec.Struct, frozen=True):
         return result
 
 
-def state_of(pose: Pose, camera: Camera, mesh) -> State:
-    """The state of a pose."""
+def state_of(pose: Pose, camera: Camera, mesh: Centred) -> State:
+    """The state of a pose of a mesh (or caster).  `State.pose` undoes it."""
     middle = pose.apply(mesh.centre[None])[0]
     slope = middle[:2] / middle[2]
     return State(pose.rotation, float(slope[0]), float(slope[1]), float(np.log(middle[2])), float(np.log(camera.focal)))

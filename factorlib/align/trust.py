@@ -40,7 +40,7 @@ class Trust(msgspec.Struct, frozen=True):
     mirrored_score: float | None = None
 
 
-def trust_in(thing: Thing, placed: Placed, number: int) -> Trust:
+def trust_in(thing: ObjectToPlace, placed: Placed, number: int) -> Trust:
     """Of the pose of `thing`, the photo's `number`-th; of a pose that was given only the contours are compared."""
     found, caster, evidence = placed.found[number], thing.caster, thing.evidence
     if not evidence.inside.any():
@@ -57,10 +57,9 @@ def trust_in(thing: Thing, placed: Placed, number: int) -> Trust:
 
 def contour_error(caster: Caster, target: Target, camera: Camera, state: State) -> float:
     """Median distance from the contours of mesh and mask, of every material, to the other's, as a share of the mask's extent."""
-    window = target.camera(state.camera(camera))
-    hits, distances = caster.cast(window, state.pose(caster)), [np.zeros(0)]
+    seen, distances = rendered(caster, target, camera, state), [np.zeros(0)]
     for name, region in target.regions.items():
-        points = contour_of(caster, name, hits, window, state)[0]
+        points = contour_of(seen, name)[0]
         distances.append(np.abs(map_coordinates(region.distance, points.T[::-1] - 0.5, order=1, mode="nearest")))
         if len(region.contour):
             distances.append(cKDTree(points).query(region.contour)[0] if len(points) else np.full(len(region.contour), target.extent))
@@ -71,8 +70,7 @@ def contour_error(caster: Caster, target: Target, camera: Camera, state: State) 
 def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: State, prior: FocalPrior) -> float:
     """Root of the summed squares, over the independent directions of the unknowns, of the normals' median turn by one
     standard error."""
-    window = target.camera(state.camera(camera))
-    equations = normal_equations(caster, target, window, caster.cast(window, state.pose(caster)), state, prior)
+    equations = normal_equations(rendered(caster, target, camera, state), target, prior)
     free = 7 if prior.sigma > 0 else 6
     precision, directions = np.linalg.eigh(equations.information[:free, :free])
     turns = [

@@ -7,6 +7,7 @@ Radiance is in arbitrary units: a data set scales each light by its photo's expo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,39 +16,34 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.generate.mitsuba_variant import mitsuba
-from factorlib.generate.tracing import envmap, light_seen, rgb, transform
+from factorlib.generate.tracing import envmap, light_seen, rgb, rigid, transform
 from factorlib.images.photo import read_photo
 
 EYE = 1.2  # height of the origin over the ground
 # sunsky's zenith is its +z; its sun_direction is the world's
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
+GROUND = (0.32, 0.3, 0.26)  # reflectance
+Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
 Things = dict[str, Any]
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}  # about x, about y, of +z
 
 
-def daylight(
-    rng: np.random.Generator,
-    elevation_deg: float,
-    azimuth_deg: float,
-    turbidity: float = 4.0,
-    sun_scale: float = 0.12,
-    sun_aperture_deg: float = 3.0,
-    ground=(0.32, 0.3, 0.26),
-    rows: int = 256,
-) -> Things:
+def daylight(rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> Things:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
-    The sun is veiled: wider and weaker than the real one, whose 0.5° nothing but a mirror would tell.  The sky is handed
-    on as a map of some rows, which Mitsuba samples with less noise than the model itself.
+    elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
+    (SUN_SCALE) than the real one, whose 0.5° only a mirror shows.  rows: of the map by which the sky is handed on, which Mitsuba
+    samples with less noise than the model itself
     """
     up, turn = np.radians([elevation_deg, azimuth_deg])
     sun = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
     sky = {
-        "type": "sunsky", "turbidity": turbidity, "sun_scale": sun_scale, "sun_aperture": sun_aperture_deg,
+        "type": "sunsky", "turbidity": turbidity, "sun_scale": SUN_SCALE, "sun_aperture": SUN_APERTURE_DEG,
         "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
     }  # fmt: skip
-    seen = light_seen({"sky": sky}, (0, 0, 0), np.eye(3), rows, 4, 0, max_depth=2)
-    things = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), ground)}
+    seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
+    things = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
     return things | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
 
 
@@ -70,14 +66,14 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
     sides = ["+x", "-x", "+z", "-z"]
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
-        things[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), rise=0.25)
+        things[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), (0, 0.25))
         things[f"picture{side}"] = wall(
-            side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
+            side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), (rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5))
         )
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        things[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, rng.uniform(-1, 1), 0.45, glow=day)
+        things[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day)
     for k in range(lamps):
         place = [
             rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]),
@@ -109,24 +105,38 @@ def vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
 
-def wall(side: str, distance: float, half, colour, along: float = 0.0, rise: float = 0.0, glow=None) -> Things:
-    """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin."""
+def wall(
+    side: str,
+    distance: float,
+    half: Sequence[float] | np.ndarray,
+    colour: Colour,
+    shift: tuple[float, float] = (0.0, 0.0),
+    glow: Colour | None = None,
+) -> Things:
+    """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
+
+    shift: of its middle in its own plane (along, up);  glow: the radiance it emits, None for a wall that only reflects
+    """
     pitch, yaw = TURNS[side]
     to_world = mitsuba().ScalarTransform4f().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch)
-    to_world = to_world.translate([along, rise, distance]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
+    to_world = to_world.translate([*shift, distance]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
     thing = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
     return thing if glow is None else thing | {"emitter": {"type": "area", "radiance": rgb(glow)}}
 
 
-def block(place, half, turn_deg: float, colour) -> Things:
+def block(
+    place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour
+) -> Things:
     """A box of half sizes `half` about `place`, turned about y."""
     to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
-def map_of(things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place=(0, 0, 0)):
-    """The light of a surrounding at a place, in a turned y-up frame."""
-    return light_seen(things, place, world_from_light, height, spp, seed, max_depth=-1)
+def map_of(
+    things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place: Sequence[float] = (0, 0, 0)
+) -> Float[np.ndarray, "h w 3"]:
+    """The light of a surrounding at a place of the world, a lat-long map of `height` rows in a turned y-up frame."""
+    return light_seen(things, rigid(world_from_light, place), height, spp, seed)
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:

@@ -76,6 +76,21 @@ SHOTS = (
 )  # fmt: skip
 
 
+class Scene(msgspec.Struct, frozen=True):
+    """What one photo shows: objects in one light.
+
+    light      lat-long map in the camera's y-up frame, radiance in the light's own unit
+    materials  by name, in the order of their labels;  meshes: by shape
+    poses      cam_from_object by the object's name, in the order of `shot.placed`
+    """
+
+    shot: Shot
+    light: Float[np.ndarray, "h w 3"]
+    materials: dict[str, Material]
+    meshes: dict[str, Mesh]
+    poses: dict[str, Pose]
+
+
 def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
@@ -92,7 +107,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
         light = light_of(number, world_from_camera, lat_longs, rng, parameters)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = placements(shot, world_from_camera, rng, spread=0.0 if seed == 0 else 1.0)
-        photos.append(write_shot(out, shot, light, materials, meshes, poses[shot.name], parameters, seed))
+        photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
     write_records(out, materials, photos, poses)
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
@@ -110,12 +125,12 @@ def drawn_materials(rng: np.random.Generator, spread: float, about: dict[str, Ma
     return drawn
 
 
-def _rounded(values) -> tuple[float, ...]:
+def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
     return tuple(round(float(v), 4) for v in values)
 
 
 def light_of(
-    number: int, world_from_camera, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
+    number: int, world_from_camera: Float[np.ndarray, "3 3"], lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
 ) -> Float[np.ndarray, "h w 3"]:
     """The light of photo `number`, in the camera's y-up frame: daylight for the first, rooms for the others."""
     if lat_longs:
@@ -127,10 +142,10 @@ def light_of(
     )
 
 
-def surroundings(number: int, world_from_camera, rng: np.random.Generator, sky_rows: int) -> Things:
+def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> Things:
     """Light number 0 is a street by day, the others rooms with as many lamps as their number.
 
-    world_from_camera: rotation [3, 3]; the sun stands behind the camera, to its left or right
+    The sun stands behind the camera, to its left or right.
     """
     if number:
         return lights.room(rng, windows=2, lamps=number)
@@ -138,7 +153,7 @@ def surroundings(number: int, world_from_camera, rng: np.random.Generator, sky_r
     return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70), rows=sky_rows)
 
 
-def placements(shot: Shot, world_from_camera, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
+def placements(shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float) -> dict[str, Pose]:
     """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
     poses = {}
     for placed in shot.placed:
@@ -153,40 +168,39 @@ def name_of(placed: Placed) -> str:
     return f"{placed.material}_{placed.shape}"
 
 
-def write_shot(
-    out: Path, shot: Shot, light, materials, meshes: dict[str, Mesh], poses: dict[str, Pose], parameters: Parameters, seed: int
-) -> dict:
-    """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry."""
+def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> dict:
+    """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry of dataset.yaml."""
+    shot, meshes, poses = scene.shot, scene.meshes, scene.poses
     camera = Camera(parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2))
-    order = list(materials)
+    order = list(scene.materials)
     labelled = [
         msgspec.structs.replace(meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16))
         for p in shot.placed
     ]
     labels = folder.labels_of(labelled, camera, list(poses.values()))
-    radiance = composed(shot, light, materials, meshes, poses, camera, parameters.spp, seed)
+    radiance = composed(scene, camera, parameters.spp, seed)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT), shot)
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
-    folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
+    folder.write_light(out / f"truth/{shot.name}_light.exr", scene.light * exposure)
     folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal)
     return entry(shot, poses, parameters)
 
 
-def composed(
-    shot: Shot, light, materials, meshes, poses: dict[str, Pose], camera: Camera, spp: int, seed: int
-) -> Float[np.ndarray, "h w 3"]:
+def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
     """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
+    shot, meshes, poses = scene.shot, scene.meshes, list(scene.poses.values())
     radiance = np.zeros((camera.height, camera.width, 3))
     world = rigid(YUP_FROM_CAMERA, np.zeros(3))
-    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, list(poses.values()))
+    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
-    for number, (placed, pose) in enumerate(zip(shot.placed, poses.values(), strict=True)):
-        thing = shape(meshes[placed.shape], bsdf(materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
+    for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
+        thing = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
         own = nearest == number
         columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
-        things = {"thing": thing, "light": envmap(light)}
-        alone = traced(things, camera, world, spp, 100 * seed + number, max_depth=2, columns=columns)
+        alone = rendered(
+            {"thing": thing, "light": envmap(scene.light)}, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2
+        )
         radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
     return radiance
 

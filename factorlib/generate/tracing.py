@@ -9,6 +9,7 @@ Envmap   Mitsuba puts row i of a map at i/(H−1) of the way down, and column j 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -52,17 +53,17 @@ def bsdf(material: Material) -> dict[str, Any]:
     return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": glossy}
 
 
-def rgb(value) -> dict[str, Any]:
+def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:
     """A colour as a Mitsuba dictionary; a single number is grey."""
     return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(value, 3)]}
 
 
-def transform(matrix: Float[np.ndarray, "4 4"]):
+def transform(matrix: Float[np.ndarray, "4 4"]) -> Any:
     """Mitsuba's transform of a 4 × 4 matrix."""
     return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
 
 
-def rigid(rotation: Float[np.ndarray, "3 3"], translation) -> Float[np.ndarray, "4 4"]:
+def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """The 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
@@ -77,7 +78,7 @@ def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndar
         return mitsuba().load_dict({"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material})
 
 
-def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice) -> dict[str, Any]:
+def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice = slice(None)) -> dict[str, Any]:
     """The pinhole camera, of whose image some columns are taken; its principal point must be the image's centre."""
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
@@ -100,19 +101,24 @@ def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns:
 
 
 def traced(
-    things: dict[str, Any], camera: Camera, world_from_camera, spp: int, seed: int, max_depth: int, columns: slice = slice(None)
+    things: dict[str, Any], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int, seed: int, max_depth: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """Radiance of a scene, or of some columns of its image; max_depth 2 is direct light alone, −1 all bounces.
+    """Radiance of a scene, by a camera at world_from_camera; as `rendered`."""
+    return rendered(things, sensor(camera, world_from_camera), spp, seed, max_depth)
 
-    Many samples are taken in passes of stratified ones, so that no pass needs much memory.
+
+def rendered(things: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
+    """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
+
+    spp: samples a pixel, at least.  Many samples are taken in passes of stratified ones, so that no pass needs much memory.
     """
     mi = mitsuba()
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
     loaded = {name: mi.load_dict(thing, parallel=False) if isinstance(thing, dict) else thing for name, thing in things.items()}
     integrator = {"type": "path", "max_depth": max_depth}
-    view = sensor(camera, world_from_camera, columns)
+
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
-    passes = -(-spp * camera.height * len(range(camera.width)[columns]) // SAMPLES_PER_PASS)
+    passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
     images = [mi.render(scene, seed=passes * seed + k, spp=-(-spp // passes)) for k in range(passes)]
     return np.mean([np.array(image, dtype=np.float64) for image in images], axis=0)
 
@@ -130,9 +136,9 @@ def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> d
 
 
 def light_seen(
-    things: dict[str, Any], place, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, max_depth: int = -1
-):
-    """The radiance that arrives at `place`, [height, 2·height, 3], a lat-long map in the light frame (y-up).
+    things: dict[str, Any], world_from_light: Float[np.ndarray, "4 4"], height: int, spp: int, seed: int, max_depth: int = -1
+) -> Float[np.ndarray, "h w 3"]:
+    """The radiance that arrives at the origin of the light frame (y-up), a lat-long map of [height, 2·height].
 
     Six square views of 90° along the light frame's axes, then means over 8 × 8 directions a texel.
     """
@@ -140,7 +146,7 @@ def light_seen(
     camera = Camera(size, size, size / 2, (size / 2, size / 2))
     faces = {}
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
-        world_from_camera = rigid(world_from_light @ look(pitch, yaw), place)
+        world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
         faces[name] = traced(things, camera, world_from_camera, spp, 6 * seed + number, max_depth)
     return _texel_means(faces, height)
 

@@ -113,9 +113,7 @@ def _step(
     moving: Moving, state: State, seen: Seen, lit: Illumination, residual: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "7"]:
     """The step of a state; lit: the fitted pixels in their light, whose whitened residual is `residual`."""
-    window = moving.target.camera(state.camera(moving.camera))
-    hits = moving.caster.cast(window, state.pose(moving.caster))
-    contours = normal_equations(moving.caster, moving.target, window, hits, state, moving.prior)
+    contours = normal_equations(rendered(moving.caster, moving.target, moving.camera, state), moving.target, moving.prior)
     free = 7 if moving.prior.sigma > 0 else 6
     jacobian = photometric_jacobian(moving, state, seen, lit.light, free)
     information, gradient = projected_equations(jacobian, residual, lit)

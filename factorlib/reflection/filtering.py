@@ -66,42 +66,75 @@ class Filtered(msgspec.Struct):
     cosine: Tensor  # mean n·i of that
 
 
+class Width(msgspec.Struct):
+    """How wide a lobe is: λ, λ' of (2), and its variance along its axis."""
+
+    sharpness: Tensor
+    plane: Tensor
+    along: Tensor
+
+
+class Directions(msgspec.Struct):
+    """Where o and z point, in the frame with n = (0, 0, 1) and o = (so, 0, no): z = (zx, zy, nz)."""
+
+    so: Tensor
+    no: Tensor
+    zx: Tensor
+    zy: Tensor
+    nz: Tensor
+
+
+class Expansion(msgspec.Struct):
+    """The lobe about p*: JᵀJ with its determinant, c of (2), i*·z, n·i* and the derivatives of n·i by p."""
+
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+    det: Tensor
+    cx: Tensor
+    cy: Tensor
+    along: Tensor
+    ni: Tensor
+    nix: Tensor
+    niy: Tensor
+
+
 def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
     """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over n·i > 0, from tensors of one shape."""
-    return filtered(alpha, sharpness, gaussian_sharpness(sharpness), lobe_moments(sharpness)[1], no, nz, oz)
+    return filtered(alpha, Width(sharpness, gaussian_sharpness(sharpness), lobe_moments(sharpness)[1]), no, nz, oz)
 
 
-def filtered(alpha: Tensor, sharpness: Tensor, lam: Tensor, along_lobe: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
-    """`filtered_specular`, given λ' and the lobe's variance along its axis too."""
+def filtered(alpha: Tensor, width: Width, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
+    """`filtered_specular`, of a lobe whose moments are known."""
+    sharpness, lam = width.sharpness, width.plane
     alpha, no = alpha.clamp(LEAST_ALPHA, 1), no.clamp(LEAST_COSINE, 1)
     so = torch.sqrt((1 - no * no).clamp_min(1e-8))
     zx = (oz - no * nz) / so
     zy = torch.sqrt((1 - nz * nz - zx * zx).clamp_min(1e-8))
     k = (1 - alpha * alpha) / (alpha * alpha)
-    geometry = so, no, zx, zy, nz
-    px, py = _blend(k, lam, oz, *geometry)
-    px, py = _mode(k, lam, px, py, *geometry)
-    xx, yy, xy, det, cx, cy, along, ni, nix, niy = _expansion(lam, px, py, *geometry)
-    cx, cy = px + cx, py + cy
-    misfit = 0.5 * sharpness * (1 - along) ** 2
-    density, spread = _student(k, lam, xx, yy, xy, det, cx, cy, sharpness / lam, misfit)
+    directions = Directions(so, no, zx, zy, nz)
+    px, py = _blend(k, lam, oz, directions)
+    px, py = _mode(k, lam, px, py, directions)
+    at = _expansion(lam, px, py, directions)
+    misfit = 0.5 * sharpness * (1 - at.along) ** 2
+    density, spread = _student(k, lam, at, sharpness / lam, misfit)
     r = _curvature(k, px, py) / lam
-    total = _plus(xx, yy, det, r)
-    mx, my = _product(r, total, xx, yy, xy, cx, cy)
-    ni = ni + nix * (mx - px) + niy * (my - py)
-    variance = (nix * nix * (yy + r) + niy * niy * (xx + r) - 2 * nix * niy * xy) / total
-    deviation = torch.sqrt(variance / lam + along_lobe * ni * ni + 1e-8)
+    mx, my, total = _product(r, at)
+    ni = at.ni + at.nix * (mx - px) + at.niy * (my - py)
+    variance = (at.nix * at.nix * (at.yy + r) + at.niy * at.niy * (at.xx + r) - 2 * at.nix * at.niy * at.xy) / total
+    deviation = torch.sqrt(variance / lam + width.along * ni * ni + 1e-8)
     u = LOGISTIC * (ni / deviation).clamp_min(-20)
     lit = torch.sigmoid(u)
     cosine = deviation * softplus(u) / (LOGISTIC * lit)
     shadowed = lit * smith(alpha, cosine) * smith(alpha, no) / (4 * no)
     value = 2 / (lam * alpha * alpha) * density * shadowed
-    return Filtered(value, sharpness / lam, lam, px, py, misfit, density, spread, k * (cx * cx + cy * cy), ni, deviation, lit, cosine)
+    distance = k * (at.cx * at.cx + at.cy * at.cy)
+    return Filtered(value, sharpness / lam, lam, px, py, misfit, density, spread, distance, ni, deviation, lit, cosine)
 
 
-def _blend(k: Tensor, lam: Tensor, oz: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, Tensor]:
+def _blend(k: Tensor, lam: Tensor, oz: Tensor, directions: Directions) -> tuple[Tensor, Tensor]:
     """p between n and the half vector of o and z, by the widths and weights of light and D there (isotropic)."""
-    x, y, z = so + zx, zy, no + nz
+    x, y, z = directions.so + directions.zx, directions.zy, directions.no + directions.nz
     length = torch.sqrt(x * x + y * y + z * z + 1e-6)
     x, y, z = x / length, y / length, z / length
     variance = 1 / (lam * (2 + 2 * oz).clamp_min(LEAST_HALF))
@@ -115,33 +148,30 @@ def _blend(k: Tensor, lam: Tensor, oz: Tensor, so: Tensor, no: Tensor, zx: Tenso
     return x * scale, y * scale
 
 
-def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, *geometry: Tensor) -> tuple[Tensor, Tensor]:
+def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> tuple[Tensor, Tensor]:
     """One Gauss–Newton step from p to the mode of light times D: (JᵀJ + r)⁻¹ JᵀJ c, kept inside the disc."""
-    xx, yy, xy, det, cx, cy, *_ = _expansion(lam, px, py, *geometry)
-    cx, cy = px + cx, py + cy
-    r = _curvature(k, px, py) / lam
-    x, y = _product(r, _plus(xx, yy, det, r), xx, yy, xy, cx, cy)
+    at = _expansion(lam, px, py, directions)
+    x, y, _ = _product(_curvature(k, px, py) / lam, at)
     outside = torch.sqrt((x * x + y * y) / LARGEST_P + 1e-12).clamp_min(1.0)
     return x / outside, y / outside
 
 
-def _product(r: Tensor, total: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, cx: Tensor, cy: Tensor) -> tuple[Tensor, Tensor]:
-    """(JᵀJ + r)⁻¹ JᵀJ c: the mode of light about c times D about 0."""
+def _product(r: Tensor, at: Expansion) -> tuple[Tensor, Tensor, Tensor]:
+    """(JᵀJ + r I)⁻¹ JᵀJ c, the mode of light about c times D about 0, and the determinant |JᵀJ + r I|."""
+    total = at.det + r * (at.xx + at.yy) + r * r
     shrink = r / total
-    return cx - shrink * ((yy + r) * cx - xy * cy), cy - shrink * ((xx + r) * cy - xy * cx)
+    x = at.cx - shrink * ((at.yy + r) * at.cx - at.xy * at.cy)
+    return x, at.cy - shrink * ((at.xx + r) * at.cy - at.xy * at.cx), total
 
 
 def _curvature(k: Tensor, px: Tensor, py: Tensor) -> Tensor:
+    """Curvature of −log D at p, as the step to the mode takes it; PEAK says why."""
     return PEAK * k / (1 + k * (px * px + py * py))
 
 
-def _plus(xx: Tensor, yy: Tensor, det: Tensor, r: Tensor) -> Tensor:
-    """|JᵀJ + r I|."""
-    return det + r * (xx + yy) + r * r
-
-
-def _expansion(lam: Tensor, px: Tensor, py: Tensor, so: Tensor, no: Tensor, zx: Tensor, zy: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
-    """JᵀJ (xx, yy, xy, its determinant), its solution for Jᵀz, i·z, n·i and the derivatives of n·i, at p."""
+def _expansion(lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> Expansion:
+    """The lobe of width `lam` = λ' about p."""
+    so, no, zx, zy, nz = directions.so, directions.no, directions.zx, directions.zy, directions.nz
     hn = torch.sqrt((1 - px * px - py * py).clamp_min(LEAST_HN))
     oh = so * px + no * hn
     tx, ty = px / hn, py / hn
@@ -158,16 +188,18 @@ def _expansion(lam: Tensor, px: Tensor, py: Tensor, so: Tensor, no: Tensor, zx: 
     det = xx * yy - xy * xy
     det = det.clamp_min(1e-7)
     along = 2 * oh * (px * zx + py * zy + hn * nz) - (so * zx + no * nz)
-    return xx, yy, xy, det, (yy * bx - xy * by) / det, (xx * by - xy * bx) / det, along, 2 * oh * hn - no, 2 * xx3, 2 * yy3
+    cx, cy = px + (yy * bx - xy * by) / det, py + (xx * by - xy * bx) / det
+    return Expansion(xx, yy, xy, det, cx, cy, along, 2 * oh * hn - no, 2 * xx3, 2 * yy3)
 
 
-def _student(k, lam, xx, yy, xy, det, cx, cy, ratio, misfit) -> tuple[Tensor, Tensor]:
+def _student(k: Tensor, lam: Tensor, at: Expansion, ratio: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor]:
     """Σ of (1) with the factor of (2), and log |I + 2kV|; V = (λ' JᵀJ)⁻¹, exponents of the true λ = ratio λ'."""
-    volume = lam * det
-    trace = (xx + yy) / volume
+    cx, cy = at.cx, at.cy
+    volume = lam * at.det
+    trace = (at.xx + at.yy) / volume
     determinant = 1 / (volume * lam)
     square = cx * cx + cy * cy
-    across = (yy * cx * cx + xx * cy * cy - 2 * xy * cx * cy) / volume  # cᵀVc
+    across = (at.yy * cx * cx + at.xx * cy * cy - 2 * at.xy * cx * cy) / volume  # cᵀVc
     density = 0
     for rate, weight in GAUSSIANS:
         f = 2 * rate * k

@@ -100,8 +100,8 @@ def _lobe_table_of(sharpness: bytes) -> Tensor:
 def specular_on(tape: Tape) -> tuple[Value, tuple]:
     """The formula and the features, of inputs named as in PLACES."""
     names = ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")
-    alpha, _, _, _, no, nz, oz = inputs = [tape.input(name) for name in names]
-    form = filtered(*inputs)
+    alpha, sharpness, lam, along, no, nz, oz = (tape.input(name) for name in names)
+    form = filtered(alpha, Width(sharpness, lam, along), no, nz, oz)
     return form.value, specular_columns(alpha, no, nz, oz, form)
 
 

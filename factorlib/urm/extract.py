@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,6 +16,14 @@ from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint can be trusted
+
+
+class Taken(msgspec.Struct, frozen=True):
+    """A photo's name, the light it was taken in, and its exposure t·S/N² (time, ISO speed, f-number) from EXIF, None if unknown."""
+
+    photo: str
+    illumination: str
+    exposure: float | None = None
 
 
 def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float = 0.0) -> Bool[np.ndarray, "h w"]:
@@ -26,20 +35,13 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
 
 
 def observations_of_photo(
-    photo: Channels,
-    geometry: Channels,
-    *,
-    name: str,
-    illumination: str,
-    materials: Sequence[str],
-    least_confidence: float = 0.0,
-    exposure: float | None = None,
+    photo: Channels, geometry: Channels, taken: Taken, materials: Sequence[str], least_confidence: float = 0.0
 ) -> Observations:
     """One observation per observed pixel, in row order; `weight` is the confidence of its normal, 0 to 1.
 
     photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
     geometry:  channels normal.x/y/z, view.x/y/z, label, confidence of the stage `align`
-    exposure:  t·S/N² from EXIF, where it is known
+    least_confidence: 0 to 1; pixels whose normals are less certain are left out
     """
     seen = observed_pixels(photo, geometry, least_confidence)
     y, x = np.nonzero(seen)
@@ -59,9 +61,9 @@ def observations_of_photo(
         y=y.astype("i4"),
         weight=geometry["confidence"][seen],
         materials=tuple(materials),
-        photos=(name,),
-        illuminations=(illumination,),
-        exposures=(exposure,),
+        photos=(taken.photo,),
+        illuminations=(taken.illumination,),
+        exposures=(taken.exposure,),
     )
 
 

@@ -19,7 +19,7 @@ from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
-from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.observations import write_observations
 
 SIZE = 24
@@ -112,7 +112,7 @@ def _photo(made: Made, folders: dict, photo: str, seen: list[str], materials: li
     normal = _row_of_balls(seen, lambda m, n: n @ YUP_FROM_CAMERA)
     _masks_and_align(folders, photo, np.minimum(rgb, made.clip), rgb >= made.clip, label, normal)
     observations = observations_of_photo(
-        *(read_exr(folders[s] / f"{photo}.exr") for s in ("masks", "align")), name=photo, illumination=photo, materials=materials
+        *(read_exr(folders[s] / f"{photo}.exr") for s in ("masks", "align")), Taken(photo, photo), materials
     )
     write_observations(folders["urm"] / f"{photo}.parquet", observations)
     counts = {m: int((label == materials.index(m) + 1).sum()) for m in seen}

@@ -3,7 +3,7 @@ import pytest
 
 from factorlib.conventions import FRONT
 from factorlib.errors import InputError
-from factorlib.urm.extract import observations_of_photo
+from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import COLUMNS, concatenate, read_observations, write_observations
 
@@ -23,7 +23,7 @@ def photo_and_geometry(size=64):
 
 def observations(name="kitchen", illumination="kitchen", **changed):
     photo, geometry = photo_and_geometry()
-    return observations_of_photo({**photo, **changed}, geometry, name=name, illumination=illumination, materials=("red", "white"))
+    return observations_of_photo({**photo, **changed}, geometry, Taken(name, illumination), ("red", "white"))
 
 
 def test_a_pixel_is_observed_where_mask_and_mesh_agree():
