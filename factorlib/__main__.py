@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,7 +21,7 @@ from factorlib.runner.stop import heed_stops
 class Verbs(typer.core.TyperGroup):
     """A word that is no verb is the name of a stage."""
 
-    def resolve_command(self, ctx, args):
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Read a first word that is neither an option nor a verb as `stage <word>`."""
         if args and not args[0].startswith("-") and args[0] not in self.commands:
             args = ["stage", *args]

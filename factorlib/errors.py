@@ -6,6 +6,7 @@ expected, and how to mend it.  Everything else that is raised is a defect of thi
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from difflib import get_close_matches
 from os import PathLike
 
@@ -29,15 +30,15 @@ class InputError(ValueError):
         cure = f"\n  {self.cure}" if self.cure else ""
         return f"{where}{self.found}{cure}"
 
-    def __reduce__(self):  # survives the trip back from a worker process
+    def __reduce__(self) -> tuple:  # survives the trip back from a worker process
         return _rebuild, (self.found, self.file, self.key, self.cure)
 
 
-def _rebuild(found, file, key, cure):
+def _rebuild(found: str, file: str | PathLike | None, key: str | None, cure: str | None) -> InputError:
     return InputError(found, file=file, key=key, cure=cure)
 
 
-def did_you_mean(word: str, known) -> str:
+def did_you_mean(word: str, known: Iterable[object]) -> str:
     """A cure that names the nearest of the `known` words, or all of them.
 
     >>> did_you_mean("soruce", ["source", "target"])

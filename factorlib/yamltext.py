@@ -7,8 +7,9 @@ aliases, or is merely huge is refused when it passes a limit, not when memory or
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import yaml
@@ -66,7 +67,7 @@ class _Document:
         self.count, self.anchors, self.open = 0, {}, set()
         self.events = self._events(text)
 
-    def _events(self, text: str):
+    def _events(self, text: str) -> Iterator[yaml.Event]:
         try:
             parser = _Parser(text)
             try:
@@ -177,7 +178,7 @@ class _Document:
         if event.tag not in (None, "!", _TAG + kind):
             self._refuse(f"the tag {one_line(repr(event.tag))} is not known", event, keys, "delete the tag")
 
-    def _refuse(self, found: str, event: yaml.Event, keys: Keys, cure: str):
+    def _refuse(self, found: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
         raise InputError(found, file=at_line(self.path, event.start_mark.line + 1), key=key_path(keys), cure=cure)
 
 

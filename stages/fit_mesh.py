@@ -5,6 +5,7 @@ poses.json (poses in the fitted mesh's frame, with its `scale`), which SET="alig
 """
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 

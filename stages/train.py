@@ -3,6 +3,7 @@
 Writes specular.safetensors and diffuse.safetensors, training.parquet (the curve) and accuracy.json (held-out errors).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -105,7 +106,7 @@ def _checkpoint(inputs: Inputs, part: str) -> Checkpoint:
     return Checkpoint(inputs.unfinished / f"{part}.pt" if inputs.unfinished else None)
 
 
-def _report(progress: Progress, part: str, steps: int):
+def _report(progress: Progress, part: str, steps: int) -> Callable[[Step], None]:
     def report(point: Step) -> None:
         progress(
             point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)"

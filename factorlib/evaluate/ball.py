@@ -146,11 +146,11 @@ def _summed(light: Light, response: Float[np.ndarray, "n t"]) -> Float[np.ndarra
     return response @ level.reshape(-1, 3).astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
 
 
-def _g1(cosine, alpha):
+def _g1(cosine: np.ndarray, alpha: float) -> np.ndarray:
     return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2))
 
 
-def _ggx(cos_h, alpha):
+def _ggx(cos_h: np.ndarray, alpha: float) -> np.ndarray:
     return alpha**2 / (np.pi * (cos_h**2 * (alpha**2 - 1) + 1) ** 2)
 
 

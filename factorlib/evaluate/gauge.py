@@ -40,7 +40,7 @@ def gauge_factors(
     }
 
 
-def _ratio(cross, square):
+def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
     """cross / square, and 1 where there is nothing to scale."""
     square = np.asarray(square)
     return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)

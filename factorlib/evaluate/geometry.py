@@ -54,8 +54,8 @@ def rotation_angle_deg(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"])
     return float(np.degrees(2 * np.arcsin(min(1.0, chord / (2 * np.sqrt(2))))))
 
 
-def pose_error(estimate, truth) -> PoseError:
-    """Of two cam_from_object, each with `rotation` 3×3 and `translation` 3 (`Pose` of the dataset's schema)."""
+def pose_error(estimate: RigidLike, truth: RigidLike) -> PoseError:
+    """Of two cam_from_object, as `Pose` of the dataset's schema; the translations in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
     turned = rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float))

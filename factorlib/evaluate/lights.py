@@ -126,7 +126,14 @@ def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.minimum((t * n).astype(int), n - 1) for t, n in zip((row, column), mask.shape))
 
 
-def _scored_view(view, render, estimates, truths, names, seen) -> dict[str, dict[str, ScoredLight]]:
+def _scored_view(
+    view: str,
+    render: Callable[[Light], Samples],
+    estimates: Mapping[str, Light],
+    truths: Mapping[str, Light],
+    names: list[str],
+    seen: Mapping[str, np.ndarray],
+) -> dict[str, dict[str, ScoredLight]]:
     kept = {n: _part(view, seen.get(n)) for n in names}
     names = [n for n in names if kept[n] is not None]
     true = [render(truths[n])[kept[n]] for n in names]
@@ -140,7 +147,7 @@ def _scored_view(view, render, estimates, truths, names, seen) -> dict[str, dict
     }
 
 
-def _part(view: str, seen: Bool[np.ndarray, "t"] | None):
+def _part(view: str, seen: Bool[np.ndarray, "t"] | None) -> slice | np.ndarray | None:
     """The texels of a view: all of a sphere and of the whole map; None where a part of the map is empty or unknown."""
     if view not in ("map_mirrored", "map_unmirrored"):
         return slice(None)

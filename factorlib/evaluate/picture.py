@@ -96,7 +96,9 @@ def mean_error(errors: list[PictureError]) -> PictureError | None:
     return PictureError(*(round(float(np.mean([getattr(e, f) for e in errors])), 6) for f in PictureError.__struct_fields__))
 
 
-def _error_in(region, estimate, truth, shown, ssim, white) -> PictureError:
+def _error_in(
+    region: Mask, estimate: np.ndarray, truth: np.ndarray, shown: tuple[np.ndarray, np.ndarray], ssim: np.ndarray, white: float
+) -> PictureError:
     return PictureError(
         psnr_linear_db=psnr(estimate[region], truth[region], white),
         psnr_tonemapped_db=psnr(shown[0][region], shown[1][region], 1.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from shutil import rmtree
+from types import ModuleType
 from typing import Annotated
 
 import typer
@@ -35,7 +36,7 @@ def eames(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
     _write(set_, out or Path("data/eames"), seed, lights)
 
 
-def _write(set_, out: Path, seed: int, lights: Path | None) -> None:
+def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None) -> None:
     """Generate beside `out`, then put it in its place."""
     try:
         maps = sorted(path for path in lights.iterdir() if path.suffix.lower() in (".hdr", ".exr")) if lights else []

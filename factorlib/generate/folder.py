@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.focal import FILM_DIAGONAL
 from factorlib.images.transfer import srgb_encode
 from factorlib.images.write import write_image
+from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
@@ -76,19 +77,19 @@ def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> No
     write_text(path, "\n".join(lines) + "\n")
 
 
-def labels_of(meshes, camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
-    """The material label of each pixel; 255 where its square, or a quarter pixel beyond, shows more than one thing."""
+def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
+    """The material label of each pixel; 255 where its square, or a quarter pixel beyond, shows more than one material."""
     return whole_pixels(_subpixels(meshes, camera, poses).label)
 
 
-def object_masks(meshes, camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
+def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
     """Where each object fills at least half of the pixel."""
     number = _subpixels(meshes, camera, poses).object
     inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS].reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
-def _subpixels(meshes, camera: Camera, poses: list[Pose]) -> Maps:
+def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Maps:
     """Maps on a grid SUBPIXELS times finer, with one pixel of border all round."""
     window = camera.window(-1, -1, 1 / SUBPIXELS, (camera.width + 2) * SUBPIXELS, (camera.height + 2) * SUBPIXELS)
     return rasterise(meshes, window, poses)

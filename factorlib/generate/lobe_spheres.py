@@ -12,6 +12,7 @@ Material Reflectances of 1: the model is linear in them, and its colour channels
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -65,7 +66,7 @@ def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator, progress: 
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _normals(axis, sharpness: float, alpha: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+def _normals(axis: Float[np.ndarray, "3"], sharpness: float, alpha: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
     """Normals that the camera sees, the even ones and those of the highlight in turn.
 
     A normal's change turns the mirror direction twice as much: the highlight's are spread by √(α²/2 + 1/λ), half of what
@@ -83,7 +84,8 @@ def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _envmap(axis: Float[np.ndarray, "3"], sharpness: float):
+def _envmap(axis: Float[np.ndarray, "3"], sharpness: float) -> Any:
+    """A lobe of peak 1 as Mitsuba's emitter."""
     theta = np.arange(MAP_ROWS) / (MAP_ROWS - 1) * np.pi  # Mitsuba's rows
     radiance = np.exp(-2 * sharpness * np.sin(theta / 2) ** 2).astype(np.float32)
     bitmap = mitsuba().Bitmap(np.tile(radiance[:, None, None], (1, MAP_COLUMNS, 3)))
@@ -92,7 +94,7 @@ def _envmap(axis: Float[np.ndarray, "3"], sharpness: float):
     return mitsuba().load_dict({"type": "envmap", "bitmap": bitmap, "to_world": transform(rigid(turn, np.zeros(3)))})
 
 
-def _sensor(normal: Float[np.ndarray, "m 3"]):
+def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
     """One ray a pixel, toward the sphere's points of these normals, side by side in an image of one row."""
     film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
@@ -100,7 +102,7 @@ def _sensor(normal: Float[np.ndarray, "m 3"]):
     return mitsuba().load_dict({"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False)
 
 
-def _radiance(bsdf, light, sensor, seed: int) -> Float[np.ndarray, "m"]:
+def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, "m"]:
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
     ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})

@@ -6,6 +6,8 @@ that one routine makes triangles and smooth normals of them all.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
@@ -30,7 +32,7 @@ def sphere(radius: float = 0.6) -> Mesh:
 def blob() -> Mesh:
     """A smooth body without any symmetry: a ball with broad bumps of several heights."""
 
-    def radius(direction):
+    def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)
@@ -53,7 +55,7 @@ def bottle() -> Mesh:
 SHAPES = {"sphere": sphere, "vase": vase, "bottle": bottle, "blob": blob}
 
 
-def star(radius) -> Mesh:
+def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     """The surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
     theta = np.arange(1, ROWS) / ROWS * np.pi
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi

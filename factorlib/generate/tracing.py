@@ -70,7 +70,7 @@ def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Flo
     return matrix
 
 
-def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4)):
+def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4)) -> Any:
     """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"

@@ -58,7 +58,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
     )
 
 
-def _opened(path: str | Path, key: str | None):
+def _opened(path: str | Path, key: str | None) -> Any:
     try:
         import pillow_heif
     except ImportError as error:

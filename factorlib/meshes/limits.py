@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -24,7 +25,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The limit of a file in bytes."""
         return int(self.megabytes * 1e6)
 
-    def check(self, vertices: int, triangles: int, file) -> None:
+    def check(self, vertices: int, triangles: int, file: str | Path) -> None:
         """Raises InputError for more triangles, or more vertices than so many triangles can use."""
         for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, VERTICES_A_TRIANGLE * self.triangles, "vertices")):
             if count > most:

@@ -9,6 +9,8 @@ Duplicate vertices are one vertex here, by position.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -106,7 +108,7 @@ def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return starts[run] + within // counts[run], starts[run] + within % counts[run]
 
 
-def _chunks(sizes: np.ndarray):
+def _chunks(sizes: np.ndarray) -> Iterator[slice]:
     """Slices of consecutive items whose sizes sum to about PAIRS_AT_ONCE."""
     block = np.cumsum(sizes) // PAIRS_AT_ONCE
     edges = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])

@@ -59,7 +59,7 @@ def _statements(content: bytes) -> Iterator[tuple[int, str]]:
 class _Reader:
     """The state of an OBJ file while it is read line by line; numbers of vertices, faces and normals in flat arrays."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.vertices, self.vertex_normals = array("d"), array("d")
         self.faces, self.face_normals = array("q"), array("q")  # indices from 0; of vertex_normals, −1 for none
         self.part = array("q")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from factorlib.reading import one_line
 MOST_PARTS = 100_000  # of one file
 
 
-def check_count(parts: int, file) -> None:
+def check_count(parts: int, file: str | Path) -> None:
     """Raise InputError for more than MOST_PARTS parts in one file."""
     if parts > MOST_PARTS:
         raise InputError(f"has {parts:,} parts", file=file, cure=f"join parts of one material: at most {MOST_PARTS:,} are read")
@@ -24,7 +25,7 @@ def part_labels(
     parts: Mapping[str, str] | None,
     material: str | None,
     overrides: Mapping[str, str],
-    file,
+    file: str | Path,
 ) -> np.ndarray:
     """Material label (int16, from 1) of each part of a file, given the names it goes by.
 
@@ -42,7 +43,14 @@ def part_labels(
     return np.array([_label(each, materials, parts or {}, material, overrides, file) for each in names], dtype=np.int16)
 
 
-def _label(names, materials, parts, default, overrides, file) -> int:
+def _label(
+    names: tuple[str, ...],
+    materials: Sequence[str],
+    parts: Mapping[str, str],
+    default: str | None,
+    overrides: Mapping[str, str],
+    file: str | Path,
+) -> int:
     for mapping in (overrides, parts):
         chosen = {mapping[name] for name in names if name in mapping}
         if len(chosen) > 1:
@@ -61,6 +69,6 @@ def _called(names: Sequence[str]) -> str:
     return one_line(" / ".join(names)) or "(unnamed)"
 
 
-def _check_material(name: str, materials: Sequence[str], part: str | None, file) -> None:
+def _check_material(name: str, materials: Sequence[str], part: str | None, file: str | Path) -> None:
     if name not in materials:
         raise InputError(f"unknown material {name!r}", file=file, key=part, cure=did_you_mean(name, materials))

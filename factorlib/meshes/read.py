@@ -80,7 +80,7 @@ def read_soup(path: str | Path, limits: Limits) -> Soup:
     return check(soup, path)
 
 
-def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file) -> Mesh:
+def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
     """Welded, without zero-area and duplicate faces, consistently wound, with normals; InputError if nothing is left."""
     vertices, faces, keep = solid(soup, file)
     faces, face_label, supplied = faces[keep], face_label[keep], soup.normals[keep]
@@ -93,7 +93,7 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file) -> Mesh:
     return split_at_creases(vertices, faces, normals, face_label, is_open)
 
 
-def solid(soup: Soup, file) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Welded vertices, the faces by these, and which of the faces to keep; InputError if none."""
     vertices, faces = _used(soup)
     weld = welded(vertices)
@@ -111,7 +111,7 @@ def _used(soup: Soup) -> tuple[np.ndarray, np.ndarray]:
     return soup.vertices[used], faces.reshape(-1, 3)
 
 
-def good_faces(vertices: np.ndarray, faces: np.ndarray, file) -> np.ndarray:
+def good_faces(vertices: np.ndarray, faces: np.ndarray, file: str | Path) -> np.ndarray:
     """Which faces have an area and are no copy of an earlier one (in either winding); what is dropped is logged."""
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
@@ -70,7 +72,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
     return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
 
 
-def check(soup: Soup, file) -> Soup:
+def check(soup: Soup, file: str | Path) -> Soup:
     """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
     place that leaves no digits for the shape."""
     if len(soup.faces) == 0:
@@ -87,7 +89,7 @@ def check(soup: Soup, file) -> Soup:
     return soup
 
 
-def _check_extent(corners: Float[np.ndarray, "n 3"], file) -> None:
+def _check_extent(corners: Float[np.ndarray, "n 3"], file: str | Path) -> None:
     largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
     cure = "give it in another unit, about its own origin"
     if largest > LARGEST:

@@ -18,6 +18,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -54,7 +55,7 @@ class Fused:
         weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
         self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple:
         """A copy in another process compiles, or finds in the user's cache, its own."""
         return Fused, self.made_of
 
@@ -145,7 +146,7 @@ def source(part: str, features: int, width: int, depth: int) -> str:
 
 
 @lru_cache(maxsize=8)
-def compiled(part: str, features: int, width: int, depth: int):
+def compiled(part: str, features: int, width: int, depth: int) -> Callable:
     """The C function; kept in the user's cache by what it was made of."""
     compiler = shlex.split(os.environ.get("CC", "cc"))
     text = source(part, features, width, depth)

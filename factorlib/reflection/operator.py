@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import msgspec
 import torch
@@ -17,6 +17,24 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
 CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
+
+
+@runtime_checkable
+class LobesLike(Protocol):
+    """Lobes weight · exp(λ(ω·axis − 1)), as tensors or arrays: axis [p, 3] unit, sharpness λ [p], weight [p, 3]."""
+
+    axis: Any
+    sharpness: Any
+    weight: Any
+
+
+@runtime_checkable
+class MaterialLike(Protocol):
+    """A reflectance: diffuse k_d [3], specular k_s [3], roughness [] with α = roughness²."""
+
+    diffuse: Any
+    specular: Any
+    roughness: Any
 
 
 class Response(msgspec.Struct, frozen=True):
@@ -75,11 +93,12 @@ class Operator:
             by_specular = torch.autograd.grad(specular.sum(), [r, log_sharpness, views, nz, oz])
         return Response(diffuse.detach(), *by_diffuse, specular.detach(), *by_specular)
 
-    def __call__(self, lobes, material, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def __call__(
+        self, lobes: LobesLike, material: MaterialLike, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 3"]:
         """Radiance toward the viewer, in the units of the lobes' weights; differentiable in everything.
 
-        lobes:     .axis [p, 3] unit, .sharpness [p], .weight [p, 3]
-        material:  .diffuse [3], .specular [3], .roughness []
+
         normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
         """
         axis, sharpness, weight = (torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight))

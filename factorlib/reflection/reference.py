@@ -17,6 +17,7 @@ The diffuse part is one integral over i·z, its azimuthal integral being element
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -161,7 +162,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
 
 
-def over_circles(nodes: int, low: Tensor, high: Tensor, integrand) -> Float[Tensor, "b"]:
+def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, "b"]:
     """∫ over whole circles at radii [low, high]; limits [b, 1, 1]."""
     x, w = gauss(nodes, low.dtype)
     phi = 2 * math.pi * (torch.arange(2 * nodes, dtype=low.dtype) + 0.5) / (2 * nodes)
@@ -170,7 +171,9 @@ def over_circles(nodes: int, low: Tensor, high: Tensor, integrand) -> Float[Tens
     return (inner * w * (high - low)[:, :, 0]).sum(1)
 
 
-def over_arcs(nodes: int, low: Tensor, high: Tensor, integrand, cos_arc) -> Float[Tensor, "b"]:
+def over_arcs(
+    nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "b"]:
     """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], whose length goes like a root at both ends."""
     x, w = gauss(nodes, low.dtype)
     radius = low + (high - low) * (torch.sin(math.pi / 2 * x) ** 2)[None, :, None]

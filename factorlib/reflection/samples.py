@@ -7,6 +7,7 @@ direction with a spread of 2√(α²/2 + 1/λ) for two thirds, uniform on the sp
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +19,7 @@ from torch import Tensor
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.reference import converged, diffuse_quadrature
 
+Range = tuple[float, float]  # least and greatest
 GRAZING = 0.3  # n·o below which most of the hard cases lie
 
 
@@ -62,7 +64,7 @@ class DiffuseSamples(msgspec.Struct, frozen=True):
         return len(self.sharpness)
 
 
-def diffuse_samples(count: int, seed: int, *, sharpness=(0.3, 5000.0)) -> DiffuseSamples:
+def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) -> DiffuseSamples:
     """Sharpness log-uniform; n·z uniform for one half, within three widths of the horizon for the other."""
     u = torch.from_numpy(qmc.Sobol(3, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count])
     lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 0]
@@ -73,7 +75,7 @@ def diffuse_samples(count: int, seed: int, *, sharpness=(0.3, 5000.0)) -> Diffus
 
 
 def specular_inputs(
-    count: int, seed: int, *, alpha=(0.01, 1.0), sharpness=(0.3, 5000.0), least_no: float = 0.02, grazing: bool = False
+    count: int, seed: int, *, alpha: Range = (0.01, 1.0), sharpness: Range = (0.3, 5000.0), least_no: float = 0.02, grazing: bool = False
 ) -> tuple[Tensor, ...]:
     """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence.
 
@@ -91,8 +93,8 @@ def specular_inputs(
     return tuple(torch.from_numpy(t.copy()) for t in (a, lam, no, z[:, 2], (z * view).sum(1)))
 
 
-def specular_samples(count: int, seed: int, *, tolerance: float, **ranges) -> Samples:
-    """Samples with their reference values, converged to `tolerance`."""
+def specular_samples(count: int, seed: int, *, tolerance: float, **ranges: Any) -> Samples:
+    """Samples with their reference values, converged to `tolerance`; ranges: as of `specular_inputs`."""
     inputs = specular_inputs(count, seed, **ranges)
     return Samples(*inputs, converged(*inputs, tolerance=tolerance))
 

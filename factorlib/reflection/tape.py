@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -22,7 +24,7 @@ C = {
 class Tape:
     """Operations in the order they were first needed: operation k is `ops[k]` = (name, arguments), arguments being k or float."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.ops: list[tuple[str, tuple]] = []
         self.known: dict[tuple, int] = {}
 
@@ -30,7 +32,7 @@ class Tape:
         """The input of that name, on the tape once however often it is asked for."""
         return self._record("input", (name,))
 
-    def apply(self, name: str, *arguments) -> Value | float:
+    def apply(self, name: str, *arguments: Value | float) -> Value | float:
         """Record operation `name` of C on values or numbers; a number where all arguments are."""
         arguments = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
         plain = _simplified(name, arguments)
@@ -110,7 +112,7 @@ class Value:
     def __init__(self, tape: Tape, index: int):
         self.tape, self.index = tape, index
 
-    def _(name, swap=False):
+    def _(name: str, swap: bool = False) -> Callable[[Any, Any], Any]:
         return (
             (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
         )
@@ -119,22 +121,22 @@ class Value:
     __mul__, __rmul__, __truediv__, __rtruediv__ = _("mul"), _("mul", True), _("div"), _("div", True)
     clamp_min, clamp_max = _("max"), _("min")
 
-    def __neg__(self):
+    def __neg__(self) -> Value:
         return 0.0 - self
 
-    def __pow__(self, exponent: int):
+    def __pow__(self, exponent: int) -> Value:
         return self * self if exponent == 2 else NotImplemented
 
-    def clamp(self, low: float, high: float):
+    def clamp(self, low: float, high: float) -> Value:
         """As torch's."""
         return self.clamp_min(low).clamp_max(high)
 
-    def sqrt(self):
+    def sqrt(self) -> Value:
         """As torch's."""
         return self.tape.apply("sqrt", self)
 
     @classmethod
-    def __torch_function__(cls, function, types, arguments=(), keywords=None):
+    def __torch_function__(cls, function: Callable, types: Any, arguments: tuple = (), keywords: dict | None = None) -> Any:
         x = arguments[0]
         compound = {
             torch.rsqrt: lambda: 1.0 / x.sqrt(), torch.sigmoid: lambda: 1.0 / (1.0 + x.tape.apply("exp", -x)),

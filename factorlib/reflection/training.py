@@ -47,7 +47,7 @@ class Problem(msgspec.Struct, frozen=True):
     exact: Float[Tensor, "n"]
     unit: Float[Tensor, "n"]
 
-    def rows(self, index) -> Problem:
+    def rows(self, index: Tensor) -> Problem:
         """The problem of some samples, by index [k]."""
         return Problem(*(getattr(self, name)[index] for name in self.__struct_fields__))
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_closing
 
 from factorlib.conventions import FRONT
+from factorlib.reflection.operator import MaterialLike
 from factorlib.render.reflect import Reflector
 
 GAP = 6  # cells: the widest gap between observed normals that counts as observed
@@ -28,7 +29,7 @@ def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, 
     return np.stack([x, y, -np.sqrt(1 - x * x - y * y)], axis=-1), inside
 
 
-def ball(reflector: Reflector, material, size: int) -> Float[np.ndarray, "size size 3"]:
+def ball(reflector: Reflector, material: MaterialLike, size: int) -> Float[np.ndarray, "size size 3"]:
     """Radiance; zero beside the ball."""
     normals, inside = ball_normals(size)
     picture = np.zeros((size, size, 3))

@@ -24,6 +24,7 @@ from torch import Tensor
 from factorlib.light.lobes import Lobes
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.reflection import Operator, reflection_operator
+from factorlib.reflection.operator import MaterialLike
 
 TAIL = 0.005
 NODES = 1024  # of n·z in a lobe's table
@@ -42,7 +43,7 @@ class Shadows(msgspec.Struct, frozen=True):
     directions: Float[np.ndarray, "k 3"]
     which: Int[np.ndarray, "n"] | None = None
 
-    def take(self, rows) -> Shadows:
+    def take(self, rows: slice | np.ndarray) -> Shadows:
         """Those of some points, a row for each."""
         return Shadows(self.visibility[rows if self.which is None else self.which[rows]], self.directions)
 
@@ -59,7 +60,7 @@ class Reflector:
 
     def __call__(
         self,
-        material,
+        material: MaterialLike,
         normals: Float[np.ndarray, "n 3"],
         views: Float[np.ndarray, "n 3"],
         report: Report = lambda done, total: None,
@@ -78,7 +79,7 @@ class Reflector:
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
 
-    def _radiance(self, material, normals: Tensor, views: Tensor, shadows: Shadows | None) -> Float[Tensor, "n 3"]:
+    def _radiance(self, material: MaterialLike, normals: Tensor, views: Tensor, shadows: Shadows | None) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
         diffuse_seen, specular_seen = (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))

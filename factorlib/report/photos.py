@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.picture import picture
 from factorlib.images.transfer import srgb_encode
-from factorlib.report.artifacts import Artifacts, Channels
+from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
 from factorlib.results.metrics import PhotoErrors
 
@@ -85,7 +85,7 @@ def _labels(masks: Channels, geometry: Channels, photo: np.ndarray, tags: list[s
     return shown
 
 
-def _difference(photo, found, exposure: float, masks: Channels, geometry: Channels) -> Float[np.ndarray, "h w 4"]:
+def _difference(photo: Picture, found: Picture, exposure: float, masks: Channels, geometry: Channels) -> Float[np.ndarray, "h w 4"]:
     """Grey where equal, brighter where the re-synthesis is too bright, in display values; uncounted pixels violet."""
     shown = 0.5 + AMPLIFICATION * (_display(found, exposure) - _display(photo, exposure))
     clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)

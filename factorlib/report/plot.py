@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 
 import msgspec
 
 WIDTH, HEIGHT = 560, 240
 LEFT, RIGHT, TOP, BOTTOM = 58, 20, 12, 40
+Scale = Callable[[float], float]  # from a value to its place in the picture, pixels
 
 
 class Series(msgspec.Struct, frozen=True):
@@ -82,11 +83,11 @@ def _padded(low: float, high: float) -> tuple[float, float]:
     return low - extra, high + extra
 
 
-def _scale(low: float, high: float, start: float, end: float):
+def _scale(low: float, high: float, start: float, end: float) -> Scale:
     return lambda value: start + (value - low) / ((high - low) or 1.0) * (end - start)
 
 
-def _y_axis(up, low: float, high: float, log_y: bool) -> list[str]:
+def _y_axis(up: Scale, low: float, high: float, log_y: bool) -> list[str]:
     found = []
     for value in log_ticks(low, high) if log_y else ticks(low, high):
         y, text = up(value), f"{10**value:.3g}" if log_y else f"{value:g}"
@@ -95,14 +96,14 @@ def _y_axis(up, low: float, high: float, log_y: bool) -> list[str]:
     return found
 
 
-def _x_axis(across, low: float, high: float, names: Sequence[str]) -> list[str]:
+def _x_axis(across: Scale, low: float, high: float, names: Sequence[str]) -> list[str]:
     base = HEIGHT - BOTTOM
     marks = list(enumerate(names)) if names else [(v, f"{v:g}") for v in ticks(low, high, 8)]
     found = [f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{base}" y2="{base}"/>']
     return found + [f'<text x="{across(v):.1f}" y="{base + 14}" text-anchor="middle">{escape(text)}</text>' for v, text in marks]
 
 
-def _polyline(line: list[tuple[float, float]], k: int, across, up, log_y: bool) -> str:
+def _polyline(line: list[tuple[float, float]], k: int, across: Scale, up: Scale, log_y: bool) -> str:
     at = " ".join(f"{across(x):.1f},{up(math.log10(y) if log_y else y):.1f}" for x, y in line)
     dots = "".join(f'<circle cx="{a.split(",")[0]}" cy="{a.split(",")[1]}" r="2.2"/>' for a in at.split()) if len(line) <= 40 else ""
     return f'<g class="s{k}"><polyline points="{at}"/>{dots}</g>'

@@ -12,7 +12,7 @@ import time
 class Meter:
     """Started where it is made."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         _reset_peak()
         self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()

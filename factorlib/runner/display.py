@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import TextIO
 
 from factorlib.runner.plan import Planned, Step
 
@@ -13,7 +14,7 @@ BEAT = 10.0  # seconds between two plain lines about the same step
 class Display:
     """Plain lines: what starts, what it warns of, how long it took."""
 
-    def __init__(self, stream=None):
+    def __init__(self, stream: TextIO | None = None):
         self.stream = stream or sys.stderr
         self.totals: dict[str, int] = {}
         self.left: dict[str, int] = {}

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from factorlib import arithmetic
 from factorlib.runner.stop import whole
@@ -78,7 +78,7 @@ class _OfWorkers:
         self.before = {name: os.environ.get(name) for name in self.VARIABLES}
         os.environ.update(self.VARIABLES)
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         for name, value in self.before.items():
             if value is None:
                 del os.environ[name]

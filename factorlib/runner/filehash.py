@@ -65,7 +65,7 @@ class FileHashes:
         """What `parse` makes of a file of source, remembered; type_: what that is."""
         return self._remembered(self._sources, path, parse, type_)
 
-    def _remembered(self, table: dict, path: Path, make: Callable, type_: type):
+    def _remembered(self, table: dict, path: Path, make: Callable, type_: type) -> Any:
         now = signature(path)
         known = _known(table.get(str(path)), now, type_)
         if known is not None:

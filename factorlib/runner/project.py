@@ -68,11 +68,11 @@ def photo_sets() -> Provider:
     return Provider(SLICES, read)
 
 
-def _looking_at(dataset) -> Callable[..., list[InputError]]:
+def _looking_at(dataset: Any) -> Callable[..., list[InputError]]:
     """`factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
 
     @cache
-    def validation():
+    def validation() -> Any:
         return importlib.import_module("factorlib.validation").Validation(dataset)
 
     return lambda *arguments: validation().faults(*arguments)

@@ -14,7 +14,7 @@ _waiting: list[int] | None = None  # signals that came while nothing may be inte
 class Stopped(SystemExit):
     """SIGTERM came."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__(TERMINATED)
 
 

@@ -21,6 +21,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -117,7 +118,7 @@ class Outputs(Mapping):
         self.damaged: dict[str, list[str]] = {}
         self._known: dict[str, str] = {}
 
-    def get(self, key, default=None):
+    def get(self, key: str, default: Any = None) -> Any:
         """Tree hash of a key; `default` where there is no result, or its tree is damaged (then `damaged` says how)."""
         if key not in self._known:
             entry = self.store.entry(key)
@@ -140,7 +141,7 @@ class Outputs(Mapping):
         now = {key: self.get(key) for key in before}
         return None not in now.values() and now == before
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: str) -> str:
         found = self.get(key)
         if found is None:
             raise KeyError(key)
@@ -149,7 +150,7 @@ class Outputs(Mapping):
     def __iter__(self) -> Iterator[str]:
         return (path.stem for path in self.store.keys.glob("*.json"))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return sum(1 for _ in self)
 
 

@@ -254,7 +254,7 @@ class Events(logging.Handler):
             logging.getLogger(name).propagate = False
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         for name in ("factorlib", "py.warnings"):
             logging.getLogger(name).removeHandler(self)
         with contextlib.suppress(OSError):  # what could not be said, see `_say`

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pycolmap
@@ -63,7 +64,7 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
     return [_shot(f"frames[{index}]", frame, lens_of(frame, content), said) for index, frame in enumerate(content.frames)]
 
 
-def read_source(file: Path, type_: type, key: str | None = None):
+def read_source(file: Path, type_: type, key: str | None = None) -> Any:
     """A json as a value of `type_`.  Raises InputError that names file and key."""
     text = read_text(file, "a JSON file", key, MOST_BYTES)
     with reading("JSON", file, key):
