@@ -15,7 +15,7 @@ DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another
 
 
 class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a pose is held to."""
+    """What a pose must reach to be believed."""
 
     least_iou: Share = 0.7
     """Overlap (intersection over union) of mesh and mask below which a pose is doubtful."""

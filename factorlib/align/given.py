@@ -1,4 +1,4 @@
-"""What is given of a photo, held against the photo: a pose puts its object before the camera, a camera fits the picture, and
+"""Checks of what is given for a photo against the photo: a pose puts its object before the camera, a camera fits the picture, and
 every material of the mask is some object's."""
 
 from __future__ import annotations

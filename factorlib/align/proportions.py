@@ -29,7 +29,7 @@ from factorlib.meshes.mesh import Mesh, scaled
 
 SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d
 DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3, 0.1, 0.1]) ** -2.0  # as of `refine`, and of d
-MOST = 0.15  # of a step
+LARGEST_STEP = 0.15  # of a step
 STILL = 1e-4  # a step of d that ends the descent
 PARTS = 4  # that are left out in turn, at most
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -163,10 +163,10 @@ def joint_step(each: Sequence[tuple[Sighting, Equations]]) -> tuple[Float[np.nda
         shared = shared + equations.information[7:, 7:] - cross.T @ away[:, :2]
         pull = pull + equations.gradient[7:] - cross.T @ away[:, 2]
         own.append((free, away))
-    by_shape = np.clip(-np.linalg.solve(shared, pull), -MOST, MOST)
+    by_shape = np.clip(-np.linalg.solve(shared, pull), -LARGEST_STEP, LARGEST_STEP)
     moves = []
     for free, away in own:
         move = np.zeros(7)
-        move[:free] = np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * MOST, 2 * MOST)
+        move[:free] = np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP)
         moves.append(move)
     return by_shape, moves

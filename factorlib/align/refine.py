@@ -31,7 +31,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Hits
 
 CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
-LEAST_SCALE = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
+LEAST_SPREAD = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
 HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
 MOST_SCALE = 0.05  # of the mask's extent
 
@@ -125,8 +125,8 @@ def normal_equations(
             residuals.append(residual)
             rows.append(row)
     residual, row = np.concatenate(residuals), np.concatenate(rows)
-    spread = 1.4826 * np.median(np.abs(residual)) if len(residual) else LEAST_SCALE
-    scale = float(np.clip(spread, LEAST_SCALE, max(MOST_SCALE * target.extent, LEAST_SCALE)))
+    spread = 1.4826 * np.median(np.abs(residual)) if len(residual) else LEAST_SPREAD
+    scale = float(np.clip(spread, LEAST_SPREAD, max(MOST_SCALE * target.extent, LEAST_SPREAD)))
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
     if prior.sigma > 0:

@@ -1,6 +1,6 @@
 """How far a pose is to be believed, from the mask alone.
 
-contour_error      overlap says little of a big round thing and much of a thin one; distance between contours is fair to both.
+contour_error      overlap says little of a big round object and much of a thin one; distance between contours is fair to both.
                    The median over all contour points, of mesh and mask, so that parts that one of the two lacks do not count.
 normal_stderr_deg  the pose's standard errors, by the normal equations of its contours, moved one after another: how far the
                    normals in the mask turn.  Turns that show nothing new, as of a sphere, cost nothing.  Large for few pixels.

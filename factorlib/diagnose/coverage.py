@@ -22,8 +22,8 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes
 from factorlib.model.loss import Loss
 
-SHARPNESS = 100.0  # of the lobes that are asked about
-WIDTH_DEG = float(np.degrees(np.sqrt(2 / SHARPNESS)))  # where such a lobe has fallen to 1/e: 8°
+PROBE_SHARPNESS = 100.0  # of the lobes that are asked about
+WIDTH_DEG = float(np.degrees(np.sqrt(2 / PROBE_SHARPNESS)))  # where such a lobe has fallen to 1/e: 8°
 ROWS, LARGEST = 32, 1000.0
 SAMPLE = 1000  # observations that stand for all
 
@@ -51,7 +51,7 @@ def light_standard_errors(
     count = len(illumination.block)
     rows = np.sort(np.random.default_rng(0).permutation(count)[:SAMPLE])
     sample = msgspec.structs.replace(illumination, block=illumination.block.take(rows).with_none_held_out())
-    atoms = sample.atoms(np.arange(len(rows)), UnitLobes(directions, np.full(len(directions), SHARPNESS)))
+    atoms = sample.atoms(np.arange(len(rows)), UnitLobes(directions, np.full(len(directions), PROBE_SHARPNESS)))
     information = [_information(atoms[c], jacobian) for c, jacobian in enumerate(_jacobians(sample, loss))]
     with np.errstate(divide="ignore"):
         return sigma / np.sqrt(np.stack(information, 1) * count / len(rows))

@@ -1,4 +1,4 @@
-"""What may be scaled before two things are compared.
+"""What may be scaled before an estimate is compared with the truth.
 
 A factor per colour channel can move between all materials and all lights that are linked by observations, and the
 exposure of a photo is not known: so an error is quoted three times.

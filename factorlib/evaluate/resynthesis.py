@@ -52,10 +52,10 @@ def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
         "uncovered": valid & ~observed,
         "invalid": left_out | ((label > 0.5) & ~valid),
     }
-    held = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
+    satisfied = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
     return Shot(
         rgb, resynthesis, label, pixels, white_of(rgb, pixels), {k: int(v.sum()) for k, v in counts.items()},
-        float(held.mean()) if bounds.any() else None,
+        float(satisfied.mean()) if bounds.any() else None,
     )  # fmt: skip
 
 
@@ -65,7 +65,7 @@ def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h 
 
 
 def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[str], Shot]) -> Resynthesis:
-    """Errors of all photos; `shot` reads one by name, and only one is held at a time but for its counted pixels."""
+    """Errors of all photos; `shot` reads one by name, and only one is in memory at a time but for its counted pixels."""
     factors = _factors(list(names), shot)
     photos = {name: _photo_errors(shot(name), materials, factor) for name, factor in factors.items()}
     scored = [p.gauges for p in photos.values() if p.gauges]

@@ -1,4 +1,4 @@
-"""The maps of a truth, read and held against what they are of: a true light is radiance, true normals have the photo's pixels."""
+"""The maps of a truth, read and checked against what they describe: a true light is radiance, true normals have the photo's pixels."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from factorlib.generate.tracing import SAMPLER, rgb, rigid, transform
 
 MAP_ROWS, MAP_COLUMNS = 2048, 8
 SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
-LEAST_COSINE = 0.01  # n·o of a pixel
+LEAST_FACING = 0.01  # n·o of a pixel
 ALPHA, SHARPNESS = (0.008, 1.0), (0.05, 1e4)  # log-uniform
 
 Progress = Callable[[int, int], None]
@@ -75,7 +75,7 @@ def _normals(axis: Float[np.ndarray, "3"], sharpness: float, alpha: float, count
     angle, radius = rng.uniform(0, 2 * np.pi, 4 * count), np.sqrt(rng.uniform(0, 1, 4 * count))
     even = np.stack([radius * np.cos(angle), radius * np.sin(angle), -np.sqrt(1 - radius**2)], axis=-1)
     highlight = _unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
-    even, highlight = (n[n @ FRONT > LEAST_COSINE] for n in (even, _unit(highlight)))
+    even, highlight = (n[n @ FRONT > LEAST_FACING] for n in (even, _unit(highlight)))
     half = min(count // 2, len(highlight))  # none is seen of a light right behind the sphere
     return np.concatenate([even[: count - half], highlight[:half]])
 

@@ -39,12 +39,12 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
     picture = _opened(path, key)
     info, (width, height) = picture.info, picture.size
     _refuse_video(info, path, key)
-    held: list[np.ndarray] = []
+    cached: list[np.ndarray] = []
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
-        if not held:
-            held.append(_decoded(picture, path, key))
-        return held[0][begin:end]
+        if not cached:
+            cached.append(_decoded(picture, path, key))
+        return cached[0][begin:end]
 
     return Stored(
         width=width,

@@ -7,7 +7,7 @@ Channels      one is grey; alpha is dropped.
 Clipped       integer codes from CLIPPED of the range (254 of 255) on; of a raw file, what the sensor's white level cut.
               A float file has no top code; what is not finite in it is no pixel.
 Size          a photo can be averaged down by a whole factor (`boxes`) while it is read, so that no more than some rows of it
-              are ever held: radiance by its linear mean; clipped where any part is; finite where any part is.
+              are ever in memory: radiance by its linear mean; clipped where any part is; finite where any part is.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from factorlib.images.scanlines import open_scanlines
 from factorlib.images.stored import Stored
 from factorlib.images.transfer import decoder
 
-READ_AT_ONCE = 1 << 21  # pixels of the rows that are held as floats
+READ_AT_ONCE = 1 << 21  # pixels of the rows that are in memory as floats
 log = logging.getLogger("factorlib.images")
 
 

@@ -35,16 +35,16 @@ def is_raw(path: str | Path) -> bool:
 def open_raw(path: str | Path, key: str | None) -> Stored:
     """Raises InputError for a file that LibRaw cannot read."""
     rawpy, sensor = _opened(path, key)
-    sizes, held = sensor.sizes, {}
+    sizes, cached = sensor.sizes, {}
     top, left, height, width = _crop(sizes)
 
     def developed() -> dict[str, np.ndarray]:
-        if not held:
+        if not cached:
             with sensor:
                 pixels, saturated = _developed(rawpy, sensor, path, key), _saturated(sensor)
             inner = slice(top, top + height), slice(left, left + width)
-            held.update(pixels=pixels[inner], saturated=saturated[inner])
-        return held
+            cached.update(pixels=pixels[inner], saturated=saturated[inner])
+        return cached
 
     return Stored(
         width=width,

@@ -53,13 +53,13 @@ def _reader(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], p
 
 
 def _of_tiles(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None) -> Rows:
-    """A file of tiles has no scanlines: it is held whole, in its own type."""
-    held: list[np.ndarray] = []
+    """A file of tiles has no scanlines: it is in memory as a whole, in its own type."""
+    cached: list[np.ndarray] = []
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
-        if not held:
-            held.append(_checked(source, source.read_image(spec.format), path, key)[..., colours])
-        return held[0][begin:end]
+        if not cached:
+            cached.append(_checked(source, source.read_image(spec.format), path, key)[..., colours])
+        return cached[0][begin:end]
 
     return rows
 

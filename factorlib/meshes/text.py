@@ -27,7 +27,7 @@ def lines_of(content: bytes) -> Iterator[str]:
 
 
 def check_length(letters: int) -> None:
-    """Words of a line are held one by one: ValueError for more of them than any polygon has corners."""
+    """Words of a line are objects of their own: ValueError for more of them than any polygon has corners."""
     if letters > LONGEST:
         raise ValueError(f"a line of more than {LONGEST:,} letters")
 

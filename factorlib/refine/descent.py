@@ -35,7 +35,7 @@ RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
 EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
 DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
-MOST = 0.1  # of a step
+LARGEST_STEP = 0.1  # of a step
 
 
 class Moving(msgspec.Struct, frozen=True):
@@ -120,7 +120,7 @@ def _step(
     hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
     step = np.zeros(7)
     step[:free] = -np.linalg.solve(hessian, contours.gradient[:free] + gradient)
-    return np.clip(step, -MOST, MOST)
+    return np.clip(step, -LARGEST_STEP, LARGEST_STEP)
 
 
 def photometric_jacobian(moving: Moving, state: State, seen: Seen, light: Light, free: int) -> Float[np.ndarray, "n 3 k"]:

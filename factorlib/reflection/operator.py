@@ -16,7 +16,7 @@ Name = Literal["reference", "closed_form", "network", "paper_network"]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
-CHUNK = 1 << 14  # evaluations whose intermediate results are held at once
+CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
 
 
 @runtime_checkable

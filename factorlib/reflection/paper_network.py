@@ -17,7 +17,7 @@ Linearity     k · w multiplies what the other inputs give, and so does the lobe
 Depth         three hidden layers for the specular part, two for the diffuse one.
 Activation    SiLU, so that derivatives are continuous; at the end s tanh(x/s), s = 8, and an exponential: radiance is
               never negative, and bounded.
-Range         sharpness and roughness are held within what was rendered, `SHARPNESS` and `ROUGHNESS`.
+Range         sharpness and roughness are clamped to what was rendered, `SHARPNESS` and `ROUGHNESS`.
 Pixels        50 of each of 4000 spheres, lobes uniform in direction, seen from afar, so that every view is (0, 0, −1):
               `factorlib.generate.lobe_spheres`; Mitsuba renders them in place of Blender.
 Training      `paper_training`: relative error, Adam.

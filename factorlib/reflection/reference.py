@@ -1,4 +1,4 @@
-"""The reflection of one lobe by quadrature in float64: slow, obvious, and what the others are held to.
+"""The reflection of one lobe by quadrature in float64: slow, obvious, and what the others are compared with.
 
 The specular part ∫_{n·i>0} SG(i) D(h) G1(n·i) di · G1(n·o) / (4 n·o) has two sharp factors, each symmetric about its own
 axis, and one quadrature in polar coordinates about each:

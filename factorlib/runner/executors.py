@@ -27,7 +27,7 @@ class Pools:
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or _cores()
-        self._idle: dict[int, list[Executor]] = {}
+        self._spare: dict[int, list[Executor]] = {}
         self._busy: dict[Future, tuple[int, Executor]] = {}
 
     def free(self, cores: int) -> bool:
@@ -36,8 +36,8 @@ class Pools:
 
     def submit(self, cores: int, threads: int, function: Callable, *arguments) -> Future:
         with whole(), _OfWorkers():
-            idle = self._idle.setdefault(threads, [])
-            executor = idle.pop() if idle else _executor(threads)
+            spare = self._spare.setdefault(threads, [])
+            executor = spare.pop() if spare else _executor(threads)
             try:
                 future = executor.submit(function, *arguments)
             except BrokenProcessPool:  # its process was killed while it had nothing to do

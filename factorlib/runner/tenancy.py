@@ -39,7 +39,7 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def alone(store: Store) -> Iterator[None]:
-    """For what takes things away: no run goes on, and none starts meanwhile."""
+    """For what deletes results: no run goes on, and none starts meanwhile."""
     store.tmp.mkdir(parents=True, exist_ok=True)
     with _door(store, lambda _: None):
         sweep(store)

@@ -22,7 +22,7 @@ from factorlib.runner.views import gathered
 
 
 class Damage(msgspec.Struct, frozen=True):
-    """where: the folder or file;  what: a line for each thing that is wrong;  steps: whose result it is, as `masks/kitchen (eames)`."""
+    """where: the folder or file;  what: a line for each fault;  steps: whose result it is, as `masks/kitchen (eames)`."""
 
     where: Path
     what: list[str]

@@ -34,7 +34,7 @@ from factorlib.solve.thresholds import FAR_BEHIND, HALVED, LEAST_DECREASE
 
 A_LOBE = 60  # observations for each lobe of a light, that it may not explain their noise
 ROBUST = 2.0  # standard deviations: beyond lies what a light of few lobes cannot show
-LEAST_SCALE = 0.02
+LEAST_ROBUST_SCALE = 0.02
 PATIENCE = 2  # rounds that may gain nothing
 
 
@@ -165,12 +165,12 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
 
 
 def robust(problem: JointProblem, point: Point) -> Loss:
-    """The loss with `ROBUST` robust standard deviations of the current residual as its scale, at least `LEAST_SCALE` of the noise model's σ.
+    """The loss with `ROBUST` robust standard deviations of the current residual as its scale, at least `LEAST_ROBUST_SCALE` of the noise model's σ.
 
     What a light of few lobes cannot show stands out from the rest long before it exceeds the noise model, and bends the materials.
     """
     absolute = np.abs(np.concatenate(problem.residuals(point)))
-    scale = max(ROBUST * 1.4826 * float(np.median(absolute)), LEAST_SCALE)
+    scale = max(ROBUST * 1.4826 * float(np.median(absolute)), LEAST_ROBUST_SCALE)
     return msgspec.structs.replace(problem.loss, robust_scale=scale)
 
 

@@ -16,19 +16,19 @@ from factorlib.model.bounds import LEAST_REFLECTANCE
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 
-BRIGHTEST = 0.7  # reflectance of the brightest material at the start; the gauge settles it in the end
+BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start; the gauge settles it in the end
 
 
 def starting_materials(blocks: Sequence[Block], count: int, specular_share: float, roughness: float) -> Materials:
     """Materials whose diffuse part explains the mean radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - specular_share), 10 * LEAST_REFLECTANCE)
-    specular = np.maximum(np.full((count, 3), specular_share * BRIGHTEST / 2), 10 * LEAST_REFLECTANCE)
+    specular = np.maximum(np.full((count, 3), specular_share * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
     return Materials(diffuse, specular, np.full(count, roughness))
 
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
-    """Relative reflectance per material and channel, the largest being `BRIGHTEST`; unseen materials get the middle one."""
+    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; unseen materials get the middle one."""
     rows, right, weight = [], [], []
     for i, block in enumerate(blocks):
         for m in np.unique(block.material):
@@ -42,7 +42,7 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
     logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
     seen = np.array(rows)[:, :count].any(0)
     logs[~seen] = np.median(logs[seen], axis=0)
-    return BRIGHTEST * np.exp(logs - logs.max())
+    return BRIGHTEST_AT_START * np.exp(logs - logs.max())
 
 
 def starting_light(block: Block, materials: Materials) -> Light:

@@ -20,7 +20,7 @@ from factorlib.urm.cells import groups
 from factorlib.urm.observations import Observations
 
 HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
-ROWS = 1 << 16  # observations whose visibility is held as floats
+ROWS = 1 << 16  # observations whose visibility is in memory as floats
 
 
 def merge(observations: Observations, degrees: float) -> Observations:
