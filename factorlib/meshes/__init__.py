@@ -1,6 +1,6 @@
 """Meshes: files to labelled triangles with smooth normals, and back to PLY.
 
-from factorlib.meshes import Mesh, read_mesh, write_ply
+>>> from factorlib.meshes import Mesh, read_mesh, write_ply
 """
 
 from factorlib.meshes.mesh import Mesh

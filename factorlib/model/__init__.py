@@ -1,11 +1,11 @@
 """What photographs should show: materials, lights, and the one forward model that goes from them to radiance.
 
-    problem     JointProblem: the observations, the operator and the loss; every question about a point is asked of it
-    point       Point: what is asked for, materials and lights
+    problem       JointProblem: the observations, the operator and the loss; it answers every question about a point
+    point         Point: the unknowns, which are materials and lights
     illumination  one illumination at a point: radiance, residuals, responses of lobes
-    jacobian    the derivatives of radiance by everything unknown
-    responses   what rows of observations reflect of lobes of weight one; the only caller of the reflection operator
-    observed    observations, grouped by illumination, as blocks
+    jacobian      the derivatives of radiance by all unknowns
+    responses     what observations reflect of lobes of weight one; the only caller of the reflection operator
+    observed      observations, grouped by illumination, as blocks
 
-How a point is found is no matter here: that is `factorlib.solve`.
+`factorlib.solve` finds the best point.
 """

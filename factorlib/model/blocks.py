@@ -12,10 +12,11 @@ ROWS = ("normal", "view", "radiance", "clipped", "precision", "material", "photo
 class Block(msgspec.Struct, frozen=True):
     """The n observations under one illumination, sorted by material.
 
-    radiance is divided by `unit` (the block's mean radiance); precision is 1/σ of the noise model times the root of
-    the observation's weight, zero where a channel says nothing; held_out observations choose the model and do not
-    fit it.  visibility says how much of each direction an observation sees, 0 to 255 (None: all of all of them);
-    directions are those, in the block's frame, of each photo.
+    unit        the block's mean radiance; `radiance` is divided by it
+    precision   1/σ of the noise model times the root of the observation's weight; 0 where a channel says nothing
+    held_out    observations that choose between models and are not fitted
+    visibility  how much of each of k directions an observation sees, 0 (nothing) to 255 (all); None: all see everything
+    directions  the k directions of `visibility`, in the block's frame, for each of the f photos
     """
 
     name: str
@@ -41,11 +42,11 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, visibility=visibility)
 
     def fitted(self) -> Block:
-        """What is there to be fitted: all but what is held out."""
+        """The observations that are not held out."""
         return self.take(~self.held_out) if self.held_out.any() else self
 
     def with_none_held_out(self) -> Block:
-        """All observations, to be fitted."""
+        """The same observations, all to be fitted."""
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
     def sampled(self, count: int, seed: int) -> Block:
@@ -62,6 +63,6 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, visibility=None)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """What `radiance`, in the block's unit, is too bright, in σ; one-sided where clipped: such a pixel says "at least"."""
+        """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""
         difference = (radiance - self.radiance) * self.precision
         return np.where(self.clipped, np.minimum(difference, 0.0), difference)

@@ -9,10 +9,10 @@ HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out 
 
 
 def held_out_by_cells(cell: Int[np.ndarray, "n"], material: Int[np.ndarray, "n"], share: float, seed: int) -> Bool[np.ndarray, "n"]:
-    """About a `share` of the observations: all of randomly chosen cells.  Never all of a material.
+    """Which observations are held out: all of randomly chosen cells, about a `share` of all, but never all of a material.
 
-    Neighbouring pixels err alike, so single pixels would not tell a lobe that the light needs from one that explains
-    the error of a place.
+    Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would
+    explain them as well as a lobe that the light needs.
     """
     names, number = np.unique(cell, return_inverse=True)
     chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]

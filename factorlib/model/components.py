@@ -13,16 +13,16 @@ from factorlib.model.blocks import Block
 
 
 class Component(NamedTuple):
-    """Materials (their numbers) and illuminations (their names) that are linked, in order; either may be none."""
+    """Materials (by number) and illuminations (by name) that are linked, both sorted; either may be empty."""
 
     materials: tuple[int, ...]
     illuminations: tuple[str, ...]
 
 
 def connected_components(blocks: Sequence[Block], materials: int) -> list[Component]:
-    """All components, in order, of materials 0 … `materials`−1 and the blocks.
+    """All components of materials 0 … `materials`−1 and the blocks, sorted.
 
-    Two materials are linked where one light shows both; within a component a factor per channel is undetermined.
+    Two materials are linked if one light shows both.  In each component one factor per channel is not determined.
     """
     shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
     first, second = np.array(shown, dtype=int).reshape(-1, 2).T

@@ -1,10 +1,10 @@
-"""Fixing what the data cannot: one factor per channel and connected component, between reflectances and lights.
+"""The gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
 
 Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
        light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
        lights of E_ic, each light counting alike.  In logarithms the rule does not depend on the gauge it starts from.
-       The paper sums weights.  But those are peaks: of one light, sums of two fits differ as one of its lobes is fitted by
-       several sharper ones, while energies add up to what the light sends.
+       The paper sums weights, which are peaks.  Where one fit has one broad lobe and another has several sharper ones in its place,
+       their summed weights differ, but their summed energies agree.
 Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
        the light, which is what photographs of objects show, and Mitsuba needs it below one.
 """
@@ -32,7 +32,7 @@ RULE = (
 
 
 def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
-    """The same predicted radiance in the gauge stated above; one light per block."""
+    """The point in the gauge stated above, which predicts the same radiance; one light per block."""
     materials, lights = point.materials, list(point.lights)
     diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
     names = [block.name for block in blocks]

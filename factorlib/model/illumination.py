@@ -1,10 +1,9 @@
 """One illumination of the joint problem at a point: what its photos show, and what the model says they should.
 
     predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc),     B_ipc = k_d,c D_ip + k_s,c S_ip,  τ the photo's tone curve
-    residual   r_ic = (y_ic − radiance_ic) / σ_ic, and min(r_ic, 0) where the channel is clipped: a clipped pixel says
-                                                   "at least this much"
+    residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 
-D and S are the responses of `factorlib.model.responses`.  A new physical effect is added here and there, once.
+D and S are the responses of `factorlib.model.responses`.  These two modules are where a new physical effect is added.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from factorlib.reflection.operator import Operator
 
 
 class Illumination(msgspec.Struct, frozen=True):
-    """The observations made in one light, that light, the materials, and how they reflect; all in the block's radiance unit."""
+    """The observations in one light, that light, the materials and the reflection operator; radiance is in the block's unit."""
 
     block: Block
     light: Light
@@ -39,15 +38,15 @@ class Illumination(msgspec.Struct, frozen=True):
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
     def fitted(self) -> Illumination:
-        """What is there to be fitted: all but what is held out."""
+        """With the observations alone that are not held out."""
         return msgspec.structs.replace(self, block=self.block.fitted())
 
     def with_light(self, light: Light) -> Illumination:
-        """In another light."""
+        """The same observations and materials in another light."""
         return msgspec.structs.replace(self, light=light)
 
     def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Σ_p D w and Σ_p S w at `rows`: what a material of that roughness shows at k_d = 1 and at k_s = 1, unexposed."""
+        """Σ_p D w and Σ_p S w at `rows`: radiance of a material of that roughness with k_d = 1 and with k_s = 1, before exposure."""
         parts = unit_values(self.block, rows, self.light.unit_lobes, roughness, self.operator)
         diffuse, specular = (part @ self.light.weight for part in parts)
         return diffuse, specular
@@ -69,21 +68,21 @@ class Illumination(msgspec.Struct, frozen=True):
         return loss.of_residuals(self.residuals()).mean(1)
 
     def fit_loss(self, loss: Loss) -> float:
-        """The loss over what is not held out, priors included."""
+        """The loss of the observations that are not held out, with priors."""
         residual = self.residuals()[~self.block.held_out]
         return float(np.sum(loss.of_residuals(residual))) + loss.of_light(self.block, self.light).value
 
     def responses(self) -> Iterator[Responses]:
-        """D and S with their derivatives, of all observations, some at a time."""
+        """D and S of all observations, with derivatives, in chunks of rows."""
         return responses(self.block, self.light, self.materials, self.operator)
 
     def linearise(self, loss: Loss, known: Iterable[Responses] | None = None) -> Iterator[Linearised]:
-        """Whitened residuals and their Jacobian, some observations and a channel at a time; `known`: responses computed before."""
+        """Whitened residuals and their Jacobian, in chunks of rows and channel by channel; known: `responses`, if computed before."""
         for some in self.responses() if known is None else known:
             yield from linearised(self.block, self.light, self.materials, some, loss)
 
     def atoms(self, rows: Int[np.ndarray, "n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
-        """What q further lobes of weight one would add to the whitened residual at `rows`, per channel."""
+        """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""
         block, materials = self.block, self.materials
         diffuse = np.empty((len(rows), len(lobes)))
         specular = np.empty_like(diffuse)

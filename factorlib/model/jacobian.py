@@ -1,7 +1,7 @@
-"""The derivatives of what an illumination shows, by all that is unknown of materials and of its light.
+"""The derivatives of an illumination's residuals by the unknowns of the materials and of its light.
 
-Channels share the geometry unknowns (axis, sharpness) and have their own weights, so the Jacobian is made of one block
-[n, 4p + …] per channel rather than as a sparse [3n, 6p + …] matrix.
+Channels share the unknowns of geometry (axis, sharpness) and have their own weights.  So the Jacobian is one dense block
+[n, 4p + …] per channel instead of a sparse matrix [3n, 6p + …].
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from factorlib.model.tone import exponents
 
 
 class Linearised(msgspec.Struct, frozen=True):
-    """One channel of some rows, whitened and weighted so that a least-squares step on it is one of the robust loss.
+    """One channel of some rows, whitened and weighted: a least-squares step on it is a step of the robust loss.
 
-    What is held out weighs nothing.  places: which unknowns (materials first, then the light's) the k columns of the Jacobian are
+    Rows that are held out have weight 0.  places: number of the unknown (materials first, then the light's) of each of the k columns
     """
 
     rows: slice
@@ -39,8 +39,11 @@ class Linearised(msgspec.Struct, frozen=True):
 
 
 class Whitened(msgspec.Struct, frozen=True):
-    """Residual and loss of one channel of n rows; scale: of a slope of radiance, to be one of the residual;
-    rising, by_tone: slopes of radiance by linear radiance and by the log exponents [n, 1]."""
+    """Residual and loss of one channel of n rows.
+
+    scale     a derivative of radiance times this is a derivative of the residual
+    rising    derivative of the radiance shown by linear radiance;  by_tone: by the log exponents of the tone curves
+    """
 
     residual: Float[Tensor, "n"]
     scale: Float[Tensor, "n"]

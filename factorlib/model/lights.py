@@ -1,12 +1,12 @@
 """A light: its lobes, and the exposures and tone curves of its photos, with their vector of unknowns.
 
-A lobe's unknowns are chosen so that what the data determine stays put while another unknown moves: its energy
-e = w/λ' rather than its peak w, λ' = λ/(1 − e^{−2λ}), and
+A lobe's unknowns are chosen so that they hardly depend on each other: its energy e = w/λ', with λ' = λ/(1 − e^{−2λ}), instead of
+its peak w, and
 
     s = −log(1/λ + b),      b = 2 min α²
 
-rather than log λ.  A reflection widens a lobe's variance 1/λ by about b, so the sum is what is seen: a rougher surface
-under a sharper lobe looks the same along a line of s, which steps in log λ would only follow in small ones.
+instead of log λ.  A reflection widens a lobe's variance 1/λ by about b, so photographs show the sum 1/λ + b.  A rougher surface under
+a sharper lobe looks the same; in s such a change is a straight line, in log λ a curve that only small steps can follow.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from factorlib.light.lobes import lobe_integral
 from factorlib.model.bounds import SHARPNESS, TONE, sharpest_resolved
 
-MOST_TURN, MOST_S, MOST_EXPOSURE, MOST_TONE = 0.3, 1.0, 1.0, 0.2  # of one step, whatever is asked for
+MOST_TURN, MOST_S, MOST_EXPOSURE, MOST_TONE = 0.3, 1.0, 1.0, 0.2  # largest change of an unknown in one step
 
 
 class UnitLobes(msgspec.Struct, frozen=True):
@@ -61,7 +61,7 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def unknowns(self) -> int:
-        """How many: the length of a step."""
+        """How many unknowns the light has: the length of a step."""
         return 6 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
 
     @property
@@ -88,7 +88,7 @@ class Light(msgspec.Struct, frozen=True):
         return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
 
     def moved(self, step: Float[np.ndarray, "l"], blur: float) -> Light:
-        """Apply a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
+        """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
         p = len(self)
         by = step[: 6 * p].reshape(6, p)
         first, second = self.tangents()

@@ -4,7 +4,7 @@
     + n π Σ_c (E_c/Ē − 1)² / 3          the paper's prior, on summed energies E: variance over channels
     + ρ(light)                          a prior on lights, where there is one
 
-All gradients and Hessians are half of the loss's own, as those of Σ r² are without the factor 2.
+Gradients and Hessians here are half of the true ones, so that those of Σ r² have no factor 2.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ LightPrior = Callable[[Block, Light], tuple[float, Float[np.ndarray, "l"], Float
 
 
 class Loss(msgspec.Struct, frozen=True):
-    """robust_scale: k of the pseudo-Huber loss, in σ;  prior: weight π of the paper's tint prior.
+    """What a point is judged by.
 
-    light_prior: what is known of lights beforehand, as from captured ones; off where None.  It adds a value ρ(light) to the loss of
-    each illumination: ρ, half its gradient and half its Gauss-Newton Hessian by the light's unknowns (`Light.moved`)
+    robust_scale  k of the pseudo-Huber loss, in σ
+    prior         weight π of the paper's tint prior
+    light_prior   a prior on lights, for example from captured ones; None: no such prior.  It gives ρ(light), half its gradient and
+                  half its Gauss–Newton Hessian by the light's unknowns (`Light.moved`)
     """
 
     robust_scale: float = 10.0
@@ -47,11 +49,11 @@ class Loss(msgspec.Struct, frozen=True):
         return 2 * self.robust_scale**2 * (np.sqrt(1 + (residual / self.robust_scale) ** 2) - 1)
 
     def trust(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Weights in ]0, 1] that make a least-squares step on the residuals one of the loss."""
+        """Weights in ]0, 1] of the squared residuals, with which a least-squares step is a step of this loss."""
         return 1 / np.sqrt(1 + (residual / self.robust_scale) ** 2)
 
     def of_light(self, block: Block, light: Light) -> Quadratic:
-        """All that the loss holds beside residuals."""
+        """The priors on a light: all of the loss but the residuals."""
         gradient, hessian = np.zeros(light.unknowns), np.zeros((light.unknowns, light.unknowns))
         lobes = slice(2 * len(light), 6 * len(light))
         value, gradient[lobes], hessian[lobes, lobes] = self._tint(block, light)

@@ -38,12 +38,12 @@ class Materials(msgspec.Struct, frozen=True):
 
     @property
     def blur(self) -> float:
-        """b = 2 min α²: by how much the least rough material widens a lobe's variance 1/λ, about."""
+        """b = 2 min α²: about how much the least rough material widens a lobe's variance 1/λ."""
         return 2 * float(self.roughness.min()) ** 4
 
     @property
     def sharpest(self) -> float:
-        """The sharpness of lobes beyond which all reflect alike."""
+        """The largest sharpness that can be resolved: reflections of sharper lobes look the same."""
         return sharpest_resolved(self.blur)
 
     def replaced(self, other: Materials, which: Sequence[int]) -> Materials:
@@ -53,7 +53,7 @@ class Materials(msgspec.Struct, frozen=True):
         return Materials.of_vector(rows.reshape(-1))
 
     def lambertian(self, m: int) -> Materials:
-        """Material m with what it reflected specularly given to its diffuse part."""
+        """With material m Lambertian: its specular reflectance is added to its diffuse one."""
         diffuse, specular = self.diffuse.copy(), self.specular.copy()
         diffuse[m] += specular[m]
         specular[m] = LEAST_REFLECTANCE

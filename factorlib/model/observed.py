@@ -56,7 +56,7 @@ def blocks_of_observations(
 
 
 def usable(observations: Observations) -> Observations:
-    """Those whose radiance and directions are finite, whose directions have a length, and that weigh something."""
+    """The observations whose radiance and directions are finite, whose directions are not zero, and whose weight is positive."""
     vectors = np.stack([observations.radiance, observations.normal, observations.view])
     directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
     return observations.take(np.isfinite(vectors).all((0, 2)) & directed & (observations.weight > 0) & np.isfinite(observations.weight))

@@ -1,4 +1,4 @@
-"""A point of the joint problem: what is asked for."""
+"""A point of the joint problem: a value for every unknown."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ class Point(msgspec.Struct, frozen=True):
         return Point(Materials.of_vector(self.materials.vector() + by_materials), lights)
 
     def restricted(self, lights: Sequence[int]) -> Point:
-        """With the lights of numbers `lights` alone."""
+        """The same materials, with the lights of numbers `lights` alone."""
         return Point(self.materials, [self.lights[k] for k in lights])

@@ -1,9 +1,9 @@
-"""The joint problem: what is known of materials and lights, and every question that can be asked about a point of it.
+"""The joint problem: what is known about materials and lights, and every question that can be asked about a point.
 
     problem = JointProblem(blocks, operator, loss, spread)      point = Point(materials, lights)
     problem.radiance(point)   .residuals(point)   .linearise(point)   .held_out_loss(point)
 
-Every observation touches one material (7 unknowns) and one light (6 a lobe), so a point is asked about illumination by
+Every observation depends on one material (7 unknowns) and one light (6 unknowns a lobe).  So questions are answered illumination by
 illumination (`factorlib.model.illumination`), and `spread` may do that on several workers.
 """
 
@@ -47,21 +47,21 @@ class JointProblem(msgspec.Struct, frozen=True):
         return [illumination.residuals() for illumination in self.illuminations(point)]
 
     def linearise(self, point: Point) -> list[Iterator[Linearised]]:
-        """Residuals and Jacobian of what is fitted, block by block, some rows and one channel at a time."""
+        """Residuals and Jacobian of the observations that are fitted, block by block, in chunks of rows and channel by channel."""
         return [illumination.linearise(self.loss) for illumination in self.illuminations(point)]
 
     def fit_loss(self, point: Point) -> float:
-        """The loss of what is not held out, priors included."""
+        """The loss of the observations that are not held out, with priors."""
         return sum(illumination.fit_loss(self.loss) for illumination in self.illuminations(point))
 
     def held_out_losses(self, point: Point) -> list[Float[np.ndarray, "n"]]:
-        """Robust loss of each held-out observation, block by block; of every one where none is held out at all."""
+        """Robust loss of each held-out observation, block by block; if no observation at all is held out, of each observation."""
         none = self.none_held_out
         judged = msgspec.structs.replace(self, blocks=[block.take(block.held_out | none) for block in self.blocks])
         return [illumination.losses(self.loss) for illumination in judged.illuminations(point)]
 
     def held_out_loss(self, point: Point) -> float:
-        """Mean robust loss per held-out channel value; of all values where none is held out."""
+        """Mean robust loss per held-out channel value; if none is held out, of all values."""
         losses = np.concatenate(self.held_out_losses(point))
         return float(losses.mean()) if len(losses) else 0.0
 
@@ -86,11 +86,11 @@ class JointProblem(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, blocks=[self.blocks[k] for k in lights])
 
     def without_shadows(self) -> JointProblem:
-        """As if nothing hid anything."""
+        """The same observations, as if meshes cast no shadows."""
         return msgspec.structs.replace(self, blocks=[block.without_shadows() for block in self.blocks])
 
     def with_none_held_out(self) -> JointProblem:
-        """All observations are fitted."""
+        """The same observations, all to be fitted."""
         return msgspec.structs.replace(self, blocks=[block.with_none_held_out() for block in self.blocks])
 
     def with_loss(self, loss: Loss) -> JointProblem:

@@ -1,9 +1,9 @@
 """What rows of observations reflect of lobes of weight one: the only place that calls the reflection operator.
 
-    D_ip   diffuse response of observation i to lobe p, at k_d = 1      both as they are seen (shadowing)
-    S_ip   specular response, at k_s = 1
+    D_ip   diffuse response of observation i to lobe p, for k_d = 1      both with shadows (shadowing)
+    S_ip   specular response, for k_s = 1
 
-and what they make of them: at exposure e, a material k_d, k_s under lobes of weight w shows, before its photo's tone curve,
+From them follows radiance: at exposure e, a material k_d, k_s under lobes of weight w shows, before its photo's tone curve,
 
     y_ic = e_i (k_d,c Σ_p D_ip w_pc + k_s,c Σ_p S_ip w_pc)                                                    (1)
 """
@@ -58,9 +58,10 @@ def unit_values(
 
 
 class Responses(msgspec.Struct, frozen=True):
-    """What `rows` of one material reflect of each lobe at unit weight, as they are seen and exposed, with derivatives.
+    """What `rows` of one material reflect of each lobe of weight one, with shadows and exposure, and the derivatives.
 
-    parts: the fields of the operator's Response [n, p];  turning: how they change as lobes turn, by visibility alone
+    parts    the fields of the operator's Response [n, p]
+    turning  how shadows alone change them as lobes turn; None without shadows
     """
 
     material: int
@@ -74,7 +75,7 @@ class Responses(msgspec.Struct, frozen=True):
 
 
 def responses(block: Block, light: Light, materials: Materials, operator: Operator) -> Iterator[Responses]:
-    """Of all observations of a block, some at a time."""
+    """The responses of all observations of a block, in chunks of rows."""
     for m, rows in material_slices(block):
         roughness = float(materials.roughness[m])
         exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
@@ -95,7 +96,7 @@ def material_slices(block: Block) -> list[tuple[int, slice]]:
 
 
 class UnitReflection(torch.autograd.Function):
-    """D and S [n, p] without shadows, for autograd: differentiated by the operator's own `response`."""
+    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
 
     @staticmethod
     def forward(

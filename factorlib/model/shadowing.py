@@ -1,4 +1,4 @@
-"""Self-shadowing: what of each lobe's reflection the observations' visibility lets through.
+"""Self-shadowing: the share of each lobe's reflection that is left where meshes hide a part of the light.
 
     D_ip → v_ip D_ip,   S_ip → u_ip S_ip          with v, u of factorlib.light.visibility, (1) and (2)
 
@@ -23,14 +23,14 @@ TOGETHER = 512  # observations whose visibility a processor's cache holds
 
 
 class Turning(msgspec.Struct, frozen=True):
-    """Derivatives [n, p] of responses as their lobes turn toward the two tangents, by visibility alone."""
+    """Derivatives [n, p] of the responses by turns of their lobes toward the two tangents, through visibility alone."""
 
     diffuse: tuple[Tensor, Tensor]
     specular: tuple[Tensor, Tensor]
 
 
 class Rows(msgspec.Struct, frozen=True):
-    """Observations of one photo that do not see everything: their places among the rows asked for, and what they see."""
+    """Observations of one photo from which something is hidden: their places among the rows asked for, and what they see (0 to 1)."""
 
     places: Tensor
     visibility: Float[Tensor, "n k"]
@@ -40,7 +40,7 @@ class Rows(msgspec.Struct, frozen=True):
 
 
 def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, "n"]) -> Iterator[Rows]:
-    """The shadowed among `rows`, photo by photo, at most TOGETHER at once."""
+    """Those of `rows` from which something is hidden, photo by photo, at most TOGETHER at once."""
     visibility, photo = block.visibility[rows], block.photo[rows]
     hidden = (visibility < 255).any(1)
     for k in np.unique(photo[hidden]):
@@ -53,7 +53,7 @@ def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, "n"]) -> Iterator[
 def shadowed(
     parts: tuple[Tensor, Tensor], block: Block, rows: slice | Int[np.ndarray, "n"], lobes: UnitLobes, roughness: float
 ) -> tuple[Tensor, Tensor]:
-    """`parts` = (diffuse, specular) responses [n, p] to lobes at `rows`, as they are seen."""
+    """The responses `parts` = (diffuse, specular) [n, p] to lobes at `rows`, with shadows."""
     if block.visibility is None:
         return parts
     diffuse, specular = (part.clone() for part in parts)
@@ -69,7 +69,7 @@ def shadowed(
 def shadowed_response(
     r: dict[str, Tensor], block: Block, rows: slice, light: Light, roughness: float
 ) -> tuple[dict[str, Tensor], Turning | None]:
-    """The fields [n, p] of an operator's Response as they are seen, by the product rule, and how they change as lobes turn."""
+    """The fields [n, p] of an operator's Response with shadows, by the product rule, and how shadows change as lobes turn."""
     if block.visibility is None:
         return r, None
     r = {name: value.clone() for name, value in r.items()}

@@ -14,17 +14,17 @@ NEAR_BOUNDS = 0.8  # of the logarithms of the exponents' bounds
 
 
 def toned(linear: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
-    """Radiance as the photos show it."""
+    """What the photos show of linear radiance."""
     return linear if len(light.log_tone) == 0 else curve(np.maximum(linear, 0.0), exponents(light, photo))
 
 
 def straightened(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"]:
-    """Linear radiance of what the photos show."""
+    """Linear radiance, from what the photos show.  The inverse of `toned`."""
     return radiance if len(light.log_tone) == 0 else inverse(radiance, exponents(light, photo))
 
 
 def slope_at(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n c"] | float:
-    """By how much what a photo shows grows with linear radiance, where it shows `radiance`."""
+    """Derivative of what a photo shows by linear radiance, where it shows `radiance`."""
     if len(light.log_tone) == 0:
         return 1.0
     return slope(straightened(radiance, light, photo), exponents(light, photo))
