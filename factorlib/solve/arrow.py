@@ -5,9 +5,9 @@ light leaves
 
     (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ g_i),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                 (1)
 
-with 7 unknowns a material, and the Schur complement on the left is the information that the data hold about the materials once
-every light is solved for.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on the units
-of an unknown; rows and columns of unknowns that are not free become those of the identity.
+with 7 unknowns a material.  The Schur complement on the left is the information that the data hold about the materials when the
+lights are unknown too.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on the units of an
+unknown.  Rows and columns of unknowns that are not free become those of the identity.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ DEFINITE = 1e-9  # damping that makes a light's block definite where the step it
 
 
 class Eliminated(NamedTuple):
-    """One light eliminated: the Cholesky factor of its block L, and its C with only the free unknowns in it."""
+    """One light eliminated: the Cholesky factor of its block L, and its C, whose columns of unknowns that are not free are 0."""
 
     factor: tuple[Float[np.ndarray, "l l"], bool]
     cross: Float[np.ndarray, "7m l"]
 
 
 class ArrowSystem(msgspec.Struct, frozen=True):
-    """The normal equations of all illuminations; their order is the order of every sum."""
+    """The normal equations of all illuminations.  Sums are taken in their order, so that equal inputs give equal bits."""
 
     parts: list[NormalEquations]
 
@@ -58,7 +58,7 @@ class ArrowSystem(msgspec.Struct, frozen=True):
     def solved(
         self, free: Bool[np.ndarray, "7m"], bounds: Sequence[Bounds], damping: float
     ) -> tuple[Float[np.ndarray, "7m"], list[Float[np.ndarray, "l"]]]:
-        """(1): the damped step of the materials, those `free`, and of each light within its bounds."""
+        """The damped step (1) of the `free` unknowns of the materials, and of each light within its bounds."""
         reduced, right = damped(self.material_hessian, damping), -self.material_gradient
         solutions = []
         for part, bound in zip(self.parts, bounds, strict=True):
@@ -77,14 +77,14 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         return by_materials, by_lights
 
     def predicted_decrease(self, by_materials: Float[np.ndarray, "7m"], by_lights: Sequence[Float[np.ndarray, "l"]]) -> float:
-        """By how much the quadratic model of the loss falls with a step."""
+        """By how much a step lowers the quadratic model of the loss."""
         decrease = -by_materials @ (2 * self.material_gradient + self.material_hessian @ by_materials)
         for part, step in zip(self.parts, by_lights, strict=True):
             decrease -= step @ (2 * part.light_gradient + part.light_hessian @ step + 2 * part.cross_hessian.T @ by_materials)
         return float(decrease)
 
     def schur_complement(self, point: Point) -> Float[np.ndarray, "7m 7m"]:
-        """The information that the data hold about the materials once every light is solved for, at the point of the system."""
+        """The information about the materials when the lights are unknown too: the left side of (1), undamped, at `point`."""
         reduced = self.material_hessian
         for part, light in zip(self.parts, point.lights, strict=True):
             factor, cross = _eliminated(
@@ -94,7 +94,7 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         return (reduced + reduced.T) / 2
 
     def reduced_scores(self, point: Point) -> list[Float[np.ndarray, "k 7m"]]:
-        """Scores of each illumination's clusters for the materials, less what the light takes up of them."""
+        """The materials' scores of each illumination's clusters, after elimination of the light."""
         return [_reduced_scores(part, point, k) for k, part in enumerate(self.parts)]
 
 
@@ -110,14 +110,14 @@ def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "7m l"
 
 
 def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
-    """With the diagonal 1 + damping times as large, and positive."""
+    """The matrix with its diagonal 1 + damping times as large, and positive."""
     diagonal = np.diag(hessian)
     floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
     return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
 
 
 def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
-    """Rows and columns that are not free become those of the identity (scaled as the rest)."""
+    """The matrix with rows and columns that are not free replaced by those of the identity, in the scale of the rest."""
     scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
     masked = matrix * np.outer(free, free)
     masked[~free, ~free] = scale

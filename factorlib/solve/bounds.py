@@ -1,4 +1,4 @@
-"""What a step must keep to: ranges of unknowns, and how far a lobe may go before the quadratic model is no good."""
+"""The limits of a step: ranges of the unknowns, and how far a lobe may move before the quadratic model fails."""
 
 from __future__ import annotations
 
@@ -14,9 +14,13 @@ MOST_WIDTHS, MOST_TURN, MOST_S = 0.4, 0.3, 0.25  # of a lobe in one step: its ow
 
 
 class Bounds:
-    """Of a light's step: unknowns that are not `free` [l] take the value `fixed`; `extra` is their own damping, beside the common one.
+    """The limits of one light's step.
 
-    An unknown at a bound that the loss pushes beyond is not free from the start; `tighten` takes more of them.
+    free    [l] unknowns that the step may choose
+    fixed   [l] the step of those that are not free
+    extra   [l] damping of an unknown of its own, added to the common damping
+
+    At the start an unknown is not free if it is at a bound and the loss would fall beyond it.  `tighten` adds further limits.
     """
 
     def __init__(self, equations: NormalEquations, light: Light, materials: Materials):
@@ -29,9 +33,9 @@ class Bounds:
         self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
 
     def tighten(self, step: Float[np.ndarray, "l"]) -> bool:
-        """Whether the step went too far, and bounds were changed.
+        """Tighten the limits where the step violates them; returns whether any was changed.
 
-        A sharpness that left its range is fixed at the end of it; a lobe that went too far is damped more, that lobe alone.
+        A sharpness that would leave its range is fixed at the end of the range.  A lobe that moves too far gets more damping.
         """
         p = len(self.light)
         outside = self.free & ((step < self.low) | (step > self.high))
@@ -47,7 +51,7 @@ class Bounds:
 
 
 def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, "7m"]) -> Bool[np.ndarray, "7m"]:
-    """Unknowns of the materials at a bound that the loss pushes beyond, and those that the loss does not depend on."""
+    """Unknowns of the materials at a bound beyond which the loss would fall, and those on which the loss does not depend."""
     values = materials.rows()
     low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
     high = np.column_stack([np.zeros_like(values[:, :6], bool), values[:, 6] >= ROUGHNESS[1]]).reshape(-1)
@@ -55,7 +59,7 @@ def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, "7m"]) 
 
 
 def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:
-    """Unknowns of a light at a bound that the loss pushes beyond, and those of lobes without weight."""
+    """Unknowns of a light at a bound beyond which the loss would fall, and those of lobes without weight."""
     p = len(light)
     at_bound = np.zeros(len(gradient), bool)
     low, high = np.log([SHARPNESS[0], materials.sharpest])
@@ -68,5 +72,5 @@ def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarra
 
 
 def specular_unknowns(which: Bool[np.ndarray, "m"]) -> Bool[np.ndarray, "7m"]:
-    """Which unknowns are specular ones of the materials `which`."""
+    """Which unknowns are the specular ones (k_s and roughness) of the materials `which`."""
     return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)

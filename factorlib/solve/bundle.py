@@ -1,9 +1,9 @@
 """The bundle solver: insert lobes where the residual asks, descend jointly, prune, and stop when held-out pixels do.
 
-    rounds    on a sample of the observations find the lobes (rounds); where observations see past something, they are run with and
-              without that (self_shadowing = auto), and what explains the held-out pixels better goes on
-    choices   tone curves and specular parts that held-out pixels ask for (curves, specular)
-    polish    brings the answer to its optimum on many observations, then on all
+    rounds    find the lobes on a sample of the observations.  Where meshes hide a part of the light and self_shadowing = auto, they are
+              run with shadows and without, and the model that explains the held-out pixels better goes on
+    choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
+    polish    brings the answer to its optimum, first on many observations, then on all
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ MANY = 4  # times `sample` observations bring the best round to its optimum, bef
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """The answer, in the gauge of `factorlib.model.gauge`: a point, how it was reached, and the last loss.
+    """The answer: a point in the gauge of `factorlib.model.gauge`.
 
-    shadows: whether visibility was used, and what decided;  lambertian: materials without specular part;
-    specular: what decided about each material, tone about each light's curves; none where nothing was tried
+    history     every accepted point on the way;  loss: the loss function that was lowered last
+    lambertian  materials without specular part
+    shadows     whether visibility was used, with its evidence
+    specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
     """
 
     point: Point
@@ -47,7 +49,7 @@ class Solution(msgspec.Struct, frozen=True):
     tone: list[Evidence] = []
 
     def shown(self, problem: JointProblem) -> JointProblem:
-        """The problem as the answer explains it: with shadows or without, its loss the last one."""
+        """The problem that the answer solves: with shadows or without, with the last loss."""
         return (problem if self.shadows.kept else problem.without_shadows()).with_loss(self.loss)
 
 
@@ -62,7 +64,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     """One reflectance per material and one light per block.
 
     problem: its loss judges held-out observations and, made robust, is what is lowered;  start: `from_nothing(materials)`, or an
-    earlier solution;  run: options and company, the defaults where it is None
+    earlier solution;  run: options, reports and journal; None: the defaults
     """
     run, fits = run or Run(), dict[str, Fit]()
     for name, model in models(problem, run.options.self_shadowing).items():
@@ -82,14 +84,14 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
 
 
 def models(problem: JointProblem, self_shadowing: str) -> dict[str, JointProblem]:
-    """The models to choose from: `with` self-shadowing, `without`, or both.  Where nothing is hidden they are one."""
+    """The models to choose from: `with` self-shadowing, `without`, or both; `without` alone where nothing is hidden."""
     shadows = self_shadowing != "off" and any(block.visibility is not None for block in problem.blocks)
     found = {"without": problem.without_shadows()} if not shadows or self_shadowing == "auto" else {}
     return found | ({"with": problem} if shadows else {})
 
 
 def _shadows(fits: dict[str, Fit]) -> Evidence:
-    """Which model of `fits` explains held-out observations better, of its rounds."""
+    """Which model of `fits` explains held-out observations better, by its best round."""
     losses = {name: fit.held_out for name, fit in fits.items()}
     if len(losses) == 2:
         return decide(losses["without"], losses["with"], SHADOWS)
@@ -97,7 +99,7 @@ def _shadows(fits: dict[str, Fit]) -> Evidence:
 
 
 def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:
-    """The fit nearer to its optimum, with a tone curve for the photos that held-out observations ask for one."""
+    """The fit nearer to its optimum, with tone curves where held-out observations are explained better with them."""
     if kept := run.journal.kept("tone", Curves):
         return kept
     if problem.none_held_out:
@@ -109,7 +111,7 @@ def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:
 
 
 def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run) -> Specular:
-    """The fit without needless specular parts: those decided before, and those that held-out observations do not ask for."""
+    """The fit without needless specular parts: those decided before, and those without which held-out observations lose nothing."""
     if kept := run.journal.kept("choice", Specular):
         return kept
     materials = fit.point.materials

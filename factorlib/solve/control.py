@@ -1,11 +1,11 @@
-"""What steers a descent between its steps: how much to trust the quadratic model, and when to stop."""
+"""The control of a descent: how much damping the next step gets, and when to stop."""
 
 from __future__ import annotations
 
 import msgspec
 
-LESS, MORE = 2.5, 3.0  # the damping is divided and multiplied by, after a good and a bad step
-GOOD, BAD = 0.6, 0.2  # shares of the predicted decrease that came true
+LESS, MORE = 2.5, 3.0  # the damping is divided by LESS after a good step, multiplied by MORE after a bad one
+GOOD, BAD = 0.6, 0.2  # a step is good or bad if the loss fell by more or less than this share of the predicted decrease
 LEAST_DAMPING = 1e-9
 ENOUGH = 2  # steps in a row
 
@@ -26,13 +26,13 @@ class Damping(msgspec.Struct, frozen=True):
 
 
 class Termination(msgspec.Struct, frozen=True):
-    """Counts steps in a row that lower the loss by less than `tolerance` of itself, or fail where they promised no more."""
+    """Counts steps in a row that gain too little: they lower the loss by less than `tolerance` of it, or fail and promised less."""
 
     tolerance: float = 1e-4
     small: int = 0
 
     def after(self, gained: float, predicted: float, loss: float) -> Termination:
-        """loss: before the step."""
+        """The count after a step; `loss` is the loss before it."""
         least = self.tolerance * loss
         if gained > 0:
             return Termination(self.tolerance, self.small + 1 if gained < least else 0)
@@ -40,5 +40,5 @@ class Termination(msgspec.Struct, frozen=True):
 
     @property
     def reached(self) -> bool:
-        """Whether there is no more to gain."""
+        """Whether the descent ends: ENOUGH steps in a row gained too little."""
         return self.small >= ENOUGH

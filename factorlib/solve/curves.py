@@ -1,8 +1,11 @@
 """Whether the photos of a light have a tone curve: where held-out observations are explained much better with one.
 
-The problem is brought near its optimum.  An exponent for each photo becomes an unknown where one Gauss-Newton step of everything
-then promises a gain from it: the problem comes near its optimum once more, with and without, by as many iterations, and `compare`
-decides for each light.  Where an exponent runs toward its bounds, all it does is take up what else is wrong, and it is not believed.
+    1. The problem is brought near its optimum.
+    2. One Gauss–Newton step of all unknowns predicts what an exponent for each photo would gain.  If that is little, no photo gets one.
+    3. Else the problem is brought near its optimum once more, with exponents and without, by equally many iterations, and for each
+       light the held-out losses decide (`compare_by_light`).
+    4. An exponent that runs toward its bounds only makes up for other errors of the model: its light goes without curves.
+
 A light that has curves already, from an earlier solution, keeps them.
 """
 
@@ -37,7 +40,7 @@ class Curves(msgspec.Struct, frozen=True):
 
 
 def near_optimum(problem: JointProblem, point: Point) -> Iterate:
-    """Some iterations on."""
+    """The point after ITERATIONS of descent."""
     return descend(problem, evaluate(problem, point), Descent(ITERATIONS))
 
 
@@ -51,7 +54,7 @@ def with_curves_where_needed(problem: JointProblem, start: Iterate, robust: Loss
     if promised_gain(fitting, start) < PROMISED_BY_TONE:
         return Curves(at, [Evidence(bool(has)) for has in had])
     straight, curved = (near_optimum(fitting, _in(at, of)).point for of in (lights, _curved(lights, ~had)))
-    evidence = compare_by_light(problem, (straight, at), curved, TONE)  # a lobe that grew in a gap of what is fitted says nothing for curves
+    evidence = compare_by_light(problem, (straight, at), curved, TONE)  # against both: a lobe that grew where nothing is fitted is no evidence for curves
     kept = np.array([of_light.kept for of_light in evidence]) & ~had
     if kept.any():
         settled = near_optimum(fitting, curved).point
@@ -69,7 +72,7 @@ def _decided(evidence: Evidence, kept: bool, had: bool) -> Evidence:
 
 
 def promised_gain(problem: JointProblem, at: Iterate) -> float:
-    """The share of the loss that one step of everything gains more with tone curves for all than without."""
+    """Predicted decrease by one step with tone curves for all photos, less that without, as a share of the loss."""
     none = np.array([len(light.log_tone) == 0 for light in at.point.lights])
     curved = evaluate(problem, _in(at.point, _curved(at.point.lights, none)))
     without, richer = (damped_step(iterate, DAMPING).predicted for iterate in (at, curved))

@@ -1,9 +1,9 @@
 """Levenberg–Marquardt over all materials and lights: damped steps, taken when they lower the loss.
 
-Radiance is linear in the lobes' weights, and its slopes by their places and sharpnesses grow with them: a lobe that takes over
-another's energy while it moves is what the step of all unknowns predicts worst.  So of a step the weights are not kept: they are
-fitted anew to where the lobes and materials have gone (an embedded point iteration; Jeong et al. 2012, Hong et al. 2017), from the
-responses that the next system is made of in any case.
+Radiance is linear in the lobes' weights, and its derivatives by axes and sharpnesses are proportional to the weights.  So the step
+predicts badly what happens where one lobe takes over the energy of another while it moves.  The weights of a step are therefore not
+used: with lobes and materials where the step put them, the weights are fitted anew (an embedded point iteration; Jeong et al. 2012,
+Hong et al. 2017).  That costs little, for the next system needs the same responses.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from factorlib.solve.control import Damping, Termination
 from factorlib.solve.iterate import Iterate, fit_weights
 from factorlib.solve.step import damped_step
 
-Accepted = Callable[[int, Iterate], None]  # is handed the number of an iteration and the iterate that it led to
+Accepted = Callable[[int, Iterate], None]  # called with the number of an iteration and the accepted iterate
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """Stops after `iterations`, or when two steps in a row gain less than `tolerance` of the loss."""
+    """When a descent stops: after `iterations`, or after two steps in a row that gain less than `tolerance` of the loss."""
 
     iterations: int = 10
     tolerance: float = 1e-4

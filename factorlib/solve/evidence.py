@@ -1,7 +1,8 @@
-"""Which of two models is believed: the one way to decide, for shadows, specular parts and tone curves.
+"""Which of two models is used: the same decision for shadows, specular parts and tone curves.
 
-Both models are brought to (or near) their optimum on what is fitted.  The richer one stays where held-out observations, which
-neither has seen, are explained so much worse without it that a threshold of `factorlib.solve.thresholds` is passed.
+Both models are brought to (or near) their optimum on the observations that are fitted.  The richer model is used if the loss of the
+held-out observations, which neither model was fitted to, is so much higher without it that a threshold is passed
+(`factorlib.solve.thresholds`).
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from factorlib.solve.thresholds import Threshold
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """Whether the richer model is kept, and the mean held-out loss of the observations in question with and without it;
-    None for what was not tried."""
+    """Whether the richer model is kept, and the mean loss of the held-out observations that decided, with it and without it.
+
+    A loss is None where that model was not tried.
+    """
 
     kept: bool
     held_out_loss_with: float | None = None
@@ -35,9 +38,9 @@ class Candidates(NamedTuple):
 
 
 def compare(problem: JointProblem, candidates: Candidates, threshold: Threshold, material: int | None = None) -> Evidence:
-    """Whether held-out observations, by the problem's loss, ask for the richer model.
+    """Whether the richer model is kept, by the problem's loss of held-out observations.
 
-    material: the observations in question are those of this material; of all where it is None
+    material: only observations of this material decide; None: all do.  Harm (`Threshold.harm`) counts over all observations
     """
     without, richer = (np.concatenate(problem.held_out_losses(point)) for point in candidates)
     own = _in_question(problem, material)
@@ -47,16 +50,16 @@ def compare(problem: JointProblem, candidates: Candidates, threshold: Threshold,
 
 
 def compare_by_light(problem: JointProblem, without: Sequence[Point], richer: Point, threshold: Threshold) -> list[Evidence]:
-    """As `compare`, for each light by its own observations alone; a light of which none is held out goes without.
+    """As `compare`, for each light by its own observations; a light without held-out observations does not get the richer model.
 
-    without: points of the model without; the best of them for each light counts
+    without: several points of the simpler model; for each light the best of them counts
     """
     losses = zip(*(problem.held_out_losses(point) for point in (richer, *without)), strict=True)
     return [decide(min(mean(other) for other in others), mean(richer), threshold) for richer, *others in losses]
 
 
 def decide(without: float, richer: float, threshold: Threshold) -> Evidence:
-    """Of the mean held-out losses of both models.
+    """The evidence of two mean held-out losses.
 
     >>> decide(without=1.3, richer=1.0, threshold=Threshold(gain=0.25)).kept
     True
@@ -65,7 +68,7 @@ def decide(without: float, richer: float, threshold: Threshold) -> Evidence:
 
 
 def mean(losses: Float[np.ndarray, "n"]) -> float:
-    """Of the losses, 0 for none."""
+    """The mean of the losses; 0 if there are none."""
     return float(losses.mean()) if len(losses) else 0.0
 
 

@@ -1,4 +1,4 @@
-"""What accompanies a solve: its options, who hears of its points, and what is kept of it."""
+"""A run of the solver: its options, the events it reports, and the journal from which a stopped run goes on."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Snapshot = Callable[[Event, Point], None]  # is handed every accepted point itself
+Snapshot = Callable[[Event, Point], None]  # called with every accepted point
 
 
 def unreported(event: Event) -> None:
-    """Nobody asked for reports."""
+    """The default: no reports."""
 
 
 def unwatched(event: Event, point: Point) -> None:
-    """Nobody asked for snapshots."""
+    """The default: no snapshots."""
 
 
 class Run(msgspec.Struct, frozen=True):
-    """options: how to solve;  report, snapshot: called at every accepted point;  journal: what is done already, and what to keep."""
+    """options: how to solve;  report, snapshot: called at every accepted point;  journal: the parts that are done already."""
 
     options: Bundle = Bundle()
     report: Report = unreported
@@ -47,13 +47,13 @@ class Run(msgspec.Struct, frozen=True):
 
 
 class Recorder:
-    """Appends events to `history` and passes them on; `problem`: its observations and loss give the held-out loss."""
+    """Appends events to `history` and reports them; `problem` gives the held-out loss."""
 
     def __init__(self, problem: JointProblem, history: list[Event], run: Run):
         self.problem, self.history, self.run = problem, history, run
 
     def record(self, round_: int, phase: str, iteration: int, iterate: Iterate) -> float:
-        """The held-out loss of the iterate where it ends a round (iteration −1), NaN on the way there."""
+        """Record an iterate.  Returns its held-out loss if it ends a round (iteration −1), else NaN."""
         point = iterate.point
         held_out = self.problem.held_out_loss(point) if iteration < 0 else np.nan
         loss = iterate.loss / self.problem.fitted_values

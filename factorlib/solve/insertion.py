@@ -1,12 +1,12 @@
-"""New lobes where the residual asks for them: matching pursuit over a dictionary of axes and sharpnesses.
+"""New lobes where the residual is large: matching pursuit over a dictionary of axes and sharpnesses.
 
-Light is a non-negative measure on the sphere.  The lobe that lowers the squared residual most, were it alone added
-with its best non-negative weights, is
+Light is a non-negative measure on the sphere.  If one lobe is added with its best non-negative weights, the squared residual falls
+most for
 
     argmax_j  Σ_c max(⟨a_jc, r_c⟩, 0)² / ‖a_jc‖²,      a_jc the whitened response of lobe j in channel c,
 
-after which the residual is deflated and the next is sought (the insertion step of sliding Frank–Wolfe; the joint
-descent that follows moves the lobes off the dictionary).
+Its contribution is then taken out of the residual, and the next lobe is looked for: the insertion step of sliding Frank–Wolfe.  The
+joint descent that follows moves the lobes away from the directions and sharpnesses of the dictionary.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
-SAMPLE = 700  # observations that vote
-TOO_NEAR = 0.7  # two lobes of a round stand at least this many widths apart
+SAMPLE = 700  # observations whose residuals choose the lobes
+TOO_NEAR = 0.7  # least distance of two lobes of a round, in their widths
 
 
 def dictionary(sharpest: float = np.inf) -> UnitLobes:
-    """The lobes to choose from, those no sharper than `sharpest`; the widest always."""
+    """The lobes to choose from: those no sharper than `sharpest`, and the widest in any case."""
     axes = [fibonacci_sphere(count) for count in DICTIONARY.values()]
     axis, sharpness = np.vstack(axes), np.repeat(list(DICTIONARY), list(DICTIONARY.values()))
     resolved = sharpness <= max(sharpest, sharpness.min())
@@ -87,14 +87,14 @@ def _pursuit(
 
 
 def blurred(light: Light, sharpest: float) -> Light:
-    """Lobes sharper than `sharpest` at that sharpness, their energy kept."""
+    """The light with lobes sharper than `sharpest` widened to it; their energy stays the same."""
     log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
     kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(log_sharpness))
     return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
 
 
 def pruned(light: Light, least_share: float = 1e-5) -> Light:
-    """Without the lobes that hold less than `least_share` of the light's energy; never without all of them."""
+    """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
     energy = lobe_integral(light.sharpness) * light.weight.sum(1)
     kept = energy > least_share * max(float(energy.sum()), 1e-30)
     return light.take(kept) if kept.any() else light.take(slice(0, 1))

@@ -32,6 +32,6 @@ def evaluate(problem: JointProblem, point: Point) -> Iterate:
 
 
 def fit_weights(problem: JointProblem, point: Point) -> Iterate:
-    """As `evaluate`, after giving the lobes the weights that lower the loss most, all else as it is."""
+    """As `evaluate`, with the lobes' weights fitted first: those that lower the loss most while nothing else changes."""
     found = list(problem.spread(partial(fitted_illumination, loss=problem.loss), problem.illuminations(point)))
     return Iterate(Point(point.materials, [one.light for one in found]), ArrowSystem([one.equations for one in found]))

@@ -1,4 +1,4 @@
-"""The normal equations of one illumination: gradient and Gauss–Newton Hessian of the loss, all of Σ r², without the factor 2."""
+"""The normal equations of one illumination: half the gradient and half the Gauss–Newton Hessian of the loss (for Σ r²: Jᵀr and JᵀJ)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class NormalEquations(msgspec.Struct, frozen=True):
 def normal_equations(
     illumination: Illumination, loss: Loss, clusters: Int[np.ndarray, "n"] | None = None, known: Iterable[Responses] | None = None
 ) -> NormalEquations:
-    """Of what is not held out.
+    """The system of the observations that are not held out.
 
     clusters: number of each observation's cluster, from 0, for `NormalEquations.scores`
     known: responses of what is fitted to the light, where they were computed before
@@ -68,7 +68,7 @@ class EnergyEquations(msgspec.Struct, frozen=True):
 
 
 def energy_equations(illumination: Illumination, known: Iterable[Responses], loss: Loss) -> EnergyEquations:
-    """The same numbers as in `normal_equations`; known: responses of all observations to the light."""
+    """The part of `normal_equations` by the lobes' energies, the same numbers; known: responses of all observations to the light."""
     block, light, materials = illumination.block, illumination.light, illumination.materials
     p, total = len(light), 0.0
     gradient, hessian = np.zeros((3, p)), np.zeros((3, p, p))

@@ -1,8 +1,8 @@
-"""What of a solve is done, part by part, so that one that was killed goes on and ends in the same bytes.
+"""The journal of a solve: the parts that are done, so that a solve that was killed goes on and ends in the same bytes.
 
-Every part (the rounds of a model, the choice of specular parts, each phase of the polish) follows from the one before it
-without chance or clock, so a part that was kept need not be computed again.  What is kept comes back as it would from disk
-even where nothing was stopped: the same numbers in the same layout, on which the order of a sum can depend.
+Every part (the rounds of a model, the choice of specular parts, each phase of the polish) is a deterministic function of the part
+before it, so a part that was saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory
+layout of an array can change the order of a sum, and so the last bits.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Journal:
         self._parts: dict[str, Any] = (keeper.load() if keeper else None) or {}
 
     def kept(self, part: str, type_: type[T]) -> T | None:
-        """What the part came to, or how far it was; None where it was not begun."""
+        """What was saved of the part, done or half done; None where it was not begun."""
         return restored(type_, self._parts[part]) if part in self._parts else None
 
     def keep(self, part: str, value: T) -> T:
-        """`value`, kept."""
+        """Save the part; returns `value` as `kept` would."""
         self._parts[part] = plain(value)
         if self._keeper:
             self._keeper.save(self._parts)

@@ -1,8 +1,8 @@
-"""A roughness that stands in a wrong valley, found by a search over all of them, the lights as they are.
+"""A search over all roughnesses with the lights fixed, for descent may end in a wrong local minimum of roughness.
 
-Given the lights, radiance is linear in k_d and k_s, and only roughness is not: for each of `GRID` the two are solved for per
-channel (non-negative least squares), which leaves a curve of one variable for each material.  Its minimum replaces the
-material where it lies far enough below the loss of the present roughness, solved in the same way.
+With fixed lights, radiance is linear in k_d and k_s, but not in roughness.  For each roughness of `GRID`, k_d and k_s are solved for
+per channel (non-negative least squares), which gives the loss as a function of roughness for each material.  The material is replaced
+by the one of least loss, if that is less than `BETTER` times the loss of the present roughness, computed in the same way.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.model.tone import slope_at, straightened
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
-ROWS = 300  # observations of each material in each light that vote
+ROWS = 300  # observations of each material in each light that are used
 BETTER = 0.95  # of the present loss
 
 
@@ -36,8 +36,8 @@ class Material(NamedTuple):
     roughness: float
 
 
-def materials_out_of_valleys(problem: JointProblem, point: Point) -> Materials:
-    """The materials, those replaced for which another roughness explains the sampled observations better."""
+def materials_of_best_roughness(problem: JointProblem, point: Point) -> Materials:
+    """The materials, each replaced where another roughness explains a sample of the observations clearly better."""
     searched = partial(_searched, materials=point.materials, loss=problem.loss)
     found = list(problem.spread(searched, [(m, _voters(problem, point, m)) for m in range(len(point.materials))]))
     diffuse, specular, roughness = (np.array(values) for values in zip(*found, strict=True))
@@ -45,7 +45,7 @@ def materials_out_of_valleys(problem: JointProblem, point: Point) -> Materials:
 
 
 def _voters(problem: JointProblem, point: Point, m: int) -> list[Illumination]:
-    """What some fitted observations of material m see, light by light, so that no worker is handed all observations."""
+    """At most ROWS fitted observations of material m in each light, so that a worker is not sent all observations."""
     voting = [block.take(_voting_rows(block, m)) for block in problem.blocks]
     pairs = zip(voting, point.lights, strict=True)
     return [Illumination(block, light, point.materials, problem.operator) for block, light in pairs if len(block)]
@@ -72,7 +72,7 @@ def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Lo
 
 
 def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:
-    """Roots of weights of linear radiance: outliers of the present model count little, clipped channels not at all."""
+    """Square roots of the weights of linear radiance: small for outliers of the present model, 0 for clipped channels."""
     block = voters.block
     precision = block.precision * slope_at(block.radiance, voters.light, block.photo)
     return np.where(block.clipped, 0.0, precision * np.sqrt(loss.trust(voters.residuals())))

@@ -1,11 +1,11 @@
 """Rounds of the bundle solver, which find the lobes.
 
     round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
-            descend on everything (descent), look for a better roughness (roughness), prune, fix the gauge
+            descend on all unknowns (descent), look for a better roughness (roughness), prune, fix the gauge
             (all on a sample of the observations, which finds the lobes as well as all of them do)
-    best:   the last round that lowered the best one's held-out loss by `least_gain` of it, and by `LEAST_DECREASE`
-    stop:   when `PATIENCE` rounds in a row are not the best and do not halve the fitted loss (few held-out pixels are a noisy
-            vote), at `lobes` lobes per light, or after `rounds`
+    best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
+    stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
+            evidence), at `lobes` lobes per light, or after `rounds`
 """
 
 from __future__ import annotations
@@ -28,21 +28,22 @@ from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.insertion import blurred, candidates, lobes_inserted, pruned
 from factorlib.solve.iterate import Iterate, evaluate, fit_weights
 from factorlib.solve.options import Bundle
-from factorlib.solve.roughness import materials_out_of_valleys
+from factorlib.solve.roughness import materials_of_best_roughness
 from factorlib.solve.start import starting_light, starting_materials
 from factorlib.solve.thresholds import FAR_BEHIND, HALVED, LEAST_DECREASE
 
-A_LOBE = 60  # observations for each lobe of a light, that it may not explain their noise
-ROBUST = 2.0  # standard deviations: beyond lies what a light of few lobes cannot show
+A_LOBE = 60  # observations for each lobe of a light, so that lobes do not fit noise
+ROBUST = 2.0  # standard deviations: larger residuals are features of the light that few lobes cannot show
 LEAST_ROBUST_SCALE = 0.02
-PATIENCE = 2  # rounds that may gain nothing
+PATIENCE = 2  # rounds in a row without gain, after which no further one is tried
 
 
 class Start(msgspec.Struct, frozen=True):
     """Where the rounds start, and what is decided before them.
 
-    point: materials and lights for a problem;  decided: materials whose specular part is not tried;
-    lambertian: those of them that have none;  converged: the point counts as a round, and another follows only where one halves a loss
+    point       gives materials and lights for a problem
+    decided     materials for which it is decided whether they have a specular part;  lambertian: those of them that have none
+    converged   the point is an earlier solution: it counts as a round, and only one more is made
     """
 
     point: Callable[[JointProblem, Bundle], Point]
@@ -63,9 +64,11 @@ def from_nothing(materials: int) -> Start:
 
 
 class Rounds(msgspec.Struct, frozen=True):
-    """How far the rounds are: where they stand, the best of them and its held-out loss, and the last fitted loss.
+    """The state between two rounds.
 
-    without_gain: how many rounds in a row have gained nothing
+    current       the point after the last round;  best: the best point so far, with its held-out loss `held_out`
+    fitted        the fitted loss of the last round
+    without_gain  how many rounds in a row have gained nothing;  over: there is no further round
     """
 
     current: Point
@@ -91,13 +94,13 @@ class Fit(msgspec.Struct, frozen=True):
     history: list[Event]
 
     def held_out_at(self, number: int) -> float:
-        """The held-out loss of a round, of the best one where there were fewer."""
+        """The held-out loss of round `number`; if there were fewer rounds, that of the best one."""
         rounds = [event.held_out for event in self.history if event.phase == "round"]
         return rounds[number] if number < len(rounds) else self.held_out
 
 
 def best_round(problem: JointProblem, start: Start, run: Run, part: str = "rounds", rivals: Sequence[Fit] = ()) -> Fit:
-    """Rounds on a sample of the observations, as long as they gain, and no rival was far ahead at the same round.
+    """Rounds on a sample of the observations, until they gain nothing or a rival was far better at the same round.
 
     part: the name by which the journal keeps them
     """
@@ -110,7 +113,7 @@ def best_round(problem: JointProblem, start: Start, run: Run, part: str = "round
 
 
 def further_rounds(problem: JointProblem, fit: Fit, start: Point, run: Run, part: str = "further rounds") -> Fit:
-    """Rounds that go on from another point than the fit's best, as if they had found it."""
+    """Further rounds from `start` in place of the fit's best point."""
     rounds = run.journal.kept(part, Rounds)
     if not rounds:
         held_out = sampled_for(problem, start, run.options).held_out_loss(start)
@@ -120,7 +123,7 @@ def further_rounds(problem: JointProblem, fit: Fit, start: Point, run: Run, part
 
 
 def _fit_of(problem: JointProblem, rounds: Rounds, run: Run, part: str, rivals: Sequence[Fit] = ()) -> Fit:
-    """All rounds from here."""
+    """All further rounds, until they are over."""
     while not rounds.over:
         rounds = run.journal.keep(part, _next_round(problem, rounds, run, rivals))
     loss = robust(sampled_for(problem, rounds.best, run.options), rounds.best)
@@ -153,7 +156,7 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     fitting = sample.with_loss(robust(sample, rounds.current))
     current = with_new_lobes(fitting, rounds.current, bundle, number)
     current = descend(fitting, current, Descent(bundle.iterations, bundle.tolerance), partial(record, number, "descent"))
-    current = pruned_in_gauge(fitting, _out_of_valleys(fitting, current).point)
+    current = pruned_in_gauge(fitting, _with_best_roughness(fitting, current).point)
     held_out = record(number, "round", -1, current)
     better = rounds.held_out - held_out >= max(bundle.least_gain * held_out, LEAST_DECREASE)
     halved = history[-1].loss < HALVED * rounds.fitted
@@ -165,9 +168,11 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
 
 
 def robust(problem: JointProblem, point: Point) -> Loss:
-    """The loss with `ROBUST` robust standard deviations of the current residual as its scale, at least `LEAST_ROBUST_SCALE` of the noise model's σ.
+    """The problem's loss with a robust scale of `ROBUST` robust standard deviations of the current residuals, and at least
+    `LEAST_ROBUST_SCALE` of the noise model's σ.
 
-    What a light of few lobes cannot show stands out from the rest long before it exceeds the noise model, and bends the materials.
+    A feature of the light that few lobes cannot show is an outlier among the residuals long before it exceeds the noise model.  With
+    the noise model's scale it would bias the materials.
     """
     absolute = np.abs(np.concatenate(problem.residuals(point)))
     scale = max(ROBUST * 1.4826 * float(np.median(absolute)), LEAST_ROBUST_SCALE)
@@ -175,7 +180,7 @@ def robust(problem: JointProblem, point: Point) -> Loss:
 
 
 def with_new_lobes(problem: JointProblem, point: Point, bundle: Bundle, number: int) -> Iterate:
-    """With up to `insert` further lobes for each light in round `number`, and all weights fitted again."""
+    """The point with up to `insert` further lobes for each light in round `number`, and all weights fitted again."""
     seeds = [bundle.seed + 1000 * number + k for k in range(len(problem.blocks))]
     grown = partial(_grown, bundle=bundle)
     lights = list(problem.spread(grown, list(zip(problem.illuminations(point), seeds, strict=True))))
@@ -188,9 +193,9 @@ def _grown(one: tuple[Illumination, int], bundle: Bundle) -> Light:
     return lobes_inserted(illumination, count, candidates(illumination, seed)) if count > 0 else illumination.light
 
 
-def _out_of_valleys(problem: JointProblem, current: Iterate) -> Iterate:
-    """With another roughness where that lowers the loss of the whole sample, too."""
-    materials = materials_out_of_valleys(problem, current.point)
+def _with_best_roughness(problem: JointProblem, current: Iterate) -> Iterate:
+    """The iterate with other roughnesses, if they lower the loss of the whole sample too; else as it is."""
+    materials = materials_of_best_roughness(problem, current.point)
     if (materials.roughness == current.point.materials.roughness).all():
         return current
     trial = evaluate(problem, Point(materials, current.point.lights))
@@ -198,12 +203,12 @@ def _out_of_valleys(problem: JointProblem, current: Iterate) -> Iterate:
 
 
 def pruned_in_gauge(problem: JointProblem, point: Point) -> Iterate:
-    """Without lobes that hold nothing, and in gauge."""
+    """The point without lobes that have no energy, in the gauge."""
     return evaluate(problem, in_gauge(Point(point.materials, [pruned(light) for light in point.lights]), problem.blocks))
 
 
 def answer_of(problem: JointProblem, point: Point) -> Point:
-    """Pruned, no lobe sharper than the materials resolve, in gauge, the weights those that fit all observations best."""
+    """The final point: no lobe is sharper than the materials resolve, weights fit all observations, pruned, in the gauge."""
     lights = [blurred(light, point.materials.sharpest) for light in point.lights]
     fitted = fit_weights(problem, Point(point.materials, lights)).point
     return in_gauge(Point(fitted.materials, [pruned(light) for light in fitted.lights]), problem.blocks)

@@ -1,15 +1,14 @@
-"""Which materials have a specular part: those that held-out observations are explained worse without.
+"""Which materials have a specular part: those without which held-out observations are explained worse.
 
-A specular part that a Lambertian material does not have would take up errors of normals and lights.  Each material in turn, the
-least specular first, loses its specular part; the rest of the problem is brought near its optimum again, and `compare` decides.
-A material that reflects more specularly than diffusely is not tried: where normals are wrong, a dull guess explains held-out
-highlights better than the right one, and a dark glossy material would lose all it shows.
+The specular part of a material that is Lambertian in truth would fit errors of normals and lights.  So each material in turn, the
+least specular first, is made Lambertian for a trial, the rest of the problem is brought near its optimum again, and `compare` decides.
+A material that reflects more specularly than diffusely is not tried: where normals are wrong, a blurred highlight explains held-out
+observations better than the true one, and a dark glossy material would lose all that it reflects.
 
-Iterations that do harm to what is held out decide nothing: with it out of their sight, a lobe may grow in the part of the light that
-it alone mirrors, and what is lost there says nothing about a specular part.
+A trial whose iterations raise the held-out loss decides nothing.  A lobe may then have grown in a part of the light that only held-out
+observations mirror, and their loss says nothing about the specular part.
 
-What is fitted again for a trial are the `LIGHTS` lights that show most of the material, so that a trial costs the same
-however large the set.
+A trial fits only the `LIGHTS` lights that show most of the material, so that its cost does not grow with the set.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from factorlib.solve.evidence import Candidates, Evidence, compare
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.thresholds import NEEDED_EARLY, SPECULAR
 
-FIRST, ITERATIONS = 3, 6  # iterations of a trial, and how many more where the first ones leave it open
+FIRST, ITERATIONS = 3, 6  # iterations of a trial, and further ones where the first do not decide
 LIGHTS = 8
 
 
@@ -57,9 +56,9 @@ class Trials:
     def near_optimum(
         self, lights: Sequence[int], materials: Materials, lambertian: Bool[np.ndarray, "m"], most: float = np.inf
     ) -> Point:
-        """Materials and the `lights` some iterations on, or as they are where those did harm to what is held out.
+        """The point of `materials` and `lights` after some iterations; the point before them if they raise the held-out loss.
 
-        most: only the `FIRST` iterations where the held-out loss then exceeds it
+        most: if the held-out loss exceeds it after the `FIRST` iterations, no more are made
         """
         own, judge, fixed = self.fitting.restricted(lights), self.problem.restricted(lights), specular_unknowns(lambertian)
         before = evaluate(own, Point(materials, self.start.restricted(lights).lights))
@@ -109,5 +108,5 @@ def without_needless_specular(
 
 
 def undecided(lambertian: Bool[np.ndarray, "m"]) -> list[Evidence]:
-    """The evidence where there is none: what was decided before."""
+    """For materials that are not tried: what was decided before, without losses."""
     return [Evidence(not one) for one in lambertian.tolist()]

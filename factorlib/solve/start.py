@@ -16,7 +16,7 @@ from factorlib.model.bounds import LEAST_REFLECTANCE
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 
-BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start; the gauge settles it in the end
+BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start; the gauge sets it in the end
 
 
 def starting_materials(blocks: Sequence[Block], count: int, specular_share: float, roughness: float) -> Materials:
@@ -28,7 +28,7 @@ def starting_materials(blocks: Sequence[Block], count: int, specular_share: floa
 
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
-    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; unseen materials get the middle one."""
+    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
     rows, right, weight = [], [], []
     for i, block in enumerate(blocks):
         for m in np.unique(block.material):

@@ -24,9 +24,9 @@ def damped_step(at: Iterate, damping: float, fixed: Bool[np.ndarray, "7m"] | Non
     """The step at the given Levenberg–Marquardt `damping`.
 
     fixed: unknowns of the materials that stay as they are
-    An unknown at a bound that the gradient pushes outward stays there; the others are clipped after the step, but for the weights,
-    which are fitted anew where it leads (descent).  Solved again, at most `TIGHTENINGS` times, while the step takes a sharpness out
-    of bounds or a lobe farther than the quadratic model is good for (`Bounds.tighten`).
+    An unknown at a bound stays there if the loss would fall beyond it.  Other unknowns are clipped to their ranges after the step;
+    weights are fitted anew instead (descent).  While the step takes a sharpness out of its range, or moves a lobe farther than the
+    quadratic model holds, it is solved again with tighter limits (`Bounds.tighten`), at most `TIGHTENINGS` times.
     """
     materials, system = at.point.materials, at.system
     free = ~materials_at_bound(materials, system.material_gradient) & (True if fixed is None else ~fixed)

@@ -1,4 +1,4 @@
-"""Where the rounds start when an earlier solution is given: what has a name there is taken over, the rest is found from it.
+"""Where the rounds start when an earlier solution is given: what has a name there is used, the rest is found from it.
 
     known   materials by their name, lights by their illumination's; the radiance unit of a block is taken out of its light,
             photos new to a light get the exposure that explains their median radiance
@@ -34,7 +34,7 @@ from factorlib.results.solution import Earlier
 from factorlib.solve.descent import Descent, descend
 from factorlib.solve.insertion import blurred, pruned
 from factorlib.solve.options import Bundle
-from factorlib.solve.roughness import materials_out_of_valleys
+from factorlib.solve.roughness import materials_of_best_roughness
 from factorlib.solve.rounds import Start, from_nothing, robust, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.weights import fitted_illumination
@@ -64,7 +64,7 @@ def from_earlier(earlier: Earlier, names: Sequence[str], specular: str) -> Start
 
 
 def known_of(earlier: Earlier, names: Sequence[str], blocks: Sequence[Block]) -> Known:
-    """Matched by name."""
+    """What the earlier solution says of materials `names` and of the blocks, matched by name."""
     rows, component = np.full((len(names), 7), 0.5), np.full(len(names), -1)
     for m, name in enumerate(names):
         if found := earlier.table.materials.get(name):
@@ -145,7 +145,7 @@ class Propagation:
         if not new:
             return False
         self.materials = self.materials.replaced(_guess(len(self.materials)), new)
-        found = materials_out_of_valleys(self.problem.restricted(lit), Point(self.materials, [self.lights[i] for i in lit]))
+        found = materials_of_best_roughness(self.problem.restricted(lit), Point(self.materials, [self.lights[i] for i in lit]))
         self.materials = self.materials.replaced(found, new)
         for m in new:
             shows = next(i for i in lit if (self.blocks[i].material == m).any())
@@ -174,7 +174,7 @@ class Propagation:
         self.component[members] = main
 
     def _rest(self) -> Point:
-        """What nothing known leads to, from mean radiances."""
+        """The point, with what is not linked to anything known from mean radiances."""
         start = from_nothing(len(self.materials)).point(self.problem, self.bundle)
         materials = self.materials.replaced(start.materials, np.flatnonzero(self.component < 0))
         return Point(materials, [light if known is None else known for known, light in zip(self.lights, start.lights, strict=True)])
@@ -213,7 +213,7 @@ def with_exposures(illumination: Illumination) -> Light:
 
 
 def brighter(illumination: Illumination) -> Float[np.ndarray, "3"]:
-    """By what factor observations are brighter than predicted, per channel."""
+    """The factor per channel by which observations are brighter than predicted (medians)."""
     predicted = np.median(illumination.radiance(), axis=0)
     return np.maximum(np.median(illumination.block.radiance, axis=0), 1e-6) / np.maximum(predicted, 1e-6)
 

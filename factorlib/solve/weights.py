@@ -1,7 +1,7 @@
 """Lobe weights given everything else: a non-negative least-squares problem per illumination and channel.
 
-Solved on the Cholesky factor of the Gram matrix, so its size is the number of lobes, not of observations; clipped
-channels that are already explained, and outliers, carry the weights of the current residual.
+It is solved on the Cholesky factor of the Gram matrix, so its size is the number of lobes, not of observations.  Clipped channels and
+outliers get the weights that they have at the current residual.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.solve.normal_equations import EnergyEquations, NormalEquations, energy_equations, normal_equations
 
-KEPT = 1 << 20  # responses of observations to lobes that are kept in memory; of more they are computed twice
+KEPT = 1 << 20  # responses of observations to lobes that stay in memory; if there are more, they are computed twice
 
 
 class Fitted(NamedTuple):
@@ -30,10 +30,10 @@ class Fitted(NamedTuple):
 
 
 def fitted_illumination(illumination: Illumination, loss: Loss) -> Fitted:
-    """The light with the weights that lower the loss most, all else as it is.
+    """The light with the weights that lower the loss most, while nothing else changes.
 
-    Observations that are clipped, outliers or toned make the loss one of more than least squares: a light whose fitted weights
-    would raise it keeps its own.
+    With clipped observations, outliers or tone curves the loss is not quadratic in the weights.  If the fitted weights would raise the
+    loss, the light keeps its own.
     """
     fitted = illumination.fitted()
     computed = fitted.responses()

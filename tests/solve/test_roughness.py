@@ -27,7 +27,7 @@ def problem(materials: int, lights: int):
 
 
 def searched(blocks, materials, lights):
-    return materials_out_of_valleys(JointProblem(blocks, OPERATOR), Point(materials, lights))
+    return materials_of_best_roughness(JointProblem(blocks, OPERATOR), Point(materials, lights))
 
 
 def test_a_roughness_far_off_is_found_again():
