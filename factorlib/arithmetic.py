@@ -1,7 +1,7 @@
 """The same bits on every processor: which instructions the numerical libraries may use, said in their own environment variables.
 
 NumPy, OpenBLAS, PyTorch and MKL choose their kernels by what the processor offers, and kernels differ in the order of their sums.
-A solve follows one rounding error into another valley of its loss.  So all of them are limited to AVX2, which every x86-64 processor
+One rounding error can lead a solve into another local minimum of its loss.  So all of them are limited to AVX2, which every x86-64 processor
 has had since 2013 (Haswell, Zen; x86-64-v3), and MKL to the code that it runs on processors of any maker.  On other architectures the
 variables mean nothing, and results agree to rounding alone.
 

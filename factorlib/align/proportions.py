@@ -29,7 +29,7 @@ from factorlib.meshes.mesh import Mesh, scaled
 
 SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d
 DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3, 0.1, 0.1]) ** -2.0  # as of `refine`, and of d
-LARGEST_STEP = 0.15  # of a step
+LARGEST_STEP = 0.15  # of the logarithms d; of other unknowns twice as much
 STILL = 1e-4  # a step of d that ends the descent
 PARTS = 4  # that are left out in turn, at most
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]

@@ -1,13 +1,13 @@
 """Which directions of a light the data constrain: the standard error of its radiance there.
 
-Let a be the whitened response of a lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian of what is
-solved for besides the lobes (materials, exposures, tones).  What the data say about the light's weight there, all that J could
-imitate left out and the light of other directions given, is the Schur complement
+Let a be the whitened response of a lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian by all unknowns
+other than the lobes (materials, exposures, tone curves).  With the light of other directions known, the information about the weight
+of this lobe is the Schur complement
 
     i_d = aᵀa − aᵀJ (JᵀJ)⁻¹ Jᵀa = ‖a‖² − ‖Qᵀa‖²,       Q an orthonormal basis of J's columns,                  (1)
 
-and 1/√i_d is the standard error of the radiance in direction d, averaged over that width.  It is large where no
-observation reflects d toward the camera, and in what only Lambertian materials see.
+and 1/√i_d is the standard error of the radiance in direction d, averaged over that width.  It is large where no observation reflects
+d toward the camera, and where only Lambertian materials do.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes
 from factorlib.model.loss import Loss
 
-PROBE_SHARPNESS = 100.0  # of the lobes that are asked about
+PROBE_SHARPNESS = 100.0  # of the lobes whose weight's error is computed
 WIDTH_DEG = float(np.degrees(np.sqrt(2 / PROBE_SHARPNESS)))  # where such a lobe has fallen to 1/e: 8°
 ROWS, LARGEST = 32, 1000.0
-SAMPLE = 1000  # observations that stand for all
+SAMPLE = 1000  # observations used; the information is scaled to all of them
 
 
 def relative_standard_errors(illumination: Illumination, loss: Loss, sigma: float) -> Float[np.ndarray, "h w 3"]:
@@ -65,7 +65,7 @@ def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n
 
 
 def _jacobians(illumination: Illumination, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
-    """Of each channel by all but the lobes, in the order of the block's rows; robust weights left out, since a lobe's atoms have none."""
+    """J of each channel, in the order of the block's rows, without robust weights, for `Illumination.atoms` has none either."""
     light, first = illumination.light, 7 * len(illumination.materials)
     unknowns = first + light.unknowns
     whole = [np.zeros((len(illumination.block), unknowns)) for _ in range(3)]

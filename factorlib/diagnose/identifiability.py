@@ -1,7 +1,6 @@
-"""What is not determined: by the observations alone, by the answer's standard errors, and where it explains too little.
+"""What is not determined: by the observations alone, by the answer's standard errors, and where residuals stay large.
 
-Every sentence names what is not determined, why, and which photo would help.  None stops the solve: what is determined
-is still found.  The factor per channel between reflectances and lights is `factorlib.model.gauge`'s matter, links between
+Every sentence names what is not determined, why, and which photo would help.  None of them stops the solve.  The factor per channel between reflectances and lights is `factorlib.model.gauge`'s matter, links between
 photos are `factorlib.diagnose.warnings`'.
 """
 
@@ -25,7 +24,7 @@ from factorlib.model.tone import beyond_cameras
 FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
 FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
 CLIPPED = 0.5  # share of channel values
-ROUGHNESS_ERROR = 0.1  # one standard error that tells dull from glossy
+ROUGHNESS_ERROR = 0.1  # largest standard error with which dull and glossy can be distinguished
 SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
 DARK = 0.1  # a bound on reflectance that still says 'dark'
 OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
@@ -115,7 +114,7 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
 
 
 def poorly_explained(problem: JointProblem, point: Point) -> list[str]:
-    """Illuminations whose observations the answer does not explain to the noise model, as sentences."""
+    """Illuminations with many residuals far beyond the noise model, as sentences."""
     said = []
     for block, residual in zip(problem.blocks, problem.residuals(point), strict=True):
         share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())

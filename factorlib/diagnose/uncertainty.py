@@ -12,9 +12,8 @@ clusters.  One is what a light sends toward nearby mirror directions: a region o
 share.  The other is a whole light: with few lobes it is wrong everywhere in ways that agree, and only other lights
 show it.  The largest of the three variances is taken, unknown by unknown.
 
-Scores are those of residuals up to the noise model's σ at least, where the answer was found with a narrower robust scale: what it set
-aside as an outlier is a part of the light that its lobes do not show, and by how much that would move the materials is what they are
-uncertain by.
+The robust scale of scores is the noise model's σ at least, even where the answer was found with a narrower one.  What the narrow scale
+treats as outliers are parts of the light that the lobes do not show, and how far these would move the materials is their uncertainty.
 
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
 Here the sum of diffuse and specular reflectance over a component's materials is fixed in each channel: with g the

@@ -1,10 +1,14 @@
-"""Which of an object's poses a photo's shading believes: the one found, that one moved by shading, or the runner-up.
+"""Which of an object's poses explains a photo's shading: the one found, that one moved by shading, or the runner-up.
 
-Every candidate gets a light of its own from the pixels that are fitted, with weights of the same lobes, and all are judged on the
-pixels held out, those that every candidate shows.  A candidate replaces the pose found only where it lowers the held-out loss by
-`least_gain` of itself and by SURE standard errors of that difference, cells being independent, and where it leaves the
-silhouette as it was but for `most_lost` of it (`rival` for the runner-up).  Where the silhouette fits better by more than
-`most_lost`, two witnesses agree and the gain alone is enough.  The same decides whether a runner-up is ruled out.
+Each candidate gets a light of its own, fitted to the pixels that are not held out; the lobes are the same for all candidates, the
+weights are not.  The candidates are compared on the held-out pixels that all of them show.  A candidate replaces the pose found if
+
+    its held-out loss is lower by the share `least_gain`,
+    the difference is more than SURE standard errors, with cells as independent samples, and
+    its labelled IoU is lower by `most_lost` at most (`rival` for the runner-up).
+
+The standard error does not matter where the IoU is higher by more than `most_lost`: then silhouette and shading agree.  By the same
+rule a runner-up is ruled out.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from factorlib.refine.light import pursued_light, robust_scale, together, with_w
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 SURE = 2.0
-ROUNDS = 6  # of pursuit: with 3, in glossy materials what is left over depends on which lobes were found first
+ROUNDS = 6  # of pursuit: with 3, the residual of glossy materials depends on which lobes were found first
 LEAST_SHOWN = 100  # pixels, of each kind
 
 
@@ -62,9 +66,11 @@ class Judged(msgspec.Struct, frozen=True):
 
 
 class Settled(msgspec.Struct, frozen=True):
-    """What shading says: the candidate to use, every candidate, and whether the runner-up has been tried and is another matter.
+    """The decision of one object.
 
-    chosen: "found" where nothing is better;  ruled_out: None where no runner-up was tried, or it is chosen
+    chosen      name of the candidate to use; "found" where nothing is better
+    candidates  every candidate that was compared, by name
+    ruled_out   whether the runner-up explains the shading clearly worse; None where none was tried, or it is chosen
     """
 
     chosen: str
@@ -105,7 +111,7 @@ def candidates(moving: Moving, found: State, runner_up: State | None, standards:
 
 
 def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, "n"]) -> list[Judged]:
-    """Every candidate, the first being the one that gains are relative to; empty where too few pixels are shown by all."""
+    """Every candidate, in the order of `states`; an empty list where too few pixels are shown by all of them."""
     seen = {name: moving.block(state, None) for name, state in states.items()}
     common = np.logical_and.reduce([agrees for _, agrees in seen.values()])
     held_out = next(iter(seen.values()))[0].held_out
@@ -140,7 +146,7 @@ def gain_of(before: Float[np.ndarray, "k"], after: Float[np.ndarray, "k"]) -> tu
 
 
 def is_better(one: Judged, than: Judged, standards: Standards) -> bool:
-    """Whether shading settles for `one`."""
+    """Whether `one` replaces `than`, by the rule above."""
     (gain, stderr), more = one.gain(than), one.score - than.score
     lost = standards.rival if "runner_up" in (one.name, than.name) else standards.most_lost
     agreed = more > standards.most_lost or gain > SURE * stderr

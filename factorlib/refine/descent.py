@@ -3,12 +3,12 @@
     photometric    r_ic(θ, w) = (Σ_p w_pc B_ipc(θ) − radiance_ic)/σ_ic        θ: turn 3, place 3, focal length
     contours       the normal equations of `factorlib.align.refine`
 
-w is linear: with A = ∂r/∂w over the lobes that shine and J = ∂r/∂θ, the pose sees only what no change of light explains,
+The residual is linear in w.  With A = ∂r/∂w over the lobes of positive weight and J = ∂r/∂θ, elimination of w leaves
 
     H = JᵀWJ − JᵀWA (AᵀWA)⁻¹ AᵀWJ,        g = JᵀWr − JᵀWA (AᵀWA)⁻¹ AᵀWr                                        (1)
 
-(Golub and Pereyra's variable projection in Kaufman's form).  Without it the light, which was fitted to the pose as it is, would
-hold the pose where it is.  J is taken from normals of poses a little to either side; pixels near an edge do not vote.
+(Golub and Pereyra's variable projection in Kaufman's form).  Without the elimination the pose would hardly move, for the light was
+fitted to the present pose.  J is a central difference over normals of poses a little to either side; pixels near an edge are left out.
 """
 
 from __future__ import annotations
@@ -35,18 +35,21 @@ RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
 EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
 DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
-LARGEST_STEP = 0.1  # of a step
+LARGEST_STEP = 0.1  # of each unknown, in its own unit
 
 
 class Moving(msgspec.Struct, frozen=True):
-    """The object that moves: what its contours are compared with, how all reflects, and observations of the photo with it in a state."""
+    """The object that moves: its mesh, what its contours are compared with, how surfaces reflect, and the photo's observations.
+
+    block: observations of all pixels with the object in a given state, and which of them show the material that the mask says
+    """
 
     caster: Caster
     target: Target
     camera: Camera
     prior: FocalPrior
     surfaces: Surfaces
-    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]  # all pixels, and which of them agree
+    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]
 
     def score(self, state: State) -> float:
         """Labelled IoU."""
@@ -55,7 +58,7 @@ class Moving(msgspec.Struct, frozen=True):
 
 
 class Photographed(msgspec.Struct, frozen=True):
-    """One object of a photo: the meshes over its pixels, the object's number, what its contours are, the camera and its focal length."""
+    """One object of a photo: the meshes over the pixels, the object's number, the camera, the masks, what is known of the focal length."""
 
     view: View
     number: int

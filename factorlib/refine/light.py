@@ -1,7 +1,7 @@
-"""The light that one photo asks for, given materials and normals: found anew for every pose, so that none is favoured.
+"""The light that explains one photo, given materials and normals.  It is found anew for every pose, so that no pose has an advantage.
 
-The light of the solve was fitted to the pose that is in question.  Here lobes are pursued from nothing over the dictionary of
-`factorlib.solve.insertion`, which no pose has had a say in, and their weights are a non-negative least-squares problem.
+The light of the solve was fitted to the pose that is to be tested, so it is not used.  Lobes are chosen by matching pursuit from the
+dictionary of `factorlib.solve.insertion`, which depends on no pose; their weights are a non-negative least-squares problem.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ RIDGE = 1e-4  # of the squared response of each lobe
 
 
 class Surfaces(msgspec.Struct, frozen=True):
-    """How all that a photo shows reflects: what is known before any pose is refined."""
+    """How the surfaces of a photo reflect: the solved materials and the reflection operator."""
 
     materials: Materials
     operator: Operator
 
     def under(self, light: Light, block: Block) -> Illumination:
-        """Their observations in a light."""
+        """Observations of these surfaces in a light."""
         return Illumination(block, light, self.materials, self.operator)
 
 
 def pursued_light(block: Block, surfaces: Surfaces, rounds: int = ROUNDS) -> Light:
-    """Explains what of the block is not held out."""
+    """The light of the observations that are not held out, by `rounds` of matching pursuit."""
     block = block.take(~block.held_out)
     light = starting_light(block, surfaces.materials)
     lobes = candidates(surfaces.under(light, block), 0, SAMPLE)
@@ -51,13 +51,13 @@ def pursued_light(block: Block, surfaces: Surfaces, rounds: int = ROUNDS) -> Lig
 
 
 def together(lights: Sequence[Light]) -> Light:
-    """All their lobes: candidates that choose weights of the same lobes differ by nothing else."""
+    """One light with the lobes of all, so that candidates can be compared with weights of the same lobes."""
     parts = [np.concatenate([getattr(light, name) for light in lights]) for name in ("axis", "log_sharpness", "weight")]
     return Light(*parts, lights[0].log_exposure)
 
 
 def with_weights(illumination: Illumination) -> Light:
-    """Its light with the weights ≥ 0 that explain best, robustly, what is not held out."""
+    """The illumination's light with the weights ≥ 0 that explain the observations not held out best, robustly."""
     block, light = illumination.block, illumination.light
     rows = np.flatnonzero(~block.held_out)
     atoms = illumination.atoms(rows, light.unit_lobes)
@@ -73,7 +73,7 @@ def with_weights(illumination: Illumination) -> Light:
 
 
 def _ridge(atoms: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
-    """Keeps lobes that look alike from taking turns."""
+    """A small ridge, so that the weights of lobes with similar responses are determined."""
     return RIDGE * np.diag(np.sum(atoms**2, axis=0))
 
 
@@ -84,5 +84,5 @@ def robust_scale(residual: Float[np.ndarray, "n 3"]) -> float:
 
 
 def robust_loss(residual: Float[np.ndarray, "n 3"]) -> Loss:
-    """The loss of that scale, without priors."""
+    """The loss whose scale is `robust_scale`, without priors."""
     return Loss(robust_scale(residual), prior=0.0)

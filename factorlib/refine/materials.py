@@ -1,4 +1,4 @@
-"""The materials that a solve found, and which of them it knows."""
+"""The materials that a solve found, and which of them are known well enough."""
 
 from __future__ import annotations
 

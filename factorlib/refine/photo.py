@@ -18,8 +18,12 @@ from factorlib.refine.pixels import Pixels, View
 
 
 class PosedObject(msgspec.Struct, frozen=True):
-    """An object: its pose as it was found, the pose that came second, whether it moves (a given pose does not), and whether its
-    pixels count for the light while others move (those of a doubtful pose do not)."""
+    """An object and its pose as it was found.
+
+    runner_up  the pose that came second
+    moves      whether the pose may change; one that was given may not
+    trusted    whether the object's pixels are used for the light while other objects move; those of a doubtful pose are not
+    """
 
     caster: Caster
     evidence: Evidence
@@ -40,7 +44,7 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 class Refined(msgspec.Struct, frozen=True):
-    """An object's pose as it was and now, as states from which the camera follows too, and what decided (None: it was not tried)."""
+    """An object's pose before and after, as states, which hold the focal length too; `settled` is None where no other was tried."""
 
     before: State
     after: State
@@ -81,5 +85,5 @@ def refined_photo(
 
 
 def by_pixels(objects: Sequence[PosedObject]) -> list[int]:
-    """Their numbers, the one with most pixels first."""
+    """Numbers of the objects, the one with most pixels in its mask first."""
     return sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k))

@@ -1,7 +1,7 @@
 """The pixels of a photo that poses are compared on, and what posed meshes show in them.
 
-A pixel is fixed, and so is its view direction; only the normal under it moves with a pose.  Held out are whole cells of the
-image, for neighbouring pixels err alike, and they are the same cells whatever the pose.
+A pixel and its view direction are fixed; only the normal that it shows changes with a pose.  Whole cells of the image are held out,
+because neighbouring pixels have similar errors.  The cells are the same for all poses.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def pixels_of(
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """normal [n, 3]: camera frame, unit; material: whether the mesh shows the material there that the mask does, facing the camera."""
+    """What meshes show at n pixels: unit normals in the camera frame, and whether the mesh shows the mask's material, facing the camera."""
 
     normal: Float[np.ndarray, "n 3"]
     agrees: Bool[np.ndarray, "n"]

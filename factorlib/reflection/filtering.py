@@ -12,10 +12,10 @@ i* = 2(o·h*)h* − o and J = ∂i/∂p:  |i − z|² ≈ |i* + J(p − p*) − 
 
     V = (λ' JᵀJ)⁻¹,     c = p* + (JᵀJ)⁻¹ Jᵀz,     and a factor e^{−λ(1 − i*·z)²/2} for the part of z − i* along i*.          (2)
 
-Where the product of light and D has its weight depends on both: about the half vector of o and z if the light is the
-narrower, about p = 0 if D is; where both are narrow and far apart the product has a mode at each, of which the heavier is
-taken.  So p* is a blend of the two, improved by one Gauss–Newton step to the product's mode.  The mean and spread of n·i
-there say how much of the light is above the horizon, by a logistic law.
+The product of light and D is large about the half vector of o and z if the light is the narrower of the two, and about p = 0 if D is.
+If both are narrow and far apart, the product has two modes, and the one of larger integral is taken.  So p* is a blend of the two
+places, improved by one Gauss–Newton step to the product's mode.  From the mean and deviation of n·i there, a logistic law gives the
+part of the light above the horizon.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The reflection networks' values and gradients as C functions, compiled on first use.
 
-The formulas stay where they are, in torch: they are run once on a `Tape`, which knows their derivatives and writes both
-as C into kernel.c, which can leave the derivatives out.  The network's derivative by its features comes between: with t = tanh(net/s) the result is
-R = formula · exp(fade · s · t), so that BACKWARD is seeded by ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
+The formulas are written once, in torch.  They are run on a `Tape`, which derives their derivatives and writes both as C into kernel.c;
+that code can leave the derivatives out.  With t = tanh(net/s) the result is R = formula · exp(fade · s · t).  kernel.c computes the
+network and its derivative by the features itself, and its part BACKWARD begins with ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
 
 Without a C compiler (`cc`, or what CC says) torch computes the same, an order of magnitude slower.
 """

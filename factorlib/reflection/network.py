@@ -2,9 +2,9 @@
 
     R = closed form · exp(s · tanh(net(features) / s)),     s = 8
 
-Features are smooth functions of the symmetric inputs, most of them what the formula is made of: where it expanded the
-light, how far the product is from the normal, how much is above the horizon.  A lobe sharper than the training saw keeps
-the formula's limit: the correction fades as 1/√λ.
+Features are smooth functions of the symmetric inputs; most of them are intermediate results of the formula: the point p* about which
+the light was expanded, the distance of the product from the normal, the part above the horizon.  For lobes sharper than in training
+the correction fades as 1/√λ, so that the formula's limit stays.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The paper's operator: plain fully connected networks, one for the diffuse part and one for the specular one.
 
 Wang, Ritschel and Mitra (arXiv 1710.08313) let networks of 288-wide layers, applied to every pixel and colour channel
-alike, answer for the reflection of one lobe, having learned it from 200,000 pixels of rendered spheres.  This is the
-baseline of every comparison: it knows nothing of what a reflection is.  Its 12 inputs, in the camera frame:
+alike, compute the reflection of one lobe; they are trained on 200,000 pixels of rendered spheres.  This is the baseline of every
+comparison: no formula of reflection is built in.  Its 12 inputs, in the camera frame:
 
     n, half       normal and half vector, (2(n·o)n − o + (0, 0, −1)) / 2      3 + 3    half: specular only
     z, log σ      the lobe's axis and precision, λ = 2σ                       3 + 1

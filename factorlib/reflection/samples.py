@@ -1,4 +1,4 @@
-"""Samples of the reflection operator's inputs, for training and for measuring: what a solve meets, evenly.
+"""Samples of the reflection operator's inputs, for training and for measuring, spread evenly over what occurs in a solve.
 
 α log-uniform in [.01, 1], sharpness log-uniform in [.3, 5000], n·o uniform in [.02, 1]; the lobe's axis about the mirror
 direction with a spread of 2√(α²/2 + 1/λ) for two thirds, uniform on the sphere for one third.

@@ -1,8 +1,8 @@
 """Derivatives and C code of an elementwise function that is written in torch.
 
-A `Value` stands for a tensor while the function runs once; what it computes is recorded on a `Tape`, each distinct
-operation once.  `Tape.gradient` walks back over it and records the derivatives in the same way (reverse mode), and
-`Tape.c_code` says the operations that some result needs as C statements on floats, one expression per line.
+The function is run once with a `Value` in place of each tensor, and its operations are recorded on a `Tape`, equal ones only once.
+`Tape.gradient` goes backward over the tape and records the derivatives in the same way (reverse mode).  `Tape.c_code` writes the
+operations that given results need as C statements on floats, one a line.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Training of the reflection networks on samples of the reference.
 
 The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at its tip; Adam, with a step that warms up and
-falls to zero by a cosine; samples of large error are seen more often, since the worst case matters as the mean does.  The
-weights that are kept are those of the least held-out error, and training stops where that has long ceased to fall.
-Everything is seeded and the threads are fixed, so that the same parameters give the same bytes, killed in between or not.
+falls to zero by a cosine.  Samples of large error are drawn more often, because the worst case matters as much as the mean.  The
+weights of the least held-out error are kept, and training stops when that error has not fallen for PATIENCE points of the curve.
+Seeds and threads are fixed, so that the same parameters give the same bytes, also after a kill and a restart.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class Run:
 
 
 def robust(error: Tensor) -> Tensor:
-    """|e| away from its tip, and more than that where e is large, so that no single case is left behind."""
+    """About |e|, smooth at 0, plus 2e², so that single large errors count more."""
     return torch.sqrt(error * error + 1e-6) + 2 * error * error
 
 
