@@ -18,6 +18,7 @@ class Meter:
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
 
     def read(self, threads: int, cores: int) -> dict:
+        """Cost since the meter was made: wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
         return {
             "started": self.started,
             "seconds": round(time.perf_counter() - self.wall, 3),

@@ -31,10 +31,12 @@ class Pools:
         self._busy: dict[Future, tuple[int, Executor]] = {}
 
     def free(self, cores: int) -> bool:
+        """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
         busy = sum(taken for taken, _, _ in self._busy.values())
         return busy == 0 or busy + cores <= self.cores
 
-    def submit(self, cores: int, threads: int, function: Callable, *arguments) -> Future:
+    def submit(self, cores: int, threads: int, function: Callable, *arguments: Any) -> Future:
+        """Start `function(*arguments)` in a worker process of `threads` threads, which takes `cores` cores; returns its future."""
         with whole(), _OfWorkers():
             spare = self._spare.setdefault(threads, [])
             executor = spare.pop() if spare else _executor(threads)
@@ -47,11 +49,13 @@ class Pools:
             return future
 
     def done(self, future: Future) -> None:
+        """Take a finished future's worker back, for the next step of as many threads."""
         _, threads, executor = self._busy.pop(future)
-        self._idle[threads].append(executor)
+        self._spare[threads].append(executor)
 
     def close(self, kill: bool = False) -> None:
-        executors = [e for idle in self._idle.values() for e in idle] + [executor for _, _, executor in self._busy.values()]
+        """End all worker processes; `kill`: at once, whatever they do."""
+        executors = [e for spare in self._spare.values() for e in spare] + [executor for _, _, executor in self._busy.values()]
         for executor in executors:
             executor.shutdown(wait=False, cancel_futures=True)
         if kill:

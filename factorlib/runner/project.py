@@ -87,6 +87,7 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def pipeline_file(self) -> Path:
+        """The file that declares the stages."""
         return self.root / PIPELINE
 
     @property

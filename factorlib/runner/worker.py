@@ -149,7 +149,7 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
         return list(pool.map(function, items))
 
 
-def params_of(module: ModuleType, code: Code):
+def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
     """The stage's parameters as its own struct, every bound checked."""
     return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
 
