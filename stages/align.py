@@ -15,7 +15,7 @@ from factorlib.align.external_camera import focal_and_centre
 from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
-from factorlib.align.place import Placed, Thing, placed
+from factorlib.align.place import KnownFocal, ObjectToPlace, Placed, placed
 from factorlib.align.search import Found, Search
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
@@ -53,27 +53,29 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
-    things = things_of(slice_, channels, inputs, params, facts.factor, earlier)
-    camera, focal, focal_source = camera_of(slice_, facts, name)
-    hold_against(slice_, things, channels["label"], inputs.facts["dataset.materials"], camera, focal, name)
+    objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
+    camera, known = camera_of(slice_, facts, name)
+    check_given_poses(slice_, objects, name)
+    warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], inputs.facts["dataset.materials"], name)
+    warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
     before = earlier_focal(earlier.camera, facts.factor) if earlier else None
-    result = placed(things, camera, focal, focal_source, name, params.search, before)
-    maps = rasterise([thing.caster for thing in things], result.camera, result.poses)
+    result = placed(objects, camera, known, name, params.search, before)
+    maps = rasterise([each.caster for each in objects], result.camera, result.poses)
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     external = slice_.external.source if slice_.external else None
     sources = {thing.name: "given" if thing.pose else external for thing in slice_.objects}
-    objects = {thing.name: entry(thing, k, result, maps, params, sources[thing.name]) for k, thing in enumerate(things)}
-    for thing_name, found in objects.items():
-        complain(name, thing_name, found, params.strict)
-    left_out = np.isin(maps.object, [k for k, found in enumerate(objects.values(), start=1) if found.left_out])
+    entries = {each.name: entry(each, k, result, maps, params, sources[each.name]) for k, each in enumerate(objects)}
+    for object_name, found in entries.items():
+        complain(name, object_name, found, params.strict)
+    left_out = np.isin(maps.object, [k for k, found in enumerate(entries.values(), start=1) if found.left_out])
     write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
-    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), objects))
+    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), entries))
 
 
-def things_of(
+def objects_of(
     slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: PhotoPoses | None = None
-) -> list[Thing]:
+) -> list[ObjectToPlace]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
     objects = []
@@ -86,8 +88,8 @@ def things_of(
         caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
         evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
         found = earlier_pose(before) if before else None
-        things.append(Thing(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
-    return things
+        objects.append(ObjectToPlace(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
+    return objects
 
 
 def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
@@ -114,20 +116,20 @@ def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
     return Keypoints(np.array([k.pixel for k in thing.keypoints]) / factor, np.array([k.point for k in thing.keypoints]))
 
 
-def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, float | None, str | None]:
-    """The photo's camera, its focal length to be settled later; that length, if anything is known of it, and where from.
+def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
+    """The photo's camera, its focal length to be found later, and what is known of that length.
 
     What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
     Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
     """
     factor, (width, height) = facts.factor, facts.original_size
     focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
-    if slice_.told is not None and (source != "dataset" or slice_.camera.principal_point is None):
-        told_focal, centre = camera_told(slice_.told, width, height, photo)
+    if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
+        external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
         if source != "dataset":
             focal, source = external_focal / factor, slice_.external.source
     across, down = slice_.camera.principal_point or centre
-    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), focal, source
+    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)
 
 
 def camera_entry(result: Placed, factor: int) -> CameraEntry:
@@ -137,7 +139,7 @@ def camera_entry(result: Placed, factor: int) -> CameraEntry:
     return CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, factor)
 
 
-def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
+def entry(thing: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
     """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
@@ -161,6 +163,7 @@ def entry(thing: Thing, k: int, result: Placed, maps: Maps, params: Params, sour
 
 
 def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
+    """The second-best pose as it stands in poses.json; None where no other was found."""
     if found is None or found.runner_up is None:
         return None
     other = found.runner_up
@@ -168,7 +171,8 @@ def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
 
 
 def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
-    cure = CURE_OF_TOLD if entry.source in schema.SOURCES else CURE
+    """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
+    cure = CURE_OF_EXTERNAL if entry.source in schema.SOURCES else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=cure)

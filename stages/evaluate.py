@@ -59,7 +59,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(3, 3)
 
 
-def _against_truth(inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen, component) -> dict:
+def _against_truth(
+    inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen: dict[str, list[str]], component: dict[str, int]
+) -> dict:
     materials = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
     estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the gauge of the exported lights
     true_lights = {n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()}

@@ -52,6 +52,7 @@ class Found(msgspec.Struct, frozen=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Fit the proportions of every mesh, and write meshes.json and poses.json."""
     poses, slices = read_poses(inputs["align"] / FILE), inputs.facts["dataset.objects"]
     found: dict[str, list[Found]] = {}
     for photo in sorted(poses):
@@ -70,7 +71,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_poses(out / FILE, poses)
 
 
-def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: Inputs, params: Params):
+def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: Inputs, params: Params) -> Iterator[tuple[str, Found]]:
     """(mesh, sighting) of every object whose pose was found, with its mask and the mesh as its file has it."""
     channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_photo_facts(inputs["masks"] / f"{photo}.json")
     height, width = channels["label"].shape

@@ -49,11 +49,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     observations = observations_of_photo(
         photo,
         geometry,
-        name=name,
-        illumination=light["illumination"],
-        materials=inputs.facts["dataset.materials"],
-        least_confidence=params.least_confidence,
-        exposure=read_photo_facts(inputs["masks"] / f"{name}.json").exposure,
+        Taken(name, light["illumination"], read_photo_facts(inputs["masks"] / f"{name}.json").exposure),
+        inputs.facts["dataset.materials"],
+        params.least_confidence,
     )
     if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)

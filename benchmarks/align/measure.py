@@ -11,7 +11,7 @@ from benchmarks.align.cases import Case, case
 from benchmarks.solve.clock import Clock
 from factorlib.align.doubts import doubts
 from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou
-from factorlib.align.place import Thing, placed
+from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import Found, RunnerUp, Search
 from factorlib.align.trust import Trust, trust_in
 from factorlib.geometry.camera import Camera

@@ -41,6 +41,19 @@ class Candidate(msgspec.Struct, frozen=True):
     error: float
 
 
+class Density(msgspec.Struct, frozen=True):
+    """How densely rotations are tried, and which guesses are kept.
+
+    views      directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
+    keep       guesses at most, each turned by `apart_deg` at least against the others
+    """
+
+    views: int
+    rolls: int
+    keep: int
+    apart_deg: float
+
+
 def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """A rotation cam_from_object that looks along `direction` of the object's frame."""
     side = np.eye(3)[np.argmin(np.abs(direction))]

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.evidence import labelled_iou
-from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined
+from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined, rendered
 from factorlib.align.state import State
 from factorlib.align.target import Target
 from factorlib.geometry.camera import Camera

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.coarse import candidates, is_cut
+from factorlib.align.coarse import Density, candidates, is_cut
 from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior, Refined, refined
 from factorlib.align.state import State

@@ -18,8 +18,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from factorlib.align.evidence import Evidence
-from factorlib.align.place import Placed, Thing
-from factorlib.align.refine import FocalPrior, contour_of, normal_equations
+from factorlib.align.place import ObjectToPlace, Placed
+from factorlib.align.refine import FocalPrior, contour_of, normal_equations, rendered
 from factorlib.align.search import Search, find, normal_difference
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of

@@ -8,6 +8,8 @@ Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the dista
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -18,7 +20,16 @@ from factorlib.results.metrics import AngleError, NormalError, PoseError
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
 
 
-def normal_error(estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]):
+class RigidLike(Protocol):
+    """A rigid transform: a rotation matrix [3, 3] and a translation [3], as arrays or as rows of numbers."""
+
+    rotation: Any
+    translation: Any
+
+
+def normal_error(
+    estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> NormalError | None:
     """Errors over the pixels of `mask` where both normals are known (not zero); None where there is none."""
     known = mask & (np.linalg.norm(estimate, axis=-1) > 0.5) & (np.linalg.norm(truth, axis=-1) > 0.5)
     if not known.any():

@@ -38,6 +38,7 @@ class Appearances:
         self.glossy: dict[float, Samples] = {}
 
     def ball(self, material: Reflectance) -> Samples:
+        """Radiance of a ball of `material`, one row per normal, RGB."""
         value = np.asarray(material.diffuse) * self.diffuse
         if not any(material.specular):
             return value

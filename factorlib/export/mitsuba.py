@@ -74,6 +74,7 @@ def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflecta
 
 
 def write_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment) -> None:
+    """Write the text of `scene_xml` to `path`."""
     write_text(path, scene_xml(view, shapes, materials, light))
 
 

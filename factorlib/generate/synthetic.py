@@ -19,7 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.lights import Things
 from factorlib.generate.shapes import SHAPES
-from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
+from factorlib.generate.tracing import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh

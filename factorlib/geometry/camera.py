@@ -20,6 +20,7 @@ class Camera(msgspec.Struct, frozen=True):
     centre: tuple[float, float]  # principal point
 
     def colmap(self) -> pycolmap.Camera:
+        """The same camera as pycolmap's."""
         parameters = [self.focal, *self.centre]
         return pycolmap.Camera(model="SIMPLE_PINHOLE", width=self.width, height=self.height, params=parameters)
 
@@ -51,9 +52,11 @@ class Pose(msgspec.Struct, frozen=True):
     translation: Float[np.ndarray, "3"]
 
     def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the object frame in camera coordinates."""
         return points @ self.rotation.T + self.translation
 
     def colmap(self) -> pycolmap.Rigid3d:
+        """The same transform as pycolmap's."""
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), self.translation)
 
 

@@ -129,9 +129,11 @@ def toward_viewer(
 
 
 def face_normals(mesh: Mesh, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Unit normals of the triangles `face` of a mesh, by the winding of their corners, object frame."""
     a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
     return unit(np.cross(b - a, c - a))
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Vectors of length 1; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

@@ -1,4 +1,4 @@
-"""Directions: even sets of them, those that mirrors show, and cells to tell which are alike."""
+"""Directions: evenly spread ones, mirror directions, and cells of similar directions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """The same lattice turned and mirrored, from which the search for poses looks: other views would find other poses' last digits.
+    """The same lattice turned and mirrored: the views from which poses are searched.  Other views would change the last digits of poses.
 
     >>> float(np.abs(fibonacci_directions(500).mean(axis=0)).max()) < 1e-2
     True
@@ -37,7 +37,7 @@ def mirror_directions(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray,
 
 
 def mirror_cells(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n"]:
-    """A name of the cell, a cube of `size` cut by the unit sphere, in which each observation's mirror direction lies."""
+    """Number of the cell in which each observation's mirror direction lies; cells are cubes with sides of length `size`."""
     return np.floor((mirror_directions(normal, view) + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
 
 

@@ -1,4 +1,4 @@
-"""What is held out together: observations that see the same region of a light err alike."""
+"""What is held out together: observations that mirror the same region of a light, whose errors are similar."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.align.evidence import Evidence, labelled_iou
-from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations
+from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations, rendered
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, Pose

@@ -14,7 +14,7 @@ UNKNOWN = 0.7  # standard error of a diffuse reflectance, in its range of 1: one
 
 
 def known_materials(solved: Sequence[Solved]) -> tuple[Materials, Bool[np.ndarray, "m"]]:
-    """All of them as arrays, and which are known."""
+    """The materials as arrays, in order, and which of them are known."""
     rows = [[*one.diffuse, *one.specular, one.roughness] for one in solved]
     known = [min(one.stderr.diffuse) < UNKNOWN for one in solved]
     return Materials.of_vector(np.array(rows, dtype=float).reshape(-1)), np.array(known, dtype=bool)

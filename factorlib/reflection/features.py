@@ -29,6 +29,7 @@ class Layers(msgspec.Struct, frozen=True):
         return torch.nn.functional.linear(x, self.weights[-1], self.biases[-1])[..., 0]
 
     def to(self, dtype: torch.dtype) -> Layers:
+        """The same network in another floating-point type."""
         return Layers(self.mean.to(dtype), self.scale.to(dtype), [w.to(dtype) for w in self.weights], [b.to(dtype) for b in self.biases])
 
 
@@ -73,6 +74,10 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
 
 
 def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
+    """Features: bounded, smooth, and of the order of one.
+
+    lam: λ';  mean, along, across: the lobe's moments, as `lobe_moments` gives them
+    """
     u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
     widths = mean, torch.log(lam.clamp_max(2e4)), across
     return *widths, nz, nz * nz, mean * nz, u * torch.rsqrt(1 + u * u), u * torch.rsqrt(8 + u * u)

@@ -29,7 +29,7 @@ from torch import Tensor
 from factorlib.errors import InputError
 from factorlib.reflection.diffuse import diffuse_of_moments
 from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
-from factorlib.reflection.filtering import filtered
+from factorlib.reflection.filtering import Width, filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value

@@ -114,6 +114,7 @@ def _side(observations: int) -> int:
 
 
 def light_row(run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None) -> LightRow | None:
+    """The row of light `name`; None where no such light was exported.  errors: its part of metrics.json"""
     radiance = run.illumination(name)
     if radiance is None:
         return None

@@ -40,6 +40,7 @@ class PoseRow(msgspec.Struct, frozen=True):
 
 
 def pose_rows(run: Artifacts) -> list[PoseRow]:
+    """A row for every photo that has an entry in poses.json, in the set's order."""
     poses, facts = run.poses(), run.photo_facts()
     return [_row(run, photo, poses[photo], facts.get(photo)) for photo in run.set.photos if photo in poses]
 

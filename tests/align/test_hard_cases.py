@@ -9,7 +9,7 @@ import trimesh
 
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.evidence import Evidence, label_agreement, silhouette_iou
-from factorlib.align.place import Thing, placed
+from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import Search
 from factorlib.align.trust import trust_in
 from factorlib.errors import InputError

@@ -7,7 +7,7 @@ import pytest
 
 from factorlib.align.evidence import Evidence
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
-from factorlib.align.place import Thing, placed
+from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import focal_prior
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.told import camera_told
+from factorlib.align.external_camera import focal_and_centre
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import ExternalCamera
 from factorlib.dataset.slices import dataset_slice

@@ -111,16 +111,16 @@ def centroid(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_light_of_one_texel_comes_back_from_its_side(folder, side):
-    matte = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
-    path = ball_scene(folder, matte, one_lobe(SIDES[side]))
+    lambertian = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    path = ball_scene(folder, lambertian, one_lobe(SIDES[side]))
     np.testing.assert_allclose(np.sign(np.round(centroid(rendered(path, spp=32)), 1)), SIDES[side][:2])
 
 
 def test_light_fixed_to_the_world_turns_with_the_camera(folder):
     turn = made_export.WORLD_FROM_CAMERA["side"]
-    matte = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
-    still = rendered(ball_scene(folder, matte, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
-    turned = rendered(ball_scene(folder, matte, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64)
+    lambertian = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+    still = rendered(ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
+    turned = rendered(ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64)
     np.testing.assert_allclose(centroid(turned), centroid(still), atol=0.01)
     assert turned.mean() == pytest.approx(still.mean(), rel=0.01)
 

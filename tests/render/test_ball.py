@@ -8,7 +8,7 @@ from factorlib.render.ball import ball, ball_normals, observed_cells
 from factorlib.render.reflect import Reflector
 from factorlib.results.materials import Reflectance
 
-MATTE = Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)
+LAMBERTIAN = Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)
 
 
 def brightest(axis) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.roughness import materials_out_of_valleys, reflectances
+from factorlib.solve.roughness import materials_of_best_roughness, reflectances
 
 OPERATOR = reflection_operator("network")
 
