@@ -60,7 +60,7 @@ def allowed(of: Type) -> str:
     """What a value may be.
 
     >>> allowed(type_info(int)), allowed(IntType(ge=1, le=1024)), allowed(FloatType(gt=0)), allowed(type_info(bool))
-    ('whole number', '1 … 1024', 'number > 0', 'true, false')
+    ('whole number', '1 … 1,024', 'number > 0', 'true, false')
     """
     if isinstance(of, IntType | FloatType):
         return _range(of)
