@@ -196,8 +196,9 @@ def measured(dataset: str, photos: bool) -> dict:
     leaving = sum(1 if len(b.photos) == 1 else len(b.photos) for b in seen) if photos else 0
     result: dict = {"parts": {"flat": _summary([flat(split) for split in splits])}}
     with tqdm(total=len(VARIANTS) + leaving, desc=dataset) as bar:
+        whole = None
         for name, how in VARIANTS.items():
-            solution = whole if how and not _differs(how, whole) else solved(seen, count, operator, how)
+            solution = whole if whole is not None and how and not _differs(how, whole) else solved(seen, count, operator, how)
             lobes = [len(light) for light in solution.point.lights]
             result["parts"][name] = _summary(unseen(splits, solution, operator)) | {"lobes": [min(lobes), max(lobes)]}
             if not how:

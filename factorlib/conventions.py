@@ -44,7 +44,7 @@ def lat_long_of_direction(direction: Float[np.ndarray, "*batch 3"]) -> tuple[np.
     return row, column
 
 
-def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, "height"]:
+def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, " height"]:
     """Exact solid angle of one texel of each row, steradians; height × width texels sum to 4π.
 
     >>> round(float(lat_long_solid_angles(8, 16).sum() * 16 / (4 * np.pi)), 12)

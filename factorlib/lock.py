@@ -13,6 +13,8 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from factorlib.wholefile import write_text
+
 ROOT = Path(__file__).resolve().parent.parent
 HEAD = """\
 # Every package of .venv, pinned; installed without looking for more (torch apart, see factorlib/setup.py).
@@ -54,5 +56,5 @@ def lock_text() -> str:
 
 
 if __name__ == "__main__":
-    (ROOT / "requirements.lock").write_text(lock_text())
+    write_text(ROOT / "requirements.lock", lock_text())
     sys.stdout.write("requirements.lock is written\n")

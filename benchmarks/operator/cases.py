@@ -40,8 +40,8 @@ COUNT = 6  # random directions of a place that is not one direction
 class Pairs(msgspec.Struct, frozen=True):
     """Points under one lobe each, float64; vectors are unit, [k, 3]."""
 
-    roughness: Float[Tensor, "k"]
-    sharpness: Float[Tensor, "k"]
+    roughness: Float[Tensor, " k"]
+    sharpness: Float[Tensor, " k"]
     normal: Float[Tensor, "k 3"]
     view: Float[Tensor, "k 3"]
     axis: Float[Tensor, "k 3"]
@@ -49,7 +49,7 @@ class Pairs(msgspec.Struct, frozen=True):
     def __len__(self) -> int:
         return len(self.roughness)
 
-    def scale(self) -> Float[Tensor, "k"]:
+    def scale(self) -> Float[Tensor, " k"]:
         """E/100, what errors are measured in beside the value itself."""
         return lobe_integral(self.sharpness) / 100
 
@@ -129,13 +129,13 @@ def across(axis: Float[Tensor, "k 3"], vector: Float[Tensor, "k 3"]) -> Float[Te
     return vector - (axis * vector).sum(1, keepdim=True) * axis
 
 
-def value_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, "k"]:
+def value_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, " k"]:
     """|a − b| / (b + E/100), the greater of diffuse and specular."""
     parts = [(a.fields[p] - b.fields[p]).abs() / (b.fields[p] + given.scale()) for p in ("diffuse", "specular")]
     return torch.maximum(*parts)
 
 
-def gradient_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, "k"]:
+def gradient_error(a: Found, b: Found, given: Pairs) -> Float[Tensor, " k"]:
     """|∂a − ∂b| / (|∂b| + b + E/100): the greatest of all derivatives that mean something alone."""
     worst = torch.zeros(len(given), dtype=torch.float64)
     for name in ("diffuse_by_log_sharpness", "diffuse_by_nz", "specular_by_roughness", "specular_by_log_sharpness"):

@@ -37,7 +37,7 @@ def drawn(domain: Domain, count: int) -> tuple[Tensor, ...]:
     return alpha, lam, no, nz, oz
 
 
-def each(operator: Operator, *scalars: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
+def each(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
     """The specular part of α, λ, n·o, n·z, o·z that share nothing."""
     a, lam, no, nz, oz = (t.to(operator.dtype) for t in scalars)
     with torch.no_grad():
@@ -54,7 +54,7 @@ def grazing(domain: Domain, count: int) -> tuple[Tensor, ...]:
     return alpha, lam, no, nz, domain.least_no * nz - so * sz * torch.cos(turn)
 
 
-def tail(error: Float[Tensor, "k"]) -> tuple[float, float]:
+def tail(error: Float[Tensor, " k"]) -> tuple[float, float]:
     """The 99th percentile and the largest."""
     return float(error.quantile(0.99)), float(error.max())
 

@@ -100,7 +100,7 @@ def candidates(caster: Caster, evidence: Evidence, camera: Camera, density: Dens
 
 
 def _cost_images(
-    evidence: Evidence, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, "rolls"]
+    evidence: Evidence, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, " rolls"]
 ) -> tuple[np.ndarray, float]:
     """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area

@@ -96,7 +96,7 @@ class Equations(msgspec.Struct, frozen=True):
     """k unknowns, the first seven those of `State.moved`."""
 
     information: Float[np.ndarray, "k k"]
-    gradient: Float[np.ndarray, "k"]
+    gradient: Float[np.ndarray, " k"]
     scale: float
 
     def step(self, move_focal: bool) -> Float[np.ndarray, "7"]:

@@ -57,7 +57,7 @@ def light_standard_errors(
         return sigma / np.sqrt(np.stack(information, 1) * count / len(rows))
 
 
-def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "d"]:
+def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " d"]:
     """Equation (1)."""
     u, values, _ = np.linalg.svd(jacobian, full_matrices=False)
     basis = u[:, values > 1e-9 * max(float(values.max(initial=0.0)), 1e-300)]

@@ -45,7 +45,7 @@ def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block]) 
     return said
 
 
-def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]) -> Iterator[str]:
+def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, " n"]]]) -> Iterator[str]:
     count = sum(int(rows.sum()) for _, rows in shown)
     if count < FEW:
         yield (
@@ -65,7 +65,7 @@ def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, "n"]]]
         )
 
 
-def _spread(block: Block, rows: Bool[np.ndarray, "n"]) -> float:
+def _spread(block: Block, rows: Bool[np.ndarray, " n"]) -> float:
     """Largest angle between a mirror direction and their mean, degrees."""
     normal, view = block.normal[rows], block.view[rows]
     mirror = mirror_directions(normal, view)

@@ -90,7 +90,7 @@ def _sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"
     return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
 
 
-def clusters_of(block: Block) -> Int[np.ndarray, "n"]:
+def clusters_of(block: Block) -> Int[np.ndarray, " n"]:
     """The number of each observation's cluster."""
     return np.unique(mirror_cells(block.normal, block.view, CLUSTER), return_inverse=True)[1].reshape(-1)
 

@@ -49,7 +49,7 @@ def averaged_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[n
     return np.where(enough, mean / np.where(enough, length, 1), 0)
 
 
-def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Angles between vectors of any length, exact for small ones too.
 
     >>> angles_deg(np.array([[1.0, 0, 0]]), np.array([[0, 2.0, 0]])).tolist()

@@ -147,7 +147,7 @@ def _scored_view(
     }
 
 
-def _part(view: str, seen: Bool[np.ndarray, "t"] | None) -> slice | np.ndarray | None:
+def _part(view: str, seen: Bool[np.ndarray, " t"] | None) -> slice | np.ndarray | None:
     """The texels of a view: all of a sphere and of the whole map; None where a part of the map is empty or unknown."""
     if view not in ("map_mirrored", "map_unmirrored"):
         return slice(None)

@@ -132,7 +132,7 @@ def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
-def legs(sides: int, rings: int, radii=SHAPE.leg_radii) -> Part:
+def legs(sides: int, rings: int, radii: tuple[float, float, float] = SHAPE.leg_radii) -> Part:
     """Four legs and the struts between neighbours."""
     top = [np.array([x, SHAPE.seat_y, z]) for x, z in SHAPE.tops]
     foot = [np.array([x, 0.0, z]) for x, z in SHAPE.feet]
@@ -144,7 +144,7 @@ def legs(sides: int, rings: int, radii=SHAPE.leg_radii) -> Part:
     return np.concatenate([d[0] for d in dowels]), np.concatenate([d[1] + offset for d, offset in zip(dowels, first)])
 
 
-def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii, sides: int, rings: int) -> Part:
+def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: tuple[float, float, float], sides: int, rings: int) -> Part:
     """A closed round rod of radius `radii` at its start, middle and end."""
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(axis, [0.3, 0.2, 1.0])

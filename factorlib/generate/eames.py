@@ -54,7 +54,7 @@ class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance: float
     eye: float
     focal_35mm: int
-    told: str
+    focal_known_from: str
     sun: tuple[float, float] | None = None
     turbidity: float = 4.0
     windows: int = 2
@@ -146,7 +146,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     labels = folder.labels_of(meshes, scene.camera, poses)
     radiance = traced(scene.things | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, -1)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT))
-    folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, shot.focal_35mm if shot.told == "exif" else None)
+    folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, shot.focal_35mm if shot.focal_known_from == "exif" else None)
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
     for name, mask in own_masks(scene, meshes, poses).items():
         folder.write_labels(out / name, np.where(mask, 255, 0))
@@ -181,16 +181,17 @@ def own_masks(scene: Scene, meshes: Sequence[Mesh], poses: Sequence[Pose]) -> di
 
 
 def own_mask(shot: Shot, name: str) -> str:
+    """Path of the silhouette of chair `name`, relative to the data set."""
     return f"masks/{shot.name}_{name}.png"
 
 
 def entry(scene: Scene) -> dict[str, Any]:
-    """The photo in dataset.yaml: no pose; the focal length only where it is told there."""
+    """The photo in dataset.yaml: no pose; the focal length only where the user is to give it there."""
     shot, objects = scene.shot, []
     for colour, name in zip(shot.chairs, scene.chairs, strict=True):
         mask = {"mask": own_mask(shot, name)} if len(shot.chairs) > 1 else {}
         objects.append({"name": name, "mesh": "chair", "materials": {"shell": colour}, **mask})
-    camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if shot.told == "given" else {}
+    camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if shot.focal_known_from == "given" else {}
     return {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png", **camera, "objects": objects}
 
 

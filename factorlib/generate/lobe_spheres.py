@@ -34,8 +34,8 @@ class Spheres(msgspec.Struct, frozen=True):
     """n spheres: the lobe's axis (camera frame, unit) and sharpness, the material's roughness."""
 
     axis: Float[np.ndarray, "n 3"]
-    sharpness: Float[np.ndarray, "n"]
-    roughness: Float[np.ndarray, "n"]
+    sharpness: Float[np.ndarray, " n"]
+    roughness: Float[np.ndarray, " n"]
 
 
 class Pixels(msgspec.Struct, frozen=True):
@@ -102,7 +102,7 @@ def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
     return mitsuba().load_dict({"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False)
 
 
-def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, "m"]:
+def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, " m"]:
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
     ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})

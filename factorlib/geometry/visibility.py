@@ -35,7 +35,7 @@ class Points(msgspec.Struct, frozen=True):
 
     place: Float[np.ndarray, "n 3"]  # mesh units, lifted off the surface
     face_normal: Float[np.ndarray, "n 3"]
-    found: Bool[np.ndarray, "n"]
+    found: Bool[np.ndarray, " n"]
 
 
 class Occluders:
@@ -57,7 +57,7 @@ class Occluders:
         scaled = ((vertices - self.centre) / self.radius).astype(np.float32)
         self.scene.add_triangles(o3d.core.Tensor(scaled), o3d.core.Tensor(faces.astype(np.uint32)))
 
-    def points_under(self, camera: Camera, x: Int[np.ndarray, "n"], y: Int[np.ndarray, "n"]) -> Points:
+    def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
         """What the rays through the centres of pixels (x, y) meet first."""
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
         hits = self.scene.cast_rays(self._rays(np.zeros_like(along), along), nthreads=1)
@@ -90,8 +90,8 @@ class Occluders:
 def visibility(
     occluders: Occluders,
     camera: Camera,
-    x: Int[np.ndarray, "n"],
-    y: Int[np.ndarray, "n"],
+    x: Int[np.ndarray, " n"],
+    y: Int[np.ndarray, " n"],
     shading_normal: Float[np.ndarray, "n 3"],
     directions: int,
     most_points: int,
@@ -108,7 +108,7 @@ def visibility(
     return seen[nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)]
 
 
-def spread_subset(x: Int[np.ndarray, "n"], y: Int[np.ndarray, "n"], most: int) -> Int[np.ndarray, "m"]:
+def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:
     """Rows of at most about `most` pixels: the first in each square of the picture.
 
     >>> y, x = np.divmod(np.arange(64), 8)
@@ -124,7 +124,7 @@ def nearest(
     normal: Float[np.ndarray, "m 3"],
     place_asked: Float[np.ndarray, "n 3"],
     normal_asked: Float[np.ndarray, "n 3"],
-) -> Int[np.ndarray, "n"]:
+) -> Int[np.ndarray, " n"]:
     """Of the m surface points the one nearest to each of n, in place (in units of their spacing) and in normal."""
     spacing = max(float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])), 1e-12)
     tree = cKDTree(np.column_stack([place / spacing, NORMAL_WEIGHT * normal]))

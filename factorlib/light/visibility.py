@@ -68,13 +68,13 @@ def highlight_weights(
     return weight, (by_square - weight * by_square.sum(1, keepdim=True)) * (4 * roughness**3)
 
 
-def kernel(directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, "p"]) -> Float[Tensor, "k p"]:
+def kernel(directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, " p"]) -> Float[Tensor, "k p"]:
     """L of the equations: lobes at the directions, widened, and no less than e^FAINTEST."""
     distance = torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist")
     return torch.exp((-0.5 * widened(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
 
 
-def widened(sharpness: Float[Tensor, "p"], count: int) -> Float[Tensor, "p"]:
+def widened(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
     """κ of lobes seen through `count` directions."""
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
@@ -89,7 +89,7 @@ def seen(
     weights: Float[Tensor, "n k"],
     directions: Float[Tensor, "k 3"],
     axis: Float[Tensor, "p 3"],
-    sharpness: Float[Tensor, "p"],
+    sharpness: Float[Tensor, " p"],
     tangents: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]],
     by_roughness: Float[Tensor, "n k"] | None = None,
 ) -> Seen:

@@ -27,9 +27,9 @@ class Block(msgspec.Struct, frozen=True):
     radiance: Float[np.ndarray, "n 3"]
     clipped: Bool[np.ndarray, "n 3"]
     precision: Float[np.ndarray, "n 3"]
-    material: Int[np.ndarray, "n"]
-    photo: Int[np.ndarray, "n"]
-    held_out: Bool[np.ndarray, "n"]
+    material: Int[np.ndarray, " n"]
+    photo: Int[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
     visibility: UInt8[np.ndarray, "n k"] | None = None
     directions: Float[np.ndarray, "f k 3"] | None = None
 

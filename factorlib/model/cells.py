@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
 
 
-def held_out_by_cells(cell: Int[np.ndarray, "n"], material: Int[np.ndarray, "n"], share: float, seed: int) -> Bool[np.ndarray, "n"]:
+def held_out_by_cells(cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int) -> Bool[np.ndarray, " n"]:
     """Which observations are held out: all of randomly chosen cells, about a `share` of all, but never all of a material.
 
     Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would

@@ -63,7 +63,7 @@ class Illumination(msgspec.Struct, frozen=True):
         """r, in σ of the noise model."""
         return self.block.residuals(self.radiance())
 
-    def losses(self, loss: Loss) -> Float[np.ndarray, "n"]:
+    def losses(self, loss: Loss) -> Float[np.ndarray, " n"]:
         """Robust loss of every observation, mean over its channels."""
         return loss.of_residuals(self.residuals()).mean(1)
 
@@ -81,7 +81,7 @@ class Illumination(msgspec.Struct, frozen=True):
         for some in self.responses() if known is None else known:
             yield from linearised(self.block, self.light, self.materials, some, loss)
 
-    def atoms(self, rows: Int[np.ndarray, "n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
+    def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""
         block, materials = self.block, self.materials
         diffuse = np.empty((len(rows), len(lobes)))

@@ -32,9 +32,9 @@ class Linearised(msgspec.Struct, frozen=True):
 
     rows: slice
     channel: int
-    places: Int[np.ndarray, "k"]
+    places: Int[np.ndarray, " k"]
     jacobian: Float[Tensor, "n k"]
-    residual: Float[Tensor, "n"]
+    residual: Float[Tensor, " n"]
     loss: float
 
 
@@ -45,8 +45,8 @@ class Whitened(msgspec.Struct, frozen=True):
     rising    derivative of the radiance shown by linear radiance;  by_tone: by the log exponents of the tone curves
     """
 
-    residual: Float[Tensor, "n"]
-    scale: Float[Tensor, "n"]
+    residual: Float[Tensor, " n"]
+    scale: Float[Tensor, " n"]
     rising: Float[Tensor, "n 1"] | float
     by_tone: Float[Tensor, "n 1"] | float
     loss: float
@@ -82,7 +82,7 @@ def linearised(block: Block, light: Light, materials: Materials, some: Responses
         yield Linearised(rows, c, places, jacobian * seen.scale[:, None], seen.residual, seen.loss)
 
 
-def _places(light: Light, materials: int, m: int, c: int, p: int) -> Int[np.ndarray, "k"]:
+def _places(light: Light, materials: int, m: int, c: int, p: int) -> Int[np.ndarray, " k"]:
     """Numbers of the unknowns of channel c: geometry and weights of the lobes, exposures, those of material m, tones."""
     first = 7 * materials
     end = first + 6 * p + len(light.log_exposure) - 1
@@ -91,7 +91,7 @@ def _places(light: Light, materials: int, m: int, c: int, p: int) -> Int[np.ndar
     return np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6], tones])
 
 
-def whitened(block: Block, light: Light, rows: slice, c: int, linear: Float[Tensor, "n"], loss: Loss) -> Whitened:
+def whitened(block: Block, light: Light, rows: slice, c: int, linear: Float[Tensor, " n"], loss: Loss) -> Whitened:
     """Channel c of `rows`, whose linear radiance is `linear`."""
     predicted, rising, by_tone = _toned_with_slopes(linear, block, rows, light)
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
@@ -106,8 +106,8 @@ def whitened(block: Block, light: Light, rows: slice, c: int, linear: Float[Tens
 
 
 def _toned_with_slopes(
-    linear: Float[Tensor, "n"], block: Block, rows: slice, light: Light
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 1"] | float, Float[Tensor, "n 1"] | float]:
+    linear: Float[Tensor, " n"], block: Block, rows: slice, light: Light
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 1"] | float, Float[Tensor, "n 1"] | float]:
     """Radiance as the photos show it, and its slopes by linear radiance and by the log exponents."""
     if len(light.log_tone) == 0:
         return linear, 1.0, 0.0

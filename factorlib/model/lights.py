@@ -28,7 +28,7 @@ class UnitLobes(msgspec.Struct, frozen=True):
     """
 
     axis: Float[np.ndarray, "p 3"]
-    sharpness: Float[np.ndarray, "p"]
+    sharpness: Float[np.ndarray, " p"]
 
     def __len__(self) -> int:
         return len(self.sharpness)
@@ -41,16 +41,16 @@ class Light(msgspec.Struct, frozen=True):
     """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
-    log_sharpness: Float[np.ndarray, "p"]
+    log_sharpness: Float[np.ndarray, " p"]
     weight: Float[np.ndarray, "p 3"]  # in the illumination's own radiance unit
-    log_exposure: Float[np.ndarray, "f"]
-    log_tone: Float[np.ndarray, "f"] = msgspec.field(default_factory=lambda: np.zeros(0))
+    log_exposure: Float[np.ndarray, " f"]
+    log_tone: Float[np.ndarray, " f"] = msgspec.field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
 
     @property
-    def sharpness(self) -> Float[np.ndarray, "p"]:
+    def sharpness(self) -> Float[np.ndarray, " p"]:
         """λ of each lobe."""
         return np.exp(self.log_sharpness)
 
@@ -65,7 +65,7 @@ class Light(msgspec.Struct, frozen=True):
         return 6 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
 
     @property
-    def unit_energy(self) -> Float[np.ndarray, "p"]:
+    def unit_energy(self) -> Float[np.ndarray, " p"]:
         """1/λ': energy of a lobe of unit weight over 2π, steradians."""
         return lobe_integral(self.sharpness) / (2 * np.pi)
 
@@ -81,13 +81,13 @@ class Light(msgspec.Struct, frozen=True):
         first /= np.linalg.norm(first, axis=1, keepdims=True)
         return first, np.cross(self.axis, first)
 
-    def sharpness_slopes(self, blur: float) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    def sharpness_slopes(self, blur: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """∂ log λ/∂s and, at constant energy, ∂ log w/∂s;  blur: b."""
         by_s = 1 + blur * self.sharpness
         doubled = np.maximum(2 * self.sharpness, 1e-9)
         return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
 
-    def moved(self, step: Float[np.ndarray, "l"], blur: float) -> Light:
+    def moved(self, step: Float[np.ndarray, " l"], blur: float) -> Light:
         """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
         p = len(self)
         by = step[: 6 * p].reshape(6, p)

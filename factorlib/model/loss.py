@@ -24,11 +24,11 @@ class Quadratic(NamedTuple):
     """A value, and half its gradient and half its Gauss–Newton Hessian by the l unknowns of a light (`Light.moved`)."""
 
     value: float
-    gradient: Float[np.ndarray, "l"]
+    gradient: Float[np.ndarray, " l"]
     hessian: Float[np.ndarray, "l l"]
 
 
-LightPrior = Callable[[Block, Light], tuple[float, Float[np.ndarray, "l"], Float[np.ndarray, "l l"]]]
+LightPrior = Callable[[Block, Light], tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]]
 
 
 class Loss(msgspec.Struct, frozen=True):

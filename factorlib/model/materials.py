@@ -16,12 +16,12 @@ class Materials(msgspec.Struct, frozen=True):
 
     diffuse: Float[np.ndarray, "m 3"]
     specular: Float[np.ndarray, "m 3"]
-    roughness: Float[np.ndarray, "m"]
+    roughness: Float[np.ndarray, " m"]
 
     def __len__(self) -> int:
         return len(self.roughness)
 
-    def vector(self) -> Float[np.ndarray, "7m"]:
+    def vector(self) -> Float[np.ndarray, " 7m"]:
         """Seven unknowns a material: diffuse RGB, specular RGB, roughness."""
         return np.column_stack([self.diffuse, self.specular, self.roughness]).reshape(-1)
 
@@ -30,7 +30,7 @@ class Materials(msgspec.Struct, frozen=True):
         return self.vector().reshape(-1, 7)
 
     @staticmethod
-    def of_vector(vector: Float[np.ndarray, "7m"]) -> Materials:
+    def of_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
         """The nearest materials within bounds."""
         rows = vector.reshape(-1, 7)
         reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)

@@ -18,7 +18,7 @@ class Point(msgspec.Struct, frozen=True):
     materials: Materials
     lights: list[Light]
 
-    def moved(self, by_materials: Float[np.ndarray, "7m"], by_lights: Sequence[Float[np.ndarray, "l"]]) -> Point:
+    def moved(self, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]) -> Point:
         """The nearest point within bounds after a step in all unknowns."""
         blur = self.materials.blur
         lights = [light.moved(by, blur) for light, by in zip(self.lights, by_lights, strict=True)]

@@ -54,7 +54,7 @@ class JointProblem(msgspec.Struct, frozen=True):
         """The loss of the observations that are not held out, with priors."""
         return sum(illumination.fit_loss(self.loss) for illumination in self.illuminations(point))
 
-    def held_out_losses(self, point: Point) -> list[Float[np.ndarray, "n"]]:
+    def held_out_losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
         """Robust loss of each held-out observation, block by block; if no observation at all is held out, of each observation."""
         none = self.none_held_out
         judged = msgspec.structs.replace(self, blocks=[block.take(block.held_out | none) for block in self.blocks])

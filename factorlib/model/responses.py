@@ -27,7 +27,7 @@ from factorlib.reflection.operator import Operator
 
 CHUNK = 4096  # observations whose responses are computed at once
 A = TypeVar("A", np.ndarray, Tensor)
-Rows = slice | Int[np.ndarray, "n"]
+Rows = slice | Int[np.ndarray, " n"]
 
 
 def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular: A) -> A:

@@ -39,7 +39,7 @@ class Rows(msgspec.Struct, frozen=True):
     directions: Float[Tensor, "k 3"]
 
 
-def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, "n"]) -> Iterator[Rows]:
+def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, " n"]) -> Iterator[Rows]:
     """Those of `rows` from which something is hidden, photo by photo, at most TOGETHER at once."""
     visibility, photo = block.visibility[rows], block.photo[rows]
     hidden = (visibility < 255).any(1)
@@ -51,7 +51,7 @@ def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, "n"]) -> Iterator[
 
 
 def shadowed(
-    parts: tuple[Tensor, Tensor], block: Block, rows: slice | Int[np.ndarray, "n"], lobes: UnitLobes, roughness: float
+    parts: tuple[Tensor, Tensor], block: Block, rows: slice | Int[np.ndarray, " n"], lobes: UnitLobes, roughness: float
 ) -> tuple[Tensor, Tensor]:
     """The responses `parts` = (diffuse, specular) [n, p] to lobes at `rows`, with shadows."""
     if block.visibility is None:

@@ -58,7 +58,7 @@ class Judged(msgspec.Struct, frozen=True):
     state: State
     score: float
     held_out_loss: float
-    of_cells: Float[np.ndarray, "k"]
+    of_cells: Float[np.ndarray, " k"]
 
     def gain(self, over: Judged) -> tuple[float, float]:
         """By what share of the loss of `over` this one's is less, and the standard error of that share."""
@@ -78,7 +78,7 @@ class Settled(msgspec.Struct, frozen=True):
     ruled_out: bool | None
 
 
-def settled(moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, "n"], standards: Standards) -> Settled | None:
+def settled(moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, " n"], standards: Standards) -> Settled | None:
     """Which candidate to use; None where the candidates share too few pixels to compare them.
 
     cell: number of each pixel's cell
@@ -110,7 +110,7 @@ def candidates(moving: Moving, found: State, runner_up: State | None, standards:
     return result
 
 
-def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, "n"]) -> list[Judged]:
+def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, " n"]) -> list[Judged]:
     """Every candidate, in the order of `states`; an empty list where too few pixels are shown by all of them."""
     seen = {name: moving.block(state, None) for name, state in states.items()}
     common = np.logical_and.reduce([agrees for _, agrees in seen.values()])
@@ -132,7 +132,7 @@ def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, "n"])
     ]
 
 
-def gain_of(before: Float[np.ndarray, "k"], after: Float[np.ndarray, "k"]) -> tuple[float, float]:
+def gain_of(before: Float[np.ndarray, " k"], after: Float[np.ndarray, " k"]) -> tuple[float, float]:
     """1 − Σ after / Σ before of the cells' losses, and its standard error by the scatter of the cells' differences.
 
     Which of two candidates comes first changes the difference's sign and nothing else.

@@ -49,7 +49,7 @@ class Moving(msgspec.Struct, frozen=True):
     camera: Camera
     prior: FocalPrior
     surfaces: Surfaces
-    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, "n"]]]
+    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, " n"]]]
 
     def score(self, state: State) -> float:
         """Labelled IoU."""
@@ -72,7 +72,7 @@ def moving_object(photographed: Photographed, poses: Sequence[Pose], surfaces: S
     view, number, camera = photographed.view, photographed.number, photographed.camera
     caster = view.casters[number]
 
-    def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, "n"]]:
+    def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, " n"]]:
         """All pixels with the object in a state, visibility as in `like`; which of them show what the mask does."""
         own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
         seen = view.seen(own, posed)
@@ -96,7 +96,8 @@ def descended(moving: Moving, start: State, steps: int, most_lost: float) -> Sta
         light = pursued_light(fit, surfaces) if k in (0, steps // 2) else with_weights(surfaces.under(light, fit))
         lit = surfaces.under(light, fit)
         residual = lit.residuals()
-        robust = robust_loss(residual) if k == 0 else robust
+        if k == 0:
+            robust = robust_loss(residual)
         loss = float(robust.of_residuals(residual).mean())
         if loss < least and moving.score(state) >= floor:
             best, least = state, loss
@@ -109,7 +110,7 @@ class Seen(msgspec.Struct, frozen=True):
     """All pixels of a photo with the object in a state, and which of them are fitted."""
 
     every: Block
-    fitted: Bool[np.ndarray, "m"]
+    fitted: Bool[np.ndarray, " m"]
 
 
 def _step(
@@ -145,7 +146,7 @@ def photometric_jacobian(moving: Moving, state: State, seen: Seen, light: Light,
 
 def projected_equations(
     jacobian: Float[np.ndarray, "n 3 k"], residual: Float[np.ndarray, "n 3"], lit: Illumination
-) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
     """H and g of equation (1), over the residuals' own spread and their correlation."""
     light = lit.light
     atoms = lit.atoms(np.arange(len(lit.block)), light.unit_lobes)

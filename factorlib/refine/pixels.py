@@ -34,14 +34,14 @@ class Pixels(msgspec.Struct, frozen=True):
     material   index, from 0             cell       number of the pixel's cell
     """
 
-    x: Int[np.ndarray, "n"]
-    y: Int[np.ndarray, "n"]
+    x: Int[np.ndarray, " n"]
+    y: Int[np.ndarray, " n"]
     radiance: Float[np.ndarray, "n 3"]
     unit: float
     precision: Float[np.ndarray, "n 3"]
-    material: Int[np.ndarray, "n"]
-    cell: Int[np.ndarray, "n"]
-    held_out: Bool[np.ndarray, "n"]
+    material: Int[np.ndarray, " n"]
+    cell: Int[np.ndarray, " n"]
+    held_out: Bool[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.x)
@@ -80,7 +80,7 @@ class Seen(msgspec.Struct, frozen=True):
     """What meshes show at n pixels: unit normals in the camera frame, and whether the mesh shows the mask's material, facing the camera."""
 
     normal: Float[np.ndarray, "n 3"]
-    agrees: Bool[np.ndarray, "n"]
+    agrees: Bool[np.ndarray, " n"]
 
 
 class View:

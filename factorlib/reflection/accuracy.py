@@ -13,13 +13,13 @@ COSINE = (0.0, 0.1, 0.3, 0.6, 1.0)
 DEGREES = (0.0, 10.0, 30.0, 90.0, 180.0)
 
 
-def quantiles(error: Float[Tensor, "n"]) -> dict[str, float | int]:
+def quantiles(error: Float[Tensor, " n"]) -> dict[str, float | int]:
     """Quantiles of |error| and the number of samples; 4 digits, since more say nothing."""
     size = error.abs().double()
     return {name: float(f"{float(size.quantile(q)):.4g}") for name, q in QUANTILES.items()} | {"samples": len(size)}
 
 
-def binned(error: Float[Tensor, "n"], value: Float[Tensor, "n"], edges: tuple[float, ...]) -> dict[str, dict]:
+def binned(error: Float[Tensor, " n"], value: Float[Tensor, " n"], edges: tuple[float, ...]) -> dict[str, dict]:
     """`quantiles` of each bin that has samples, by its edges."""
     table = {}
     for k, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):

@@ -17,8 +17,8 @@ SHARPEST = 1e4  # in training
 class Layers(msgspec.Struct, frozen=True):
     """A fully connected network of SiLU layers; `mean` and `scale` standardise its features."""
 
-    mean: Float[Tensor, "features"]
-    scale: Float[Tensor, "features"]
+    mean: Float[Tensor, " features"]
+    scale: Float[Tensor, " features"]
     weights: list[Tensor]  # [out, in] each
     biases: list[Tensor]
 

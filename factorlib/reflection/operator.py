@@ -61,18 +61,18 @@ class Operator:
     def __init__(self, dtype: torch.dtype = torch.float32):
         self.dtype = dtype
 
-    def diffuse(self, sharpness: Float[Tensor, "p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+    def diffuse(self, sharpness: Float[Tensor, " p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
         raise NotImplementedError
 
     def specular(
-        self, roughness: Tensor, sharpness: Float[Tensor, "p"], no: Float[Tensor, "n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+        self, roughness: Tensor, sharpness: Float[Tensor, " p"], no: Float[Tensor, " n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
     ) -> Float[Tensor, "n p"]:
         """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²; every input may be [n, p] as well."""
         raise NotImplementedError
 
     def response(
-        self, roughness: Tensor, sharpness: Float[Tensor, "p"], no: Float[Tensor, "n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+        self, roughness: Tensor, sharpness: Float[Tensor, " p"], no: Float[Tensor, " n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
     ) -> Response:
         """Values and derivatives together; nothing is left on torch's graph."""
         rows = max(1, CHUNK // max(nz.shape[1], 1))

@@ -23,8 +23,8 @@ class Examples(msgspec.Struct, frozen=True):
     """Inputs of a network, and the radiance that was rendered of a unit lobe at unit reflectance."""
 
     inputs: Float[Tensor, "n f"]
-    sharpness: Float[Tensor, "n"]
-    radiance: Float[Tensor, "n"]
+    sharpness: Float[Tensor, " n"]
+    radiance: Float[Tensor, " n"]
 
 
 def trained(examples: Examples, schedule: Schedule, report: Callable[[int, float], None]) -> Layers:

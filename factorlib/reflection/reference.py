@@ -52,7 +52,7 @@ class Reference(Operator):
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
 
-def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, *, tolerance: float) -> Float[Tensor, "b"]:
+def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, *, tolerance: float) -> Float[Tensor, " b"]:
     """The specular part of every element at the first level that agrees with the one before it."""
     scalars = alpha, sharpness, no, nz, oz
     value, level = torch.zeros_like(alpha), torch.zeros(alpha.shape, dtype=torch.long)
@@ -77,13 +77,13 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
     return value
 
 
-def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, "b"]:
+def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, " b"]:
     """`specular_quadrature`, of so many elements at a time that memory stays small; scalars [b]."""
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
     return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in range(0, len(scalars[0]), rows)])
 
 
-def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, " b"]:
     """∫ SG D G / (4 n·o) di with `nodes` nodes in each direction of each piece, about the sharper factor."""
     no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
     about_normal = sharper_is_the_normal(alpha, sharpness, no, nz, oz)
@@ -112,7 +112,7 @@ def mirror_angle(no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
     return torch.arccos((2 * no * nz - oz).clamp(-1, 1))
 
 
-def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, " b"]:
     """∫ SG(i) D(h) G1(n·i) di in polar coordinates about z, azimuth from the plane of z and n."""
     alpha, sharpness, no, nz, oz = (t[:, None, None] for t in (alpha, sharpness, no, nz, oz))
     sz = root(1 - nz**2)
@@ -136,7 +136,7 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     return over_circles(nodes, *full, integrand) + over_arcs(nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc)
 
 
-def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "b"]:
+def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, " b"]:
     """∫ SG(i) D(h) G1(n·i) 4(o·h) dh in polar coordinates about n, azimuth from the plane of n and o.
 
     θ = α sinh y spreads the nodes over the peak of D and over its tail alike.
@@ -162,7 +162,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
 
 
-def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, "b"]:
+def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, " b"]:
     """∫ over whole circles at radii [low, high]; limits [b, 1, 1]."""
     x, w = gauss(nodes, low.dtype)
     phi = 2 * math.pi * (torch.arange(2 * nodes, dtype=low.dtype) + 0.5) / (2 * nodes)
@@ -173,7 +173,7 @@ def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[...,
 
 def over_arcs(
     nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable[[Tensor], Tensor]
-) -> Float[Tensor, "b"]:
+) -> Float[Tensor, " b"]:
     """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], whose length goes like a root at both ends."""
     x, w = gauss(nodes, low.dtype)
     radius = low + (high - low) * (torch.sin(math.pi / 2 * x) ** 2)[None, :, None]

@@ -26,18 +26,18 @@ GRAZING = 0.3  # n·o below which most of the hard cases lie
 class Samples(msgspec.Struct, frozen=True):
     """The five scalars of the specular part and its value, float64."""
 
-    alpha: Float[Tensor, "n"]
-    sharpness: Float[Tensor, "n"]
-    no: Float[Tensor, "n"]
-    nz: Float[Tensor, "n"]
-    oz: Float[Tensor, "n"]
-    value: Float[Tensor, "n"]
+    alpha: Float[Tensor, " n"]
+    sharpness: Float[Tensor, " n"]
+    no: Float[Tensor, " n"]
+    nz: Float[Tensor, " n"]
+    oz: Float[Tensor, " n"]
+    value: Float[Tensor, " n"]
 
     def inputs(self) -> tuple[Tensor, ...]:
         """α, λ, n·o, n·z, o·z: the arguments of the specular formula."""
         return self.alpha, self.sharpness, self.no, self.nz, self.oz
 
-    def scale(self) -> Float[Tensor, "n"]:
+    def scale(self) -> Float[Tensor, " n"]:
         """S + E/100, E the lobe's integral: what errors are measured in."""
         return self.value + lobe_integral(self.sharpness) / 100
 
@@ -52,11 +52,11 @@ class Samples(msgspec.Struct, frozen=True):
 class DiffuseSamples(msgspec.Struct, frozen=True):
     """The two scalars of the diffuse part and its value, float64."""
 
-    sharpness: Float[Tensor, "n"]
-    nz: Float[Tensor, "n"]
-    value: Float[Tensor, "n"]
+    sharpness: Float[Tensor, " n"]
+    nz: Float[Tensor, " n"]
+    value: Float[Tensor, " n"]
 
-    def scale(self) -> Float[Tensor, "n"]:
+    def scale(self) -> Float[Tensor, " n"]:
         """S + E/100, as for the specular part."""
         return self.value + lobe_integral(self.sharpness) / 100
 
@@ -99,12 +99,12 @@ def specular_samples(count: int, seed: int, *, tolerance: float, **ranges: Any) 
     return Samples(*inputs, converged(*inputs, tolerance=tolerance))
 
 
-def _rayleigh(u: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _rayleigh(u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Length of a two-dimensional normal vector of unit deviation."""
     return np.sqrt(-2 * np.log1p(-u))
 
 
-def _turned(axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, "n"], azimuth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+def _turned(axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"], azimuth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """`axis` (in the plane y = 0) turned away from itself by `angle` in the direction `azimuth`."""
     across = np.stack([axis[:, 2], 0 * angle, -axis[:, 0]], 1)
     sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]

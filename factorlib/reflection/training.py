@@ -42,10 +42,10 @@ class Problem(msgspec.Struct, frozen=True):
     """What a network is fitted to: features, the formula's value, the exact value and the unit of its error."""
 
     features: Float[Tensor, "n f"]
-    sharpness: Float[Tensor, "n"]
-    formula: Float[Tensor, "n"]
-    exact: Float[Tensor, "n"]
-    unit: Float[Tensor, "n"]
+    sharpness: Float[Tensor, " n"]
+    formula: Float[Tensor, " n"]
+    exact: Float[Tensor, " n"]
+    unit: Float[Tensor, " n"]
 
     def rows(self, index: Tensor) -> Problem:
         """The problem of some samples, by index [k]."""
@@ -55,7 +55,7 @@ class Problem(msgspec.Struct, frozen=True):
         """The same in float32, in which networks are trained."""
         return Problem(*(getattr(self, name).float() for name in self.__struct_fields__))
 
-    def errors(self, layers: Layers) -> Float[Tensor, "n"]:
+    def errors(self, layers: Layers) -> Float[Tensor, " n"]:
         """(R − S) / unit of every sample: the network's value R against the exact value S."""
         return (self.formula * torch.exp(correction(layers, self.features, self.sharpness)) - self.exact) / self.unit
 

@@ -41,7 +41,7 @@ class Shadows(msgspec.Struct, frozen=True):
 
     visibility: UInt8[np.ndarray, "m k"]
     directions: Float[np.ndarray, "k 3"]
-    which: Int[np.ndarray, "n"] | None = None
+    which: Int[np.ndarray, " n"] | None = None
 
     def take(self, rows: slice | np.ndarray) -> Shadows:
         """Those of some points, a row for each."""
@@ -134,7 +134,7 @@ class Reflector:
         return specular * most
 
 
-def largest(values: Float[Tensor, "n p"], rest: Float[Tensor, "n"]) -> Bool[Tensor, "n p"]:
+def largest(values: Float[Tensor, "n p"], rest: Float[Tensor, " n"]) -> Bool[Tensor, "n p"]:
     """The largest values of each row, as few as leave a sum of at most `rest`.
 
     >>> largest(torch.tensor([[1.0, 5.0, 0.5, 3.0]]), torch.tensor([2.0])).tolist()

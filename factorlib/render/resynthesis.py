@@ -41,7 +41,7 @@ def resynthesised(
     return picture
 
 
-def shadows_at(seen: Observations, material: int, y: Int[np.ndarray, "n"], x: Int[np.ndarray, "n"]) -> Shadows | None:
+def shadows_at(seen: Observations, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]) -> Shadows | None:
     """What pixels of a material see: what the nearest observed pixel of it does; None where that is everything."""
     of = seen.take(seen.material == material)
     if of.visibility is None or len(of) == 0 or len(x) == 0:

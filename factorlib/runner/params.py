@@ -17,7 +17,7 @@ from msgspec.inspect import BoolType, Field, FloatType, IntType, LiteralType, No
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """name: dotted where it is a field of a field;  allowed: in words, as `1 … 1024`;  default: as YAML would have it"""
+    """name: dotted where it is a field of a field;  allowed: in words, as `1 … 1,024`;  default: as YAML would have it"""
 
     name: str
     allowed: str
@@ -60,7 +60,7 @@ def allowed(of: Type) -> str:
     """What a value may be.
 
     >>> allowed(type_info(int)), allowed(IntType(ge=1, le=1024)), allowed(FloatType(gt=0)), allowed(type_info(bool))
-    ('whole number', '1 … 1024', 'number > 0', 'true, false')
+    ('whole number', '1 … 1,024', 'number > 0', 'true, false')
     """
     if isinstance(of, IntType | FloatType):
         return _range(of)

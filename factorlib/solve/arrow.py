@@ -46,7 +46,7 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         return sum(part.loss for part in self.parts)
 
     @property
-    def material_gradient(self) -> Float[np.ndarray, "7m"]:
+    def material_gradient(self) -> Float[np.ndarray, " 7m"]:
         """g_m"""
         return np.sum([part.material_gradient for part in self.parts], axis=0)
 
@@ -56,8 +56,8 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         return np.sum([part.material_hessian for part in self.parts], axis=0)
 
     def solved(
-        self, free: Bool[np.ndarray, "7m"], bounds: Sequence[Bounds], damping: float
-    ) -> tuple[Float[np.ndarray, "7m"], list[Float[np.ndarray, "l"]]]:
+        self, free: Bool[np.ndarray, " 7m"], bounds: Sequence[Bounds], damping: float
+    ) -> tuple[Float[np.ndarray, " 7m"], list[Float[np.ndarray, " l"]]]:
         """The damped step (1) of the `free` unknowns of the materials, and of each light within its bounds."""
         reduced, right = damped(self.material_hessian, damping), -self.material_gradient
         solutions = []
@@ -76,7 +76,7 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         ]
         return by_materials, by_lights
 
-    def predicted_decrease(self, by_materials: Float[np.ndarray, "7m"], by_lights: Sequence[Float[np.ndarray, "l"]]) -> float:
+    def predicted_decrease(self, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]) -> float:
         """By how much a step lowers the quadratic model of the loss."""
         decrease = -by_materials @ (2 * self.material_gradient + self.material_hessian @ by_materials)
         for part, step in zip(self.parts, by_lights, strict=True):
@@ -105,7 +105,7 @@ def _reduced_scores(part: NormalEquations, point: Point, k: int) -> Float[np.nda
     return part.scores[:, :m] - (part.scores[:, m:] * free) @ cho_solve(factor, cross.T, check_finite=False)
 
 
-def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "7m l"], free: Bool[np.ndarray, "l"]) -> Eliminated:
+def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "7m l"], free: Bool[np.ndarray, " l"]) -> Eliminated:
     return Eliminated(cho_factor(masked(light, free), check_finite=False), cross * free)
 
 
@@ -116,7 +116,7 @@ def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarra
     return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
 
 
-def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
     """The matrix with rows and columns that are not free replaced by those of the identity, in the scale of the rest."""
     scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
     masked = matrix * np.outer(free, free)

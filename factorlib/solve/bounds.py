@@ -32,7 +32,7 @@ class Bounds:
         s_now, s_low, s_high = (-np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest))
         self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
 
-    def tighten(self, step: Float[np.ndarray, "l"]) -> bool:
+    def tighten(self, step: Float[np.ndarray, " l"]) -> bool:
         """Tighten the limits where the step violates them; returns whether any was changed.
 
         A sharpness that would leave its range is fixed at the end of the range.  A lobe that moves too far gets more damping.
@@ -50,7 +50,7 @@ class Bounds:
         return bool(outside.any() or far.any())
 
 
-def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, "7m"]) -> Bool[np.ndarray, "7m"]:
+def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, " 7m"]) -> Bool[np.ndarray, " 7m"]:
     """Unknowns of the materials at a bound beyond which the loss would fall, and those on which the loss does not depend."""
     values = materials.rows()
     low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
@@ -58,7 +58,7 @@ def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, "7m"]) 
     return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0)
 
 
-def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarray, "l"]) -> Bool[np.ndarray, "l"]:
+def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarray, " l"]) -> Bool[np.ndarray, " l"]:
     """Unknowns of a light at a bound beyond which the loss would fall, and those of lobes without weight."""
     p = len(light)
     at_bound = np.zeros(len(gradient), bool)
@@ -71,6 +71,6 @@ def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarra
     return at_bound
 
 
-def specular_unknowns(which: Bool[np.ndarray, "m"]) -> Bool[np.ndarray, "7m"]:
+def specular_unknowns(which: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " 7m"]:
     """Which unknowns are the specular ones (k_s and roughness) of the materials `which`."""
     return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)

@@ -43,7 +43,7 @@ class Solution(msgspec.Struct, frozen=True):
     point: Point
     history: list[Event]
     loss: Loss
-    lambertian: Bool[np.ndarray, "m"]
+    lambertian: Bool[np.ndarray, " m"]
     shadows: Evidence = Evidence(False)
     specular: list[Evidence] = []
     tone: list[Evidence] = []
@@ -125,7 +125,7 @@ def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run
     return run.journal.keep("choice", without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian))
 
 
-def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, "m"], run: Run) -> Polished:
+def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Polished:
     """The best round brought to its optimum on many observations, then on all, and the whole history."""
     everything = problem.with_none_held_out().with_loss(fit.loss)
     many = sampled_for(everything, fit.point, run.options, times=MANY)

@@ -79,7 +79,7 @@ def promised_gain(problem: JointProblem, at: Iterate) -> float:
     return (richer - without) / max(at.loss, 1e-300)
 
 
-def _curved(lights: Sequence[Light], which: Bool[np.ndarray, "k"]) -> list[Light]:
+def _curved(lights: Sequence[Light], which: Bool[np.ndarray, " k"]) -> list[Light]:
     """The lights, those of `which` with a curve for each photo, the identity."""
     return [with_curves(light) if one else light for light, one in zip(lights, which, strict=True)]
 

@@ -34,7 +34,7 @@ def descend(
     start: Iterate,
     descent: Descent,
     accepted: Accepted = lambda iteration, iterate: None,
-    fixed: Bool[np.ndarray, "7m"] | None = None,
+    fixed: Bool[np.ndarray, " 7m"] | None = None,
 ) -> Iterate:
     """Lower the loss from `start`, an iterate of this problem; every accepted point is reported.
 

@@ -67,12 +67,12 @@ def decide(without: float, richer: float, threshold: Threshold) -> Evidence:
     return Evidence(without > (1 + threshold.gain) * richer, richer, without)
 
 
-def mean(losses: Float[np.ndarray, "n"]) -> float:
+def mean(losses: Float[np.ndarray, " n"]) -> float:
     """The mean of the losses; 0 if there are none."""
     return float(losses.mean()) if len(losses) else 0.0
 
 
-def _in_question(problem: JointProblem, material: int | None) -> Bool[np.ndarray, "n"]:
+def _in_question(problem: JointProblem, material: int | None) -> Bool[np.ndarray, " n"]:
     held_out = [block.material[block.held_out | problem.none_held_out] for block in problem.blocks]
     every = np.concatenate(held_out)
     return every == material if material is not None else np.ones(len(every), bool)

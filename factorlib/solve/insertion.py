@@ -37,7 +37,7 @@ def dictionary(sharpest: float = np.inf) -> UnitLobes:
 class Candidates(msgspec.Struct, frozen=True):
     """The dictionary's lobes, and their whitened responses at the rows of observations that vote; of use as long as materials stay."""
 
-    rows: Int[np.ndarray, "n"]
+    rows: Int[np.ndarray, " n"]
     lobes: UnitLobes
     atoms: Float[np.ndarray, "3 n j"]
 
@@ -55,7 +55,7 @@ def lobes_inserted(illumination: Illumination, count: int, candidates: Candidate
     return illumination.light.joined(UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3))
 
 
-def _sampled_rows(block: Block, seed: int, sample: int) -> Int[np.ndarray, "n"]:
+def _sampled_rows(block: Block, seed: int, sample: int) -> Int[np.ndarray, " n"]:
     fit = np.flatnonzero(~block.held_out)
     if len(fit) <= sample:
         return fit

@@ -23,8 +23,8 @@ class NormalEquations(msgspec.Struct, frozen=True):
     """
 
     loss: float
-    material_gradient: Float[np.ndarray, "7m"]
-    light_gradient: Float[np.ndarray, "l"]
+    material_gradient: Float[np.ndarray, " 7m"]
+    light_gradient: Float[np.ndarray, " l"]
     material_hessian: Float[np.ndarray, "7m 7m"]
     cross_hessian: Float[np.ndarray, "7m l"]
     light_hessian: Float[np.ndarray, "l l"]
@@ -32,7 +32,7 @@ class NormalEquations(msgspec.Struct, frozen=True):
 
 
 def normal_equations(
-    illumination: Illumination, loss: Loss, clusters: Int[np.ndarray, "n"] | None = None, known: Iterable[Responses] | None = None
+    illumination: Illumination, loss: Loss, clusters: Int[np.ndarray, " n"] | None = None, known: Iterable[Responses] | None = None
 ) -> NormalEquations:
     """The system of the observations that are not held out.
 

@@ -99,7 +99,7 @@ def solve(
     return Solution(in_gauge(objective.point(x), blocks), history, problem.loss, np.zeros(materials, bool))
 
 
-def drawn(rows: Sequence[Int[np.ndarray, "_"]], count: int, random: np.random.Generator) -> list[Int[np.ndarray, "_"]]:
+def drawn(rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
     """`count` of all rows, without replacement, as a list per block."""
     starts = np.cumsum([0, *map(len, rows)])
     chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
@@ -150,7 +150,7 @@ class PaperObjective:
         self.begin = starting_materials(blocks, materials, paper.start_specular_share, paper.start_roughness)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
-    def start(self) -> Float[Tensor, "k"]:
+    def start(self) -> Float[Tensor, " k"]:
         """Even lobes under which the block's mean radiance, 1, is what its materials reflect."""
         p, begin = self.paper.lobes, self.begin
         bounded = np.column_stack([begin.diffuse, begin.specular, _share(begin.roughness, ROUGHNESS)])
@@ -184,7 +184,7 @@ class PaperObjective:
         vector = torch.cat([materials[0], materials[1], materials[2][:, None]], 1).reshape(-1).numpy()
         return Point(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights])
 
-    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, "_"]]) -> tuple[float, Tensor]:
+    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
         """Value and gradient on the subset."""
         x = x.detach().requires_grad_()
         (diffuse, specular, roughness), lights = self.unpacked(x)
@@ -203,7 +203,7 @@ class PaperObjective:
         return value.item(), x.grad
 
     def _predicted(
-        self, block: Block, rows: Int[np.ndarray, "n"], light: tuple[Tensor, ...], material: tuple[Tensor, ...]
+        self, block: Block, rows: Int[np.ndarray, " n"], light: tuple[Tensor, ...], material: tuple[Tensor, ...]
     ) -> Float[Tensor, "n 3"]:
         """`factorlib.model.responses`, equation (1), on autograd's graph."""
         axis, log_sharpness, weight, log_exposure = light

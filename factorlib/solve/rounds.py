@@ -47,8 +47,8 @@ class Start(msgspec.Struct, frozen=True):
     """
 
     point: Callable[[JointProblem, Bundle], Point]
-    decided: Bool[np.ndarray, "m"]
-    lambertian: Bool[np.ndarray, "m"]
+    decided: Bool[np.ndarray, " m"]
+    lambertian: Bool[np.ndarray, " m"]
     converged: bool = False
 
 

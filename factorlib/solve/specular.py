@@ -37,7 +37,7 @@ class Specular(msgspec.Struct, frozen=True):
     """A point without needless specular parts, which materials are Lambertian, and the evidence for every material."""
 
     point: Point
-    lambertian: Bool[np.ndarray, "m"]
+    lambertian: Bool[np.ndarray, " m"]
     evidence: list[Evidence]
 
 
@@ -54,7 +54,7 @@ class Trials:
         self.observations = np.array([np.bincount(block.material, minlength=count) for block in problem.blocks])
 
     def near_optimum(
-        self, lights: Sequence[int], materials: Materials, lambertian: Bool[np.ndarray, "m"], most: float = np.inf
+        self, lights: Sequence[int], materials: Materials, lambertian: Bool[np.ndarray, " m"], most: float = np.inf
     ) -> Point:
         """The point of `materials` and `lights` after some iterations; the point before them if they raise the held-out loss.
 
@@ -68,7 +68,7 @@ class Trials:
         harmless = (1 + SPECULAR.harm) * judge.held_out_loss(before.point)
         return after.point if judge.held_out_loss(after.point) <= harmless else before.point
 
-    def lights_of(self, m: int) -> Int[np.ndarray, "k"]:
+    def lights_of(self, m: int) -> Int[np.ndarray, " k"]:
         """The lights that show most of material m."""
         count = self.observations[:, m]
         most = np.sort(np.argsort(-count, kind="stable")[:LIGHTS])
@@ -81,7 +81,7 @@ class Trials:
 
 
 def without_needless_specular(
-    problem: JointProblem, start: Point, robust: Loss, decided: Bool[np.ndarray, "m"], lambertian: Bool[np.ndarray, "m"]
+    problem: JointProblem, start: Point, robust: Loss, decided: Bool[np.ndarray, " m"], lambertian: Bool[np.ndarray, " m"]
 ) -> Specular:
     """The point with needless specular parts gone, which materials have none, and the evidence for every material.
 
@@ -107,6 +107,6 @@ def without_needless_specular(
     return Specular(chosen, lambertian, evidence)
 
 
-def undecided(lambertian: Bool[np.ndarray, "m"]) -> list[Evidence]:
+def undecided(lambertian: Bool[np.ndarray, " m"]) -> list[Evidence]:
     """For materials that are not tried: what was decided before, without losses."""
     return [Evidence(not one) for one in lambertian.tolist()]

@@ -15,12 +15,12 @@ TIGHTENINGS = 12
 class Step(msgspec.Struct, frozen=True):
     """A step of all unknowns, and by how much the quadratic model falls with it."""
 
-    materials: Float[np.ndarray, "7m"]
-    lights: list[Float[np.ndarray, "l"]]
+    materials: Float[np.ndarray, " 7m"]
+    lights: list[Float[np.ndarray, " l"]]
     predicted: float
 
 
-def damped_step(at: Iterate, damping: float, fixed: Bool[np.ndarray, "7m"] | None = None) -> Step:
+def damped_step(at: Iterate, damping: float, fixed: Bool[np.ndarray, " 7m"] | None = None) -> Step:
     """The step at the given Levenberg–Marquardt `damping`.
 
     fixed: unknowns of the materials that stay as they are

@@ -51,7 +51,7 @@ class Known(msgspec.Struct, frozen=True):
     """
 
     materials: Materials
-    component: Int[np.ndarray, "m"]
+    component: Int[np.ndarray, " m"]
     lights: list[Light | None]
 
 
@@ -107,7 +107,7 @@ class Propagation:
             self._one_gauge()
         return self._rest()
 
-    def _known_rows(self, i: int) -> Bool[np.ndarray, "n"]:
+    def _known_rows(self, i: int) -> Bool[np.ndarray, " n"]:
         """Observations of block i whose materials are known, in the one gauge that most of them have."""
         component = self.component[self.blocks[i].material]
         return (component == _most(component)) & (component >= 0)
@@ -224,7 +224,7 @@ def _guess(count: int) -> Materials:
     return Materials.of_vector(np.tile(row, count))
 
 
-def _most(component: Int[np.ndarray, "n"]) -> int:
+def _most(component: Int[np.ndarray, " n"]) -> int:
     """The gauge that most observations have, of those in any; −1 where none is."""
     of_known = component[component >= 0]
     return int(np.bincount(of_known).argmax()) if len(of_known) else -1

@@ -52,7 +52,7 @@ def with_fitted_weights(light: Light, equations: EnergyEquations) -> Light:
     return msgspec.structs.replace(light, weight=energy / light.unit_energy[:, None])
 
 
-def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:
+def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
     """argmin over w ≥ 0 of ½ wᵀHw − tᵀw, H made definite by 1e-9 of its mean diagonal."""
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12 * max(float(np.diag(hessian).max()), 1e-30)))
     normalised = hessian / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))

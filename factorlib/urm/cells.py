@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 
-def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "g"], Int[np.ndarray, "n"]]:
+def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " g"], Int[np.ndarray, " n"]]:
     """The first row of each group of equal rows, groups in lexicographic order, and each row's group.
 
     As np.unique of rows, on one number a row.

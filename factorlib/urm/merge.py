@@ -46,7 +46,7 @@ def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"
     return np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64)
 
 
-def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[np.ndarray, "n"]) -> Observations:
+def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int[np.ndarray, " n"]) -> Observations:
     weight = np.maximum(observations.weight.astype(float), 1e-12)
     total = np.bincount(group, weight)
 
@@ -69,7 +69,7 @@ def _merged(observations: Observations, first: Int[np.ndarray, "g"], group: Int[
 
 
 def _mean_visibility(
-    visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]
+    visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]
 ) -> UInt8[np.ndarray, "g k"]:
     """Means with weights that sum to 1 in each group."""
     averaging = csr_array((share.astype("f4"), (group, np.arange(len(group)))))

@@ -44,12 +44,12 @@ class Observations(msgspec.Struct, frozen=True):
     view: Float[np.ndarray, "n 3"]  # unit, toward the camera
     radiance: Float[np.ndarray, "n 3"]
     clipped: Bool[np.ndarray, "n 3"]  # radiance is a lower bound
-    material: Int[np.ndarray, "n"]
-    photo: Int[np.ndarray, "n"]
-    illumination: Int[np.ndarray, "n"]
-    x: Int[np.ndarray, "n"]
-    y: Int[np.ndarray, "n"]
-    weight: Float[np.ndarray, "n"]
+    material: Int[np.ndarray, " n"]
+    photo: Int[np.ndarray, " n"]
+    illumination: Int[np.ndarray, " n"]
+    x: Int[np.ndarray, " n"]
+    y: Int[np.ndarray, " n"]
+    weight: Float[np.ndarray, " n"]
     materials: tuple[str, ...]
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]

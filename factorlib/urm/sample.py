@@ -33,7 +33,7 @@ def sample(observations: Observations, most: int) -> Observations:
     return msgspec.structs.replace(part, weight=(part.weight * share[group[kept]]).astype(np.float32))
 
 
-def strata(observations: Observations, most: int) -> Int[np.ndarray, "n"]:
+def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
     """The stratum of each observation, from 0; cells grow until there are no more strata than `most`."""
     kind, cell = np.column_stack([observations.material, observations.clipped @ CLIPPED_BITS]), CELL
     while True:
@@ -44,7 +44,7 @@ def strata(observations: Observations, most: int) -> Int[np.ndarray, "n"]:
         cell *= 2
 
 
-def shared_out(size: Int[np.ndarray, "g"], most: int) -> Int[np.ndarray, "g"]:
+def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
     """How many each stratum keeps: what it has, up to a number that is the same for all but for one; `most` in all.
 
     >>> shared_out(np.array([1, 5, 100, 80]), 27).tolist()
@@ -62,7 +62,7 @@ def shared_out(size: Int[np.ndarray, "g"], most: int) -> Int[np.ndarray, "g"]:
     return count
 
 
-def evenly_spread(group: Int[np.ndarray, "n"], count: Int[np.ndarray, "g"]) -> Int[np.ndarray, "m"]:
+def evenly_spread(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) -> Int[np.ndarray, " m"]:
     """Rows, ascending: `count` of each group, at even steps through its rows.
 
     >>> evenly_spread(np.array([0, 1, 0, 0, 0]), np.array([2, 1])).tolist()

@@ -106,7 +106,7 @@ def test_every_material_is_seen_in_two_photos_and_all_hang_together():
     seen = {shot.name: set(shot.chairs) for shot in eames.SET.shots}
     for colour in ("red", "yellow", "black", "white"):
         assert sum(colour in colours for colours in seen.values()) == 2
-    assert {shot.told for shot in eames.SET.shots} == {"exif", "given", "nothing"}
+    assert {shot.focal_known_from for shot in eames.SET.shots} == {"exif", "given", "nothing"}
 
 
 def test_the_mesh_given_is_coarser_and_a_few_millimetres_off(chairs):

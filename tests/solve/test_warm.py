@@ -81,7 +81,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
     rows = zip(names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True)
     table = MaterialTable(
         {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
-        Gauge(dict(zip(names, component, strict=True))),
+        Gauge(component=dict(zip(names, component, strict=True))),
         Model({name: not one for name, one in zip(names, lambertian, strict=True)}),
     )
     lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in zip(blocks, lights, strict=True)}
@@ -265,5 +265,5 @@ def test_what_was_decided_of_a_specular_part_stays():
 def test_nothing_known_in_a_block_leaves_its_light_unknown():
     blocks, lights = truth(0)
     earlier = written(blocks, MATERIALS, lights)
-    none = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, materials={}, gauge=Gauge({})))
+    none = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, materials={}, gauge=Gauge()))
     assert Propagation(JointProblem(blocks, OPERATOR), known_of(none, NAMES, blocks), BUNDLE).lights == [None]
