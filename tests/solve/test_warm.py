@@ -82,7 +82,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
     table = MaterialTable(
         {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
         Gauge(component=dict(zip(names, component, strict=True))),
-        Model({name: not one for name, one in zip(names, lambertian, strict=True)}),
+        Model(specular={name: not one for name, one in zip(names, lambertian, strict=True)}),
     )
     lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in zip(blocks, lights, strict=True)}
     exposures = {
