@@ -64,11 +64,6 @@ def half_of_normal_and_view(normal: Float[np.ndarray, "*n 3"], view: Float[np.nd
     return (2 * cosine * normal - view + FRONT) / 2
 
 
-def sharpness_of_precision(precision: float | np.ndarray) -> float | np.ndarray:
-    """λ = 2σ: the sharpness of the paper's w·exp(−σ|ω−z|²)."""
-    return 2 * precision
-
-
 def alpha_of_roughness(roughness: float | np.ndarray) -> float | np.ndarray:
     """GGX α = roughness²."""
     return roughness**2

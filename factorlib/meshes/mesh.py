@@ -63,15 +63,3 @@ def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
-
-
-def surface_samples(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """`count` points spread over the surface by area (stratified, so evenly), and the label of each."""
-    rng = np.random.default_rng(seed)
-    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
-    cumulative = np.cumsum(area)
-    face = np.searchsorted(cumulative, (np.arange(count) + rng.random(count)) / count * cumulative[-1])
-    face = np.minimum(face, len(area) - 1)
-    root, other = np.sqrt(rng.random(count)), rng.random(count)
-    weight = np.stack([1 - root, root * (1 - other), root * other], axis=1)  # uniform in the triangle
-    return np.einsum("nk,nkd->nd", weight, mesh.vertices[mesh.faces[face]]), mesh.face_label[face]
