@@ -37,6 +37,8 @@ CURE_OF_EXTERNAL = "look at its overlay; does the source show this photo, and is
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
+    """How meshes are read and poses searched, and what follows from a doubtful pose."""
+
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
     """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
     strict: bool = False

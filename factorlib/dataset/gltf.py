@@ -27,6 +27,8 @@ SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 class Asset(msgspec.Struct, frozen=True):
+    """The version of glTF that the file says it follows."""
+
     version: str
 
 
@@ -38,6 +40,8 @@ class Buffer(msgspec.Struct, frozen=True):
 
 
 class View(msgspec.Struct, frozen=True):
+    """A run of bytes of buffer number `buffer`; byteStride: from one element to the next, None where they lie close together."""
+
     buffer: Count
     byteLength: Count
     byteOffset: Count = 0
@@ -45,23 +49,31 @@ class View(msgspec.Struct, frozen=True):
 
 
 class SparseIndices(msgspec.Struct, frozen=True):
+    """Which elements of an accessor are replaced: integers of `componentType` in a view."""
+
     bufferView: Count
     componentType: int
     byteOffset: Count = 0
 
 
 class SparseValues(msgspec.Struct, frozen=True):
+    """What replaces those elements, in the accessor's own type."""
+
     bufferView: Count
     byteOffset: Count = 0
 
 
 class Sparse(msgspec.Struct, frozen=True):
+    """`count` elements of an accessor that differ from what its view says, or from zero where it has none."""
+
     count: Count
     indices: SparseIndices
     values: SparseValues
 
 
 class Accessor(msgspec.Struct, frozen=True):
+    """An array in a view: `count` elements of `type` (SCALAR, VEC3 …), each of numbers of `componentType`; zeros where it has no view."""
+
     componentType: int
     count: Count
     type: str
@@ -72,6 +84,8 @@ class Accessor(msgspec.Struct, frozen=True):
 
 
 class Primitive(msgspec.Struct, frozen=True):
+    """Faces of one material: attribute (POSITION, NORMAL …) -> accessor; indices: accessor of the corners; mode: 4 is triangles."""
+
     attributes: dict[str, Count]
     indices: Count | None = None
     material: Count | None = None
@@ -86,10 +100,15 @@ class Geometry(msgspec.Struct, frozen=True):
 
 
 class Material(msgspec.Struct, frozen=True):
+    """Only its name counts here: `parts` in dataset.yaml may use it."""
+
     name: str | None = None
 
 
 class Node(msgspec.Struct, frozen=True):
+    """A place in the scene's tree: a mesh, and the motion to its parent as a matrix (column by column) or as translation, rotation
+    (quaternion x y z w) and scale."""
+
     mesh: Count | None = None
     name: str | None = None
     children: list[Count] = []
@@ -100,10 +119,14 @@ class Node(msgspec.Struct, frozen=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
+    """The nodes at the top of a tree."""
+
     nodes: list[Count] = []
 
 
 class Header(msgspec.Struct, frozen=True):
+    """The JSON of a glTF file, as far as it says where triangles are; scene: the number of the one to read, None for the first."""
+
     asset: Asset
     buffers: list[Buffer] = []
     bufferViews: list[View] = []

@@ -32,6 +32,8 @@ class Rle(msgspec.Struct, frozen=True):
 
 
 class Annotation(msgspec.Struct, frozen=True):
+    """The shape of one object in one image; segmentation: polygons or RLE, left as JSON text until its photo is read."""
+
     image_id: int | str
     category_id: int | str
     segmentation: msgspec.Raw = msgspec.Raw(b"null")
@@ -39,11 +41,15 @@ class Annotation(msgspec.Struct, frozen=True):
 
 
 class Category(msgspec.Struct, frozen=True):
+    """What an annotation shows: the name is a material's."""
+
     id: int | str
     name: str
 
 
 class CocoImage(msgspec.Struct, frozen=True):
+    """An image that annotations are about; width, height: in pixels, None where the file does not say."""
+
     id: int | str
     file_name: str
     width: int | None = None

@@ -32,6 +32,8 @@ class Property(msgspec.Struct, frozen=True):
 
 
 class Element(msgspec.Struct, frozen=True):
+    """A table of the file (`vertex`, `face` …): `count` rows of `properties`, in this order."""
+
     name: str
     count: int
     properties: list[Property]

@@ -27,6 +27,8 @@ MEANINGS = {
 
 
 class Headline(msgspec.Struct, frozen=True):
+    """One number at the top of the page; beside: what it is compared with; meaning: a sentence for who does not know the measure."""
+
     label: str
     value: str
     unit: str

@@ -19,6 +19,8 @@ class Colour(msgspec.Struct, frozen=True):
 
 
 class MaterialRow(msgspec.Struct, frozen=True):
+    """One solved material: its ball, its reflectance and roughness, and how many pixels of how many photos show it; tag: its CSS colour."""
+
     name: str
     tag: str
     ball: Cell | None

@@ -19,6 +19,8 @@ DISAGREES = np.array([0.92, 1.0, 0.0])
 
 
 class Panel(msgspec.Struct, frozen=True):
+    """A picture of a photo's row: its pixels, sRGB-encoded, and the same as a `data:` URI."""
+
     title: str
     uri: str
     pixels: UInt8[np.ndarray, "h w c"]

@@ -29,6 +29,8 @@ class Gone(msgspec.Struct, frozen=True):
 
 
 class Freed(msgspec.Struct, frozen=True):
+    """How many results were deleted, and how many bytes that freed."""
+
     results: int
     bytes: int
 

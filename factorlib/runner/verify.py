@@ -30,6 +30,8 @@ class Damage(msgspec.Struct, frozen=True):
 
 
 class Verdict(msgspec.Struct, frozen=True):
+    """How many results were read, and what is wrong among them."""
+
     results: int
     damaged: list[Damage]
 

@@ -38,6 +38,8 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 class Pinhole(msgspec.Struct, frozen=True):
+    """A camera without distortion; pixels, centres at 0.5."""
+
     focal_px: float
     principal_point: Vec2
 

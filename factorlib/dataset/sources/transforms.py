@@ -54,6 +54,8 @@ class Frame(Lens, frozen=True, kw_only=True):
 
 
 class TransformsFile(Lens, frozen=True, kw_only=True):
+    """A whole transforms.json: what its frames share, and the frames."""
+
     frames: list[Frame]
 
 
