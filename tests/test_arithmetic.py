@@ -32,6 +32,19 @@ point = solution.point
 parts = [point.materials.vector(), *(part for light in point.lights for part in (light.axis, light.log_sharpness, light.weight))]
 print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
 """
+BITS = """
+import hashlib, numpy as np
+x = np.random.default_rng(0).normal(size=(257, 257))
+print(hashlib.sha256(np.exp(x).tobytes() + (x @ x).tobytes()).hexdigest())
+"""
+
+
+def process(*command: str, **environment: str) -> str:
+    """What a process prints that no test has set variables for."""
+    set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES and not k.startswith("PYTEST_")}
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=set_ | environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def solved(how: str, *emulator: str, **environment: str) -> str:
@@ -52,6 +65,15 @@ def test_a_solve_is_the_same_bits_whatever_the_variables_were():
 @pytest.mark.parametrize("processor", ["EPYC-Rome", "Haswell-noTSX"])
 def test_a_solve_is_the_same_bits_on_an_emulated_processor(processor):
     assert solved("fixed", EMULATOR, "-cpu", processor) == solved("fixed")
+
+
+def test_a_test_computes_the_bits_of_a_worker(capsys):
+    exec(BITS, {})
+    assert capsys.readouterr().out == process("-c", BITS, **VARIABLES)
+
+
+def test_without_workers_of_pytest_too():
+    process("-m", "pytest", "-n", "0", "-p", "no:cacheprovider", f"{__file__}::{test_a_test_computes_the_bits_of_a_worker.__name__}")
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
