@@ -29,6 +29,7 @@ from factorlib.align.state import State
 from factorlib.align.target import Region, Target, border_pairs
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Hits
+from factorlib.robust import robust_deviation
 
 CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
 LEAST_SPREAD = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
@@ -125,7 +126,7 @@ def normal_equations(
             residuals.append(residual)
             rows.append(row)
     residual, row = np.concatenate(residuals), np.concatenate(rows)
-    spread = 1.4826 * np.median(np.abs(residual)) if len(residual) else LEAST_SPREAD
+    spread = robust_deviation(residual) if len(residual) else LEAST_SPREAD
     scale = float(np.clip(spread, LEAST_SPREAD, max(MOST_SCALE * target.extent, LEAST_SPREAD)))
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)

@@ -41,6 +41,7 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
+from factorlib.robust import robust_deviation
 from factorlib.solve.arrow import ArrowSystem
 from factorlib.solve.normal_equations import NormalEquations, normal_equations
 
@@ -97,7 +98,7 @@ def clusters_of(block: Block) -> Int[np.ndarray, " n"]:
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
     """Robust standard deviation of the whitened residuals."""
-    return 1.4826 * float(np.median(np.abs(np.concatenate(problem.residuals(point)))))
+    return robust_deviation(np.concatenate(problem.residuals(point)))
 
 
 def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]) -> Float[np.ndarray, "k k"]:

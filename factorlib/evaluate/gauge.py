@@ -19,6 +19,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as components_of_graph
 
 Samples = Float[np.ndarray, "_ 3"]
 GAUGES = ("none", "scalar_per_set", "channel_per_photo")
@@ -54,16 +56,9 @@ def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
     >>> connected_components({"day": ["red", "white"], "night": ["blue"]})
     {'blue': 0, 'red': 1, 'white': 1}
     """
-    leader: dict[str, str] = {}
-
-    def find(name: str) -> str:
-        while leader.setdefault(name, name) != name:
-            name = leader[name]
-        return name
-
-    for together in pairs.values():
-        for name in together:
-            low, high = sorted((find(together[0]), find(name)))
-            leader[high] = low
-    roots = sorted({find(name) for name in leader})
-    return {name: roots.index(find(name)) for name in sorted(leader)}
+    names = sorted({name for together in pairs.values() for name in together})
+    linked = [(names.index(together[0]), names.index(name)) for together in pairs.values() for name in together]
+    first, second = np.array(linked, dtype=int).reshape(-1, 2).T
+    _, label = components_of_graph(coo_array((np.ones(len(linked)), (first, second)), shape=(len(names), len(names))), directed=False)
+    order = list(dict.fromkeys(label.tolist()))
+    return {name: order.index(number) for name, number in zip(names, label.tolist(), strict=True)}

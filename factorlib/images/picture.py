@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from factorlib.errors import InputError
 from factorlib.images.transfer import srgb_encode
-from factorlib.images.write import write_image
+from factorlib.images.write import encoded
+from factorlib.wholefile import write_bytes
 
 PERCENTILE = 99.0
 
@@ -45,11 +46,16 @@ def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = No
 
 
 def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
-    """Write an 8-bit PNG of 1, 3 or 4 channels (alpha not multiplied in), without date or program name."""
+    """Write the PNG of `png_bytes`, whole or not at all."""
+    write_bytes(path, png_bytes(pixels))
+
+
+def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
+    """An 8-bit PNG of 1, 3 or 4 channels (alpha not multiplied in), without date or program name."""
     pixels = np.asarray(pixels, dtype=np.uint8)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    write_image(path, spec, pixels)
+    return encoded("picture.png", spec, pixels)
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

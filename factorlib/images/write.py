@@ -16,7 +16,12 @@ from factorlib.wholefile import bytes_of, write_bytes
 
 def write_image(path: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
     """Write `pixels` [h, w, c] in the format that the suffix of `path` names; raises OSError where that fails."""
-    write_bytes(path, bytes_of(lambda memory: _encode(Path(path), memory, spec, np.ascontiguousarray(pixels))))
+    write_bytes(path, encoded(path, spec, pixels))
+
+
+def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes:
+    """The bytes of an image file of `pixels` [h, w, c], in the format of the suffix of `name`; raises OSError where that fails."""
+    return bytes_of(lambda memory: _encode(Path(name), memory, spec, np.ascontiguousarray(pixels)))
 
 
 def _encode(path: Path, memory: str, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:

@@ -18,6 +18,7 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
+from factorlib.robust import robust_deviation
 from factorlib.solve.insertion import candidates, lobes_inserted, pruned
 from factorlib.solve.start import starting_light
 from factorlib.solve.weights import nonnegative_minimum
@@ -79,8 +80,8 @@ def _ridge(atoms: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
 
 def robust_scale(residual: Float[np.ndarray, "n 3"]) -> float:
     """Three robust standard deviations, never below one σ of the noise model; channels that are not compared are exactly 0."""
-    compared = np.abs(residual[residual != 0])
-    return max(3 * 1.4826 * float(np.median(compared)), 1.0) if len(compared) else 1.0
+    compared = residual[residual != 0]
+    return max(3 * robust_deviation(compared), 1.0) if len(compared) else 1.0
 
 
 def robust_loss(residual: Float[np.ndarray, "n 3"]) -> Loss:

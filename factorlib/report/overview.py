@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import UInt8
 
-from factorlib.images.picture import exposure_of, picture
+from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.report.appearance import disc, exposures
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.photos import PhotoRow, on_white
-from factorlib.report.png import png_bytes, reduced
+from factorlib.report.png import reduced
 
 COLUMN, GAP = 200, 8  # pixels
 MOST_PHOTOS = 8

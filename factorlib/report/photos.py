@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from factorlib.evaluate.resynthesis import agreeing_pixels
-from factorlib.images.picture import picture
+from factorlib.images.picture import picture, png_bytes
 from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts, Channels, Picture
-from factorlib.report.png import box_of, data_uri, outline, png_bytes, reduced
+from factorlib.report.png import box_of, data_uri, outline, reduced
 from factorlib.results.metrics import PhotoErrors
 
 AMPLIFICATION = 4

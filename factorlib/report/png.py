@@ -1,30 +1,13 @@
-"""Pictures inside the page: PNG files as bytes and data URIs, the same bytes for the same pixels, and their sizes."""
+"""Pictures inside the page: as data URIs, reduced, cropped and outlined."""
 
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
-COLOUR_TYPE = {1: 0, 3: 2, 4: 6}  # channels -> PNG colour type
-
-
-def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
-    """A PNG of 1, 3 or 4 channels; rows are stored as Paeth differences (PNG specification, 9.4)."""
-    height, width, channels = pixels.shape
-    p = np.pad(pixels.astype(np.int16), ((1, 0), (1, 0), (0, 0)))
-    left, up, corner = p[1:, :-1], p[:-1, 1:], p[:-1, :-1]
-    estimate = left + up - corner
-    far = [np.abs(estimate - t) for t in (left, up, corner)]
-    nearest = np.where((far[0] <= far[1]) & (far[0] <= far[2]), left, np.where(far[1] <= far[2], up, corner))
-    rows = ((p[1:, 1:] - nearest) & 255).astype(np.uint8).reshape(height, -1)
-    data = np.concatenate([np.full((height, 1), 4, np.uint8), rows], axis=1).tobytes()
-    header = struct.pack(">IIBBBBB", width, height, 8, COLOUR_TYPE[channels], 0, 0, 0)
-    return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(data, 9)) + _chunk(b"IEND", b"")
+from factorlib.images.picture import png_bytes
 
 
 def data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
@@ -63,7 +46,3 @@ def _averaging(source: int, target: int) -> Float[np.ndarray, "target source"]:
     cells = np.arange(source)
     overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
     return (np.maximum(overlap, 0) * (target / source)).astype(np.float32)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from factorlib.images.transfer import srgb_encode
+
 MINUS, DASH = "\u2212", "\u2013"
 
 
@@ -63,6 +67,4 @@ def css_colour(linear: list[float]) -> str:
     >>> css_colour([1.0, 0.18, 0.0])
     'rgb(255 118 0)'
     """
-    values = [min(max(float(v), 0.0), 1.0) for v in linear]
-    encoded = [12.92 * v if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055 for v in values]
-    return f"rgb({' '.join(str(round(255 * v)) for v in encoded)})"
+    return f"rgb({' '.join(str(round(255 * v)) for v in srgb_encode(np.clip(linear, 0.0, 1.0)).tolist())})"
