@@ -92,28 +92,29 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
         np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, np.int32),
         np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape),
     )  # fmt: skip
-    nearest = np.full(shape, np.inf)
+    nearest, view = np.full(shape, np.inf), -unit(camera.rays())
     for number, (mesh, pose) in enumerate(zip(meshes, poses, strict=True), start=1):
         caster = mesh if isinstance(mesh, Caster) else Caster(mesh)
         hits = caster.cast(camera, pose)
         wins = (hits.face >= 0) & (hits.depth < nearest)
         nearest[wins] = hits.depth[wins]
-        _fill(maps, wins, number, caster.mesh, hits, camera, pose)
+        maps.depth[wins], maps.view[wins], maps.object[wins] = hits.depth[wins], view[wins], number
+        _fill(maps, wins, hits, caster.mesh, pose)
     return maps
 
 
-def _fill(maps: Maps, wins: np.ndarray, number: int, mesh: Mesh, hits: Hits, camera: Camera, pose: Pose) -> None:
+def _fill(maps: Maps, wins: Bool[np.ndarray, "h w"], hits: Hits, mesh: Mesh, pose: Pose) -> None:
+    """What the surface of `mesh` adds to `maps` where it `wins`: normals, labels, sides; views are there already."""
     corners = mesh.faces[hits.face[wins]]  # [n, 3]
     u, v = hits.uv[wins].T
     weight = np.stack([1 - u - v, u, v], axis=1)
     smooth = np.einsum("nk,nkd->nd", weight, mesh.normals[corners]) @ pose.rotation.T
     flat = face_normals(mesh, hits.face[wins]) @ pose.rotation.T
-    view = -unit(camera.rays()[wins])
+    view = maps.view[wins]
     facing = np.sum(flat * view, axis=1)
     side = np.where(facing < 0, -1.0, 1.0)
     maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
-    maps.view[wins], maps.depth[wins] = view, hits.depth[wins]
-    maps.label[wins], maps.object[wins] = mesh.face_label[hits.face[wins]], number
+    maps.label[wins] = mesh.face_label[hits.face[wins]]
     maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
 
 
