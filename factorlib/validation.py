@@ -58,8 +58,8 @@ class Validation:
             yield from ((f"photo {entry.name}", partial(self._photo, entry, most)) for entry in entries)
         elif slice_ == "objects":
             limits = convert(params.get("limits", {}), Limits, settings, "limits")
-            for thing in (thing for entry in entries for thing in entry.objects):
-                yield f"mesh {thing.mesh} {thing.materials}", partial(self._object, thing, spec.meshes[thing.mesh], limits)
+            for obj in (obj for entry in entries for obj in entry.objects):
+                yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, spec.meshes[obj.mesh], limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
                 yield f"light {path}", partial(read_true_light, self._file(path), name)
@@ -75,11 +75,11 @@ class Validation:
         size = open_photo(path, f"{key}.image").size
         check_pixels(size, most_megapixels, path, f"{key}.image")
         read_labels(entry.masks, self._file, self.dataset.spec.materials, size, entry.image, f"{key}.masks")
-        read_objects([(thing.name, thing.mask) for thing in entry.objects], self._file, size, f"{key}.objects")
+        read_objects([(obj.name, obj.mask) for obj in entry.objects], self._file, size, f"{key}.objects")
 
-    def _object(self, thing: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
+    def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
         file = self._file(mesh.file)
-        part_labels(self._parts_of(mesh.file, limits), self.dataset.spec.materials, mesh.parts, mesh.material, thing.materials, file)
+        part_labels(self._parts_of(mesh.file, limits), self.dataset.spec.materials, mesh.parts, mesh.material, obj.materials, file)
 
     def _parts_of(self, name: str, limits: Limits) -> list[tuple[str, ...]]:
         """The parts of a mesh file, which is read once; if it cannot be, that is said again for every object."""

@@ -66,7 +66,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     whole = whole_evidence(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     external = slice_.external.source if slice_.external else None
-    sources = {thing.name: "given" if thing.pose else external for thing in slice_.objects}
+    sources = {obj.name: "given" if obj.pose else external for obj in slice_.objects}
     entries = {each.name: entry(each, k, result, maps, params, sources[each.name]) for k, each in enumerate(objects)}
     for object_name, found in entries.items():
         complain(name, object_name, found, params.strict)
@@ -81,21 +81,21 @@ def objects_of(
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
     objects = []
-    for number, thing in enumerate(slice_.objects, start=1):
-        mesh, materials = slice_.meshes[thing.mesh], inputs.facts["dataset.materials"]
+    for number, obj in enumerate(slice_.objects, start=1):
+        mesh, materials = slice_.meshes[obj.mesh], inputs.facts["dataset.materials"]
         file = inputs.file(mesh.file)
-        pose = pose_of(thing, slice_.external)
-        before = earlier.objects.get(thing.name) if earlier and pose is None else None
+        pose = pose_of(obj, slice_.external)
+        before = earlier.objects.get(obj.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
-        caster = Caster(scaled(_mesh(file, mesh, thing, materials, params), scale))
-        evidence = object_evidence(channels, number, caster.mesh.labels, thing.mask is not None)
+        caster = Caster(scaled(_mesh(file, mesh, obj, materials, params), scale))
+        evidence = object_evidence(channels, number, caster.mesh.labels, obj.mask is not None)
         found = earlier_pose(before) if before else None
-        objects.append(ObjectToPlace(thing.name, caster, evidence, pose, keypoints_of(thing, factor), found, scale))
+        objects.append(ObjectToPlace(obj.name, caster, evidence, pose, keypoints_of(obj, factor), found, scale))
     return objects
 
 
-def _mesh(file: Path, mesh: schema.MeshEntry, thing: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
-    return read_mesh(file, materials, mesh.parts, mesh.material, thing.materials, params.crease_deg, params.limits)
+def _mesh(file: Path, mesh: schema.MeshEntry, obj: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
+    return read_mesh(file, materials, mesh.parts, mesh.material, obj.materials, params.crease_deg, params.limits)
 
 
 def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace], photo: str) -> None:
@@ -105,17 +105,17 @@ def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace],
             check_before_camera(each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source)
 
 
-def pose_of(thing: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
+def pose_of(obj: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
     """The pose that dataset.yaml gives, or else its source of cameras."""
-    pose = thing.pose or (external.poses.get(thing.name) if external else None)
+    pose = obj.pose or (external.poses.get(obj.name) if external else None)
     return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
 
 
-def keypoints_of(thing: schema.ObjectEntry, factor: int) -> Keypoints | None:
+def keypoints_of(obj: schema.ObjectEntry, factor: int) -> Keypoints | None:
     """In pixels of the photo averaged down by `factor`."""
-    if not thing.keypoints:
+    if not obj.keypoints:
         return None
-    return Keypoints(np.array([k.pixel for k in thing.keypoints]) / factor, np.array([k.point for k in thing.keypoints]))
+    return Keypoints(np.array([k.pixel for k in obj.keypoints]) / factor, np.array([k.point for k in obj.keypoints]))
 
 
 def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
@@ -141,23 +141,23 @@ def camera_entry(result: Placed, factor: int) -> CameraEntry:
     return CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, factor)
 
 
-def entry(thing: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
+def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
     """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
     """
     seen = np.where(maps.object == k + 1, maps.label, 0)
-    iou, agreement = silhouette_iou(thing.evidence, seen), label_agreement(thing.evidence, seen)
-    found, pose, trust = result.found[k], result.poses[k], trust_in(thing, result, k)
+    iou, agreement = silhouette_iou(obj.evidence, seen), label_agreement(obj.evidence, seen)
+    found, pose, trust = result.found[k], result.poses[k], trust_in(obj, result, k)
     reasons = doubts(iou, agreement, trust, found, params)
     return ObjectEntry(
         **entry_of(pose),
-        scale=thing.scale,
+        scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,
         source=source if found is None else "refined" if found.earlier else "keypoints" if found.by_keypoints else "found",
         score=found.score if found else None,
-        runner_up=runner_up_entry(found, thing.caster),
+        runner_up=runner_up_entry(found, obj.caster),
         **msgspec.structs.asdict(trust),
         doubts=reasons,
         left_out=bool(reasons) and found is not None and not params.keep_doubtful,
@@ -172,15 +172,15 @@ def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
     return RunnerUp(**entry_of(other.state.pose(caster)), score=other.score, normal_difference_deg=other.normal_difference_deg)
 
 
-def complain(photo: str, thing: str, entry: ObjectEntry, strict: bool) -> None:
+def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
     """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
     cure = CURE_OF_EXTERNAL if entry.source in schema.SOURCES else CURE
     for reason in entry.doubts:
         if strict:
-            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{thing}", cure=cure)
-        log.warning("%s: %s: %s; %s", photo, thing, reason, cure)
+            raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)
+        log.warning("%s: %s: %s; %s", photo, name, reason, cure)
     if entry.left_out:
-        log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, thing)
+        log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, name)
 
 
 def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:

@@ -73,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for photo, light in lights.items():
         view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
         shapes = [
-            shape for thing in objects[photo].objects for shape in files.shapes(thing, objects[photo].meshes, poses[photo].objects)
+            shape for obj in objects[photo].objects for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
         ]
         environment = _environment(out, photo, light, lobes[light.illumination], np.array(exposures.get(photo, [1.0] * 3)), params)
         write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment)
@@ -144,22 +144,22 @@ class MeshFiles:
             self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
         return self._meshes[key]
 
-    def shapes(self, thing: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]) -> list[Shape]:
+    def shapes(self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]) -> list[Shape]:
         """One per material of the object."""
-        mesh, stem = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials), self._written(thing, meshes)
+        mesh, stem = self.mesh(obj.mesh, meshes[obj.mesh], obj.materials), self._written(obj, meshes)
         place = np.eye(4)
-        pose = poses[thing.name]
+        pose = poses[obj.name]
         place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
         used = [self.materials[label - 1] for label in mesh.labels]
-        return [Shape(f"{thing.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
+        return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
 
-    def _written(self, thing: schema.ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
+    def _written(self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
         """What the files are called before the material, relative to the scenes; a second choice of materials is <mesh>.2."""
-        key = (thing.mesh, *sorted(thing.materials.items()))
+        key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
-            number = 1 + sum(other[0] == thing.mesh for other in self._stems)
-            stem = f"meshes/{thing.mesh}" + (f".{number}" if number > 1 else "")
-            mesh = self.mesh(thing.mesh, meshes[thing.mesh], thing.materials)
+            number = 1 + sum(other[0] == obj.mesh for other in self._stems)
+            stem = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
+            mesh = self.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
             for label in mesh.labels:
                 write_ply(self.scenes / f"{stem}.{self.materials[label - 1]}.ply", submesh(mesh, label))
             self._stems[key] = stem

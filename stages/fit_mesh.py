@@ -46,7 +46,7 @@ class Found(msgspec.Struct, frozen=True):
     """A sighting and where it stands: photo, object, and the evidence that its overlap is measured by."""
 
     photo: str
-    thing: str
+    object: str
     sighting: Sighting
     evidence: object
 
@@ -78,15 +78,15 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: In
     camera = entry.camera.camera(width, height)
     prior = prior_before(camera.focal, entry.camera.focal_source, facts.focal_px, width, height)
     alone = prior if len(slice_.objects) == 1 else FocalPrior(camera.focal, 0.0)
-    for number, thing in enumerate(slice_.objects, start=1):
-        found, mesh = entry.objects[thing.name], slice_.meshes[thing.mesh]
+    for number, obj in enumerate(slice_.objects, start=1):
+        found, mesh = entry.objects[obj.name], slice_.meshes[obj.mesh]
         if found.source not in SEARCHED or (found.silhouette_iou or 0.0) < params.least_iou:
             continue
-        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, thing.materials, limits=NO_LIMITS)
-        evidence = object_evidence(channels, number, read.labels, thing.mask is not None)
+        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, obj.materials, limits=NO_LIMITS)
+        evidence = object_evidence(channels, number, read.labels, obj.mask is not None)
         state = state_of(found.pose, camera, scaled(read, found.scale))
         target = target_of(evidence, read.labels, params.resolution, MARGIN)
-        yield thing.mesh, Found(photo, thing.name, Sighting(read, target, camera, alone, state), evidence)
+        yield obj.mesh, Found(photo, obj.name, Sighting(read, target, camera, alone, state), evidence)
 
 
 def fitted(verdict: Verdict, sightings: list[Found]) -> dict:
@@ -96,7 +96,7 @@ def fitted(verdict: Verdict, sightings: list[Found]) -> dict:
         "used": verdict.used,
         "reason": verdict.reason,
         "held_out_unexplained": {"as_it_is": verdict.held_out_before, "fitted": verdict.held_out_after},
-        "sightings": [f"{one.photo}.{one.thing}" for one in sightings],
+        "sightings": [f"{one.photo}.{one.object}" for one in sightings],
     }
 
 
@@ -107,4 +107,4 @@ def placed(entry: PhotoPoses, one: Found, state: State, factors: np.ndarray) -> 
     camera = msgspec.structs.replace(entry.camera, focal_px=float(seen.focal)) if one.sighting.prior.sigma > 0 else entry.camera
     iou = silhouette_iou(one.evidence, rasterise(caster, seen, pose).label)
     changed = {**entry_of(pose), "scale": tuple(factors.tolist()), "silhouette_iou": iou, "runner_up": None}
-    return PhotoPoses(camera, entry.objects | {one.thing: msgspec.structs.replace(entry.objects[one.thing], **changed)})
+    return PhotoPoses(camera, entry.objects | {one.object: msgspec.structs.replace(entry.objects[one.object], **changed)})

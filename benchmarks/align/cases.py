@@ -122,18 +122,18 @@ def write_set(folder: Path, made: list[Case]) -> None:
         lit = np.clip(-each.truth().normal[..., 2:], 0.02, 1) * np.array([0.5, 0.45, 0.4])
         write_photo(folder / f"photos/{each.name}.png", lit)
         write_labels(folder / f"masks/{each.name}.png", each.label)
-        thing = {"name": "thing", "mesh": mesh_name}
+        obj = {"name": "object", "mesh": mesh_name}
         photos.append(
             {
                 "name": each.name,
                 "image": f"photos/{each.name}.png",
                 "masks": f"masks/{each.name}.png",
                 "illumination": "lamp",
-                "objects": [thing],
+                "objects": [obj],
             }
         )
         if each.kind in RIGHT:
-            poses[each.name] = {"thing": {"rotation": each.pose.rotation.tolist(), "translation": each.pose.translation.tolist()}}
+            poses[each.name] = {"object": {"rotation": each.pose.rotation.tolist(), "translation": each.pose.translation.tolist()}}
     spec = {"format": 1, "materials": ["material1", "material2"], "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
     (folder / "truth/truth.yaml").write_text(yaml.safe_dump({"poses": poses}, sort_keys=False), encoding="utf-8")
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec, sort_keys=False), encoding="utf-8")

@@ -34,9 +34,9 @@ def measured(given: Case, search: Search = Search()) -> dict:
     truth, blind = given.truth(), Camera(given.camera.width, given.camera.height, 1.0, given.camera.centre)
     clock = Clock()
     evidence = object_evidence({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
-    thing = ObjectToPlace("thing", caster, evidence)
-    result = placed([thing], blind, KnownFocal(), given.name, search)
-    seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(thing, result, 0)
+    obj = ObjectToPlace("object", caster, evidence)
+    result = placed([obj], blind, KnownFocal(), given.name, search)
+    seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(obj, result, 0)
     taken, found = clock.taken(), result.found[0]
     iou, agreement = silhouette_iou(evidence, seen.label), label_agreement(evidence, seen.label)
     other = found.runner_up

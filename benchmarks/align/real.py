@@ -66,14 +66,14 @@ def measured_photo(key: tuple[Path, str]) -> list[dict]:
         taken = clock.taken()
     said = {"set": folder.resolve().name, "photo": photo, "wall_s": taken.wall, "processor_s": taken.processor}
     reference = read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)[photo]
-    return [said | _errors(dataset, thing, size, entry, reference) for thing in dataset.photo(photo).objects]
+    return [said | _errors(dataset, obj, size, entry, reference) for obj in dataset.photo(photo).objects]
 
 
 def withheld(dataset: Dataset) -> Dataset:
     """The dataset without cameras, poses, keypoints and what a source of cameras says."""
     replace = msgspec.structs.replace
     photos = [
-        replace(photo, camera=None, objects=[replace(thing, pose=None, keypoints=[]) for thing in photo.objects])
+        replace(photo, camera=None, objects=[replace(obj, pose=None, keypoints=[]) for obj in photo.objects])
         for photo in dataset.spec.photos
     ]
     return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
@@ -94,13 +94,13 @@ def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[PhotoPoses, tu
     return read_photo_poses(folders["align"] / f"{photo}.json"), (facts.width, facts.height)
 
 
-def _errors(dataset: Dataset, thing: ObjectEntry, size: tuple[int, int], entry: PhotoPoses, reference: Reference) -> dict:
-    mesh = dataset.spec.meshes[thing.mesh]
-    caster = Caster(read_mesh(dataset.folder / mesh.file, dataset.spec.materials, mesh.parts, mesh.material, thing.materials))
-    (camera, pose), (true_camera, true_pose) = (_seen(said, thing.name, size) for said in (entry, reference))
-    found = entry.objects[thing.name]
+def _errors(dataset: Dataset, obj: ObjectEntry, size: tuple[int, int], entry: PhotoPoses, reference: Reference) -> dict:
+    mesh = dataset.spec.meshes[obj.mesh]
+    caster = Caster(read_mesh(dataset.folder / mesh.file, dataset.spec.materials, mesh.parts, mesh.material, obj.materials))
+    (camera, pose), (true_camera, true_pose) = (_seen(said, obj.name, size) for said in (entry, reference))
+    found = entry.objects[obj.name]
     return {
-        "object": thing.name,
+        "object": obj.name,
         "turn": Rotation.from_matrix(true_pose.rotation.T @ pose.rotation).as_rotvec().tolist(),
         "rotation_error_deg": angle_between(pose.rotation, true_pose.rotation),
         "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true_pose))),

@@ -1,6 +1,6 @@
 """Where formulas break: grazing views, mirrors, lobes of no width or of all, and lobes along every special direction.
 
-A case changes one thing from the ordinary and leaves the rest; the last one changes all of them at once.
+A case differs from the ordinary in one respect; the last one changes all of them at once.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ def measured() -> dict:
     fast = variants(("float32", "float64"))
     shown = {label: operator for label, operator in fast.items() if "float64" not in label}
     rows = {name: _case(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
-    held = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
-    return {"cases": rows, "laws": held}
+    measured = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
+    return {"cases": rows, "laws": measured}
 
 
 def _case(given: Pairs, shown: dict[str, Operator], fast: dict[str, Operator], with_reference: bool) -> dict:
@@ -57,12 +57,12 @@ def _values(given: Pairs) -> dict[str, torch.Tensor]:
         return {"diffuse": reference.diffuse(given.sharpness[:, None], nz)[:, 0], "specular": specular[:, 0]}
 
 
-def _measures(told: Found, exactly: Found | None, true: dict | None, given: Pairs) -> dict:
-    measures: dict = {"pairs": len(given), "finite": told.finite()}
+def _measures(answer: Found, exactly: Found | None, true: dict | None, given: Pairs) -> dict:
+    measures: dict = {"pairs": len(given), "finite": answer.finite()}
     if exactly is not None:
-        measures |= {"value_rounding": value_error(told, exactly, given), "gradient_rounding": gradient_error(told, exactly, given)}
+        measures |= {"value_rounding": value_error(answer, exactly, given), "gradient_rounding": gradient_error(answer, exactly, given)}
     if true is not None:
-        measures["value"] = value_error(told, Found(true, told.turning), given)
+        measures["value"] = value_error(answer, Found(true, answer.turning), given)
     return {k: float(f"{float(v.max()):.3g}") if torch.is_tensor(v) else v for k, v in measures.items()}
 
 
@@ -79,13 +79,13 @@ def as_tables(result: dict) -> dict[str, str]:
         for name, row in result["cases"].items()
     ]
     values = [[name, *cells(row, "value")] for name, row in result["cases"].items() if name != ALL]
-    held = [
+    measured = [
         [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)] for law, row in result["laws"].items()
     ]
     return {
         "stability": table(["changed", *head], rounding),
         "special values": table(["changed", *head], values),
-        "laws": table(["law", *head], held),
+        "laws": table(["law", *head], measured),
     }
 
 

@@ -141,8 +141,8 @@ def traced_pair(material: Material, lat_long: Float[np.ndarray, "h w 3"], seed: 
     world, light = rigid(YUP_FROM_CAMERA, np.zeros(3)), envmap(lat_long)
     halves, inside = np.zeros((2, SIZE, SIZE, 3)), sphere()[2]
     for number in range(MOST_PASSES):
-        things = {"ball": ball, "light": light}
-        halves[number % 2] += traced(things, camera(), world, PASS_SPP, MOST_PASSES * seed + number, max_depth=2)
+        scene = {"ball": ball, "light": light}
+        halves[number % 2] += traced(scene, camera(), world, PASS_SPP, MOST_PASSES * seed + number, max_depth=2)
         if number % 2:
             passes = number + 1
             mean, difference = halves.sum(0) / passes, (halves[0] - halves[1]) / passes
@@ -170,12 +170,12 @@ def made_light(number: int) -> Float[np.ndarray, "h w 3"]:
     rng = np.random.default_rng(1000 + number)
     world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
     if number % 3:
-        things = lights.room(rng, windows=2, lamps=number % 3)
+        scene = lights.room(rng, windows=2, lamps=number % 3)
     else:
         forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
         azimuth = forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70)
-        things = lights.daylight(rng, rng.uniform(30, 50), azimuth, rows=2 * LIGHT_ROWS)
-    return lights.map_of(things, world_from_camera @ YUP_FROM_CAMERA, LIGHT_ROWS, LIGHT_SPP, 1000 + number)
+        scene = lights.daylight(rng, rng.uniform(30, 50), azimuth, rows=2 * LIGHT_ROWS)
+    return lights.map_of(scene, world_from_camera @ YUP_FROM_CAMERA, LIGHT_ROWS, LIGHT_SPP, 1000 + number)
 
 
 def _digest(*parts) -> str:

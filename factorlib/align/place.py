@@ -107,23 +107,23 @@ def placed(
         camera, source = _focal_of_given(objects, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
     for k in sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k)):
-        thing = objects[k]
-        if thing.pose is not None:
+        obj = objects[k]
+        if obj.pose is not None:
             continue
-        if not thing.evidence.inside.any():
+        if not obj.evidence.inside.any():
             raise InputError(
-                f"no pixel of the mask shows object {thing.name!r}", file="dataset.yaml", key=photo,
+                f"no pixel of the mask shows object {obj.name!r}", file="dataset.yaml", key=photo,
                 cure="remove the object from this photo, or check its mask and materials",
             )  # fmt: skip
-        if thing.earlier is not None:
-            found[k] = _found_before(thing, camera, sigma, search)
-        elif thing.keypoints is None:
-            found[k] = find(thing.caster, thing.evidence, camera, prior, search)
+        if obj.earlier is not None:
+            found[k] = _found_before(obj, camera, sigma, search)
+        elif obj.keypoints is None:
+            found[k] = find(obj.caster, obj.evidence, camera, prior, search)
         else:
-            start = state_of_keypoints(thing.keypoints, thing.caster, camera, prior, photo, thing.name)
-            found[k] = found_near(thing.caster, thing.evidence, camera, start, prior, search)
+            start = state_of_keypoints(obj.keypoints, obj.caster, camera, prior, photo, obj.name)
+            found[k] = found_near(obj.caster, obj.evidence, camera, start, prior, search)
         if prior.sigma > 0:
-            found[k], source = _judged(thing, camera, found[k], source, photo, search)
+            found[k], source = _judged(obj, camera, found[k], source, photo, search)
             sigma = found[k].log_focal_sigma
             camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
@@ -131,32 +131,32 @@ def placed(
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
 
 
-def _pose(thing: ObjectToPlace, found: Found | None) -> Pose:
+def _pose(obj: ObjectToPlace, found: Found | None) -> Pose:
     """What was said or found before is used to the last digit."""
-    if thing.pose is None and thing.earlier is None:
-        return found.state.pose(thing.caster)
-    return thing.pose or thing.earlier.pose
+    if obj.pose is None and obj.earlier is None:
+        return found.state.pose(obj.caster)
+    return obj.pose or obj.earlier.pose
 
 
-def _found_before(thing: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
-    earlier = thing.earlier
-    found = found_before(thing.caster, thing.evidence, camera, state_of(earlier.pose, camera, thing.caster), sigma, search)
+def _found_before(obj: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
+    earlier = obj.earlier
+    found = found_before(obj.caster, obj.evidence, camera, state_of(earlier.pose, camera, obj.caster), sigma, search)
     if earlier.runner_up is None:
         return found
-    state = state_of(earlier.runner_up, camera, thing.caster)
+    state = state_of(earlier.runner_up, camera, obj.caster)
     other = RunnerUp(state, earlier.runner_up_score, earlier.runner_up_difference_deg)
     return msgspec.structs.replace(found, runner_up=other)
 
 
-def _judged(thing: ObjectToPlace, camera: Camera, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
+def _judged(obj: ObjectToPlace, camera: Camera, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
     """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
     if source != "exif":
         return found, "estimated"
     broad = FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
     if found.score >= WELL_FOUND:
-        free = with_focal_free(thing.caster, thing.evidence, camera, found, broad, search)
+        free = with_focal_free(obj.caster, obj.evidence, camera, found, broad, search)
     else:
-        free = find(thing.caster, thing.evidence, camera, broad, search)
+        free = find(obj.caster, obj.evidence, camera, broad, search)
     if free.score < found.score + CLEARLY_BETTER:
         return found, "exif"
     log.warning(

@@ -40,9 +40,9 @@ class Trust(msgspec.Struct, frozen=True):
     mirrored_score: float | None = None
 
 
-def trust_in(thing: ObjectToPlace, placed: Placed, number: int) -> Trust:
-    """Of the pose of `thing`, the photo's `number`-th; of a pose that was given only the contours are compared."""
-    found, caster, evidence = placed.found[number], thing.caster, thing.evidence
+def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
+    """Of the pose of `obj`, the photo's `number`-th; of a pose that was given only the contours are compared."""
+    found, caster, evidence = placed.found[number], obj.caster, obj.evidence
     if not evidence.inside.any():
         return Trust(1.0)
     target = target_of(evidence, caster.mesh.labels, RESOLUTION, MARGIN)

@@ -1,6 +1,6 @@
 """What can be wrong with a dataset without opening a single image or mesh; each is refused with its key and a cure.
 
-`check_dataset` and `check_truth` walk a decoded file once and raise at the first thing that does not hold; `check_lights`
+`check_dataset` and `check_truth` walk a decoded file once and raise at the first rule that does not hold; `check_lights`
 follows once cameras that are known from elsewhere have been read.
 """
 
@@ -76,9 +76,9 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
             check_path(f"{group}.{name}", path, MAPS, refuse, must_exist=False)
     for name, poses in truth.poses.items():
         check_known(f"poses.{name}", name, photos, "photo", refuse)
-        for thing, pose in poses.items():
-            check_known(f"poses.{name}.{thing}", thing, [o.name for o in photos[name].objects], "object", refuse)
-            check_rotation(f"poses.{name}.{thing}.rotation", pose.rotation, refuse)
+        for obj, pose in poses.items():
+            check_known(f"poses.{name}.{obj}", obj, [o.name for o in photos[name].objects], "object", refuse)
+            check_rotation(f"poses.{name}.{obj}.rotation", pose.rotation, refuse)
 
 
 def _check_true_material(key: str, material: TrueMaterial, refuse: Refusal) -> None:
@@ -159,9 +159,9 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
     _check_masks(f"{key}.masks", photo, spec.materials, refuse)
     if not photo.objects:
         refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", "add {name: …, mesh: …}: a mesh gives its pixels their normals")
-    _check_unique(f"{key}.objects", (thing.name for thing in photo.objects), "object", refuse)
-    for index, thing in enumerate(photo.objects):
-        _check_object(f"{key}.objects[{index}]", thing, spec, refuse)
+    _check_unique(f"{key}.objects", (obj.name for obj in photo.objects), "object", refuse)
+    for index, obj in enumerate(photo.objects):
+        _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
 
 
 def _check_masks(key: str, photo: PhotoEntry, materials: list[str], refuse: Refusal) -> None:
@@ -174,32 +174,32 @@ def _check_masks(key: str, photo: PhotoEntry, materials: list[str], refuse: Refu
         check_path(f"{key}.{material}", path, (".png",), refuse)
 
 
-def _check_object(key: str, thing: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    _check_name(f"{key}.name", thing.name, refuse)
-    check_known(f"{key}.mesh", thing.mesh, spec.meshes, "mesh", refuse)
-    mesh = spec.meshes[thing.mesh]
-    for part, material in thing.materials.items():
+def _check_object(key: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
+    _check_name(f"{key}.name", obj.name, refuse)
+    check_known(f"{key}.mesh", obj.mesh, spec.meshes, "mesh", refuse)
+    mesh = spec.meshes[obj.mesh]
+    for part, material in obj.materials.items():
         _check_part(f"{key}.materials.{part}", part, mesh, refuse)
         if mesh.parts:
             check_known(f"{key}.materials.{part}", part, mesh.parts, "part", refuse)
         check_known(f"{key}.materials.{part}", material, spec.materials, "material", refuse)
-    if thing.mask is not None:
-        check_path(f"{key}.mask", thing.mask, (".png",), refuse)
-    if thing.pose is not None:
-        check_rotation(f"{key}.pose.rotation", thing.pose.rotation, refuse)
-    if thing.keypoints:
-        _check_keypoints(f"{key}.keypoints", thing, refuse)
+    if obj.mask is not None:
+        check_path(f"{key}.mask", obj.mask, (".png",), refuse)
+    if obj.pose is not None:
+        check_rotation(f"{key}.pose.rotation", obj.pose.rotation, refuse)
+    if obj.keypoints:
+        _check_keypoints(f"{key}.keypoints", obj, refuse)
 
 
-def _check_keypoints(key: str, thing: ObjectEntry, refuse: Refusal) -> None:
+def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
     """Enough of them, of different places, and not all on a line, about which the object could turn."""
-    if thing.pose is not None:
+    if obj.pose is not None:
         refuse(key, "has both a pose and keypoints", "keep one: a pose is used as it is, keypoints are where the search begins")
-    if len(thing.keypoints) < LEAST_KEYPOINTS:
+    if len(obj.keypoints) < LEAST_KEYPOINTS:
         cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
-        refuse(key, f"{len(thing.keypoints)} keypoints do not settle a pose", cure)
+        refuse(key, f"{len(obj.keypoints)} keypoints do not settle a pose", cure)
     for name in ("pixel", "point"):
-        _check_spread(key, name, [getattr(keypoint, name) for keypoint in thing.keypoints], refuse)
+        _check_spread(key, name, [getattr(keypoint, name) for keypoint in obj.keypoints], refuse)
 
 
 def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: Refusal) -> None:
@@ -235,7 +235,7 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
         check_known(f"cameras.images.{name}", name, [photo.name for photo in spec.photos], "photo", refuse)
     for name, similarity in source.world_from_object.items():
         key = f"cameras.world_from_object.{name}"
-        check_known(key, name, {thing.name: None for photo in spec.photos for thing in photo.objects}, "object", refuse)
+        check_known(key, name, {obj.name: None for photo in spec.photos for obj in photo.objects}, "object", refuse)
         check_rotation(f"{key}.rotation", similarity.rotation, refuse)
         check_unit(f"{key}.scale", similarity.scale, refuse)
     for name in source.obj_ids:

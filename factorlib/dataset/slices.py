@@ -59,14 +59,14 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
         masks=photo.masks,
         focal_px=photo.camera.focal_px if photo.camera else None,
         illumination=photo.illumination or photo.name,
-        objects=[schema.ObjectMask(thing.name, thing.mask) for thing in photo.objects],
+        objects=[schema.ObjectMask(obj.name, obj.mask) for obj in photo.objects],
     )
     masks = [photo.masks] if isinstance(photo.masks, str) else list(photo.masks.values())
     return facts, [photo.image, *masks, *_object_masks(photo)]
 
 
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
-    meshes = {thing.mesh: dataset.spec.meshes[thing.mesh] for thing in photo.objects}
+    meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     camera = photo.camera or schema.Camera()
     facts = schema.ObjectsSlice(camera=camera, objects=photo.objects, meshes=meshes, external=dataset.external.get(photo.name))
     files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
@@ -91,7 +91,7 @@ def _truth(dataset: Dataset) -> tuple[schema.TruthFile | None, list[str]]:
 
 
 def _object_masks(photo: PhotoEntry) -> list[str]:
-    return [thing.mask for thing in photo.objects if thing.mask]
+    return [obj.mask for obj in photo.objects if obj.mask]
 
 
 def _json_able(facts: Any) -> Any:

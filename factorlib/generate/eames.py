@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import chair, labelled, rough_chair
-from factorlib.generate.lights import EYE, Things
+from factorlib.generate.lights import EYE, SceneDict
 from factorlib.generate.synthetic import drawn_materials
 from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
 from factorlib.geometry.camera import Camera, Pose
@@ -97,7 +97,7 @@ class Scene(msgspec.Struct, frozen=True):
     """A photo before it is taken: surroundings, camera and chairs in the world (y up, floor at −EYE, chairs about x = z = 0)."""
 
     shot: Shot
-    things: Things
+    things: SceneDict
     camera: Camera
     world_from_camera: Float[np.ndarray, "4 4"]
     chairs: dict[str, Float[np.ndarray, "4 4"]]  # world_from_object
@@ -129,7 +129,7 @@ def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.
 
 def surroundings(
     shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
-) -> Things:
+) -> SceneDict:
     """A sky, a room, or a user's map over a grey ground; nothing stands between camera and chairs."""
     if lat_longs:
         light = lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)

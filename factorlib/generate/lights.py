@@ -25,11 +25,11 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
-Things = dict[str, Any]
+SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}  # about x, about y, of +z
 
 
-def daylight(rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> Things:
+def daylight(rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> SceneDict:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
     elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
@@ -43,11 +43,11 @@ def daylight(rng: np.random.Generator, elevation_deg: float, azimuth_deg: float,
         "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
     }  # fmt: skip
     seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
-    things = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
-    return things | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
+    scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
+    return scene | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
 
 
-def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> Things:
+def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> SceneDict:
     """A coloured block some metres away; none stands before the sun."""
     angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
     size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
@@ -55,25 +55,25 @@ def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> Things:
     return block(place, size, np.degrees(angle), vivid(rng))
 
 
-def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> Things:
+def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> SceneDict:
     """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
-    things = {
+    scene = {
         "floor": wall("-y", EYE, half[[0, 2]], rng.uniform(0.15, 0.45) * np.array([1.2, 0.95, 0.7])),
         "ceiling": wall("+y", ceiling, half[[0, 2]], (0.75, 0.74, 0.7)),
     }
     sides = ["+x", "-x", "+z", "-z"]
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
-        things[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), (0, 0.25))
-        things[f"picture{side}"] = wall(
+        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), (0, 0.25))
+        scene[f"picture{side}"] = wall(
             side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), (rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5))
         )
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        things[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day)
+        scene[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day)
     for k in range(lamps):
         place = [
             rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]),
@@ -81,7 +81,7 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
             rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1]),
         ]
         warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
-        things[f"lamp_{k}"] = {
+        scene[f"lamp_{k}"] = {
             "type": "sphere",
             "center": place,
             "radius": rng.uniform(0.12, 0.18),
@@ -91,8 +91,8 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
         angle = np.radians(clear_deg + clear_half_deg + rng.uniform(0, 1) * (360 - 2 * clear_half_deg))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
-        things[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
-    return things
+        scene[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
+    return scene
 
 
 def wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
@@ -112,7 +112,7 @@ def wall(
     colour: Colour,
     shift: tuple[float, float] = (0.0, 0.0),
     glow: Colour | None = None,
-) -> Things:
+) -> SceneDict:
     """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
 
     shift: of its middle in its own plane (along, up);  glow: the radiance it emits, None for a wall that only reflects
@@ -120,23 +120,23 @@ def wall(
     pitch, yaw = TURNS[side]
     to_world = mitsuba().ScalarTransform4f().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch)
     to_world = to_world.translate([*shift, distance]).rotate([0, 1, 0], 180).scale([*map(float, half), 1])
-    thing = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
-    return thing if glow is None else thing | {"emitter": {"type": "area", "radiance": rgb(glow)}}
+    shape = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
+    return shape if glow is None else shape | {"emitter": {"type": "area", "radiance": rgb(glow)}}
 
 
 def block(
     place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour
-) -> Things:
+) -> SceneDict:
     """A box of half sizes `half` about `place`, turned about y."""
     to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
 def map_of(
-    things: Things, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place: Sequence[float] = (0, 0, 0)
+    scene: SceneDict, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place: Sequence[float] = (0, 0, 0)
 ) -> Float[np.ndarray, "h w 3"]:
     """The light of a surrounding at a place of the world, a lat-long map of `height` rows in a turned y-up frame."""
-    return light_seen(things, rigid(world_from_light, place), height, spp, seed)
+    return light_seen(scene, rigid(world_from_light, place), height, spp, seed)
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:

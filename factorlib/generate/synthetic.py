@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
-from factorlib.generate.lights import Things
+from factorlib.generate.lights import SceneDict
 from factorlib.generate.shapes import SHAPES
 from factorlib.generate.tracing import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
@@ -142,7 +142,7 @@ def light_of(
     )
 
 
-def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> Things:
+def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> SceneDict:
     """Light number 0 is a street by day, the others rooms with as many lamps as their number.
 
     The sun stands behind the camera, to its left or right.
@@ -195,11 +195,11 @@ def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndar
     silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
-        thing = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
+        entry = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
         own = nearest == number
         columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
         alone = rendered(
-            {"thing": thing, "light": envmap(scene.light)}, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2
+            {"shape": entry, "light": envmap(scene.light)}, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2
         )
         radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
     return radiance

@@ -101,20 +101,20 @@ def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns:
 
 
 def traced(
-    things: dict[str, Any], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int, seed: int, max_depth: int
+    entries: dict[str, Any], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int, seed: int, max_depth: int
 ) -> Float[np.ndarray, "h w 3"]:
     """Radiance of a scene, by a camera at world_from_camera; as `rendered`."""
-    return rendered(things, sensor(camera, world_from_camera), spp, seed, max_depth)
+    return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
-def rendered(things: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
+def rendered(entries: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
     """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
 
     spp: samples a pixel, at least.  Many samples are taken in passes of stratified ones, so that no pass needs much memory.
     """
     mi = mitsuba()
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
-    loaded = {name: mi.load_dict(thing, parallel=False) if isinstance(thing, dict) else thing for name, thing in things.items()}
+    loaded = {name: mi.load_dict(entry, parallel=False) if isinstance(entry, dict) else entry for name, entry in entries.items()}
     integrator = {"type": "path", "max_depth": max_depth}
 
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
@@ -136,7 +136,7 @@ def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> d
 
 
 def light_seen(
-    things: dict[str, Any], world_from_light: Float[np.ndarray, "4 4"], height: int, spp: int, seed: int, max_depth: int = -1
+    entries: dict[str, Any], world_from_light: Float[np.ndarray, "4 4"], height: int, spp: int, seed: int, max_depth: int = -1
 ) -> Float[np.ndarray, "h w 3"]:
     """The radiance that arrives at the origin of the light frame (y-up), a lat-long map of [height, 2·height].
 
@@ -147,7 +147,7 @@ def light_seen(
     faces = {}
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
         world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
-        faces[name] = traced(things, camera, world_from_camera, spp, 6 * seed + number, max_depth)
+        faces[name] = traced(entries, camera, world_from_camera, spp, 6 * seed + number, max_depth)
     return _texel_means(faces, height)
 
 

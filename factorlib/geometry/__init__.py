@@ -1,4 +1,4 @@
-"""Where things are and what they see of each other: nothing here knows of pictures' values or of materials' reflectances.
+"""Where objects are and what they see of each other: nothing here knows of pictures' values or of materials' reflectances.
 
 camera      cameras and rigid poses
 raster      ray casting and rasterising of meshes

@@ -39,7 +39,7 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
 
 
 def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
-    """A mask of one thing: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
+    """A mask of one object or material: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
     values = read_values(path, key, size)
     return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
 

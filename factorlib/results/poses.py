@@ -145,7 +145,7 @@ def read_photo_poses(path: str | Path) -> PhotoPoses:
 
 
 def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
-    for name, thing in photo.objects.items():
-        for entry in (thing, thing.runner_up):
+    for name, obj in photo.objects.items():
+        for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
                 raise InputError("a pose that is no rotation and translation", file=path, key=f"{key}.{name}", cure=cure)

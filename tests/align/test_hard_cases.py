@@ -25,11 +25,11 @@ QUICK = Search(views=120, rolls=12, keep=(14, 6, 3, 2), steps=(5, 6, 8, 6))
 
 def answered(given: Caster, camera: Camera, evidence: Evidence, focal: float | None = None):
     """What the mesh shows at the pose found, and the doubts about it."""
-    thing = ObjectToPlace("thing", given, evidence)
-    result = placed([thing], camera, KnownFocal(focal, "dataset" if focal else None), "photo", QUICK)
+    obj = ObjectToPlace("chair", given, evidence)
+    result = placed([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo", QUICK)
     seen = rasterise(given, result.camera, result.poses[0])
     iou, agreement = silhouette_iou(evidence, seen.label), label_agreement(evidence, seen.label)
-    return seen, doubts(iou, agreement, trust_in(thing, result, 0), result.found[0])
+    return seen, doubts(iou, agreement, trust_in(obj, result, 0), result.found[0])
 
 
 def error_deg(truth, seen) -> float:
@@ -154,9 +154,9 @@ def test_the_mirror_image_of_a_mask_is_found_out():
 def test_standards_are_what_doubts_are_measured_by():
     caster, camera, pose = photo_of(mesh_of([ball(), at(ball(0.5), 1.1, 0.3, 0)]), 4)
     moved = Pose(pose.rotation, pose.translation + np.array([0.02, 0, 0]))
-    thing = ObjectToPlace("thing", caster, evidence_of(caster, camera, pose), moved)
-    result = placed([thing], camera, KnownFocal(camera.focal, "dataset"), "photo", QUICK)
-    trust = trust_in(thing, result, 0)
+    obj = ObjectToPlace("chair", caster, evidence_of(caster, camera, pose), moved)
+    result = placed([obj], camera, KnownFocal(camera.focal, "dataset"), "photo", QUICK)
+    trust = trust_in(obj, result, 0)
     assert trust.normal_stderr_deg is None and trust.mirrored_score is None and trust.contour_error > 0
     below, above = (Standards(most_contour_error=trust.contour_error * factor) for factor in (0.9, 1.1))
     assert doubts(1.0, 1.0, trust, None, below) and not doubts(1.0, 1.0, trust, None, above)

@@ -22,8 +22,8 @@ def seen_in(camera, pose, points=TIPS, off=0.0, seed=0) -> Keypoints:
     return Keypoints(camera.project(pose.apply(points)) + shift, points)
 
 
-def answered(thing, camera, focal):
-    result = placed([thing], camera, KnownFocal(focal, "dataset" if focal else None), "photo")
+def answered(obj, camera, focal):
+    result = placed([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo")
     return result, result.poses[0]
 
 
@@ -32,8 +32,8 @@ def answered(thing, camera, focal):
 def test_careless_keypoints_and_the_mask_give_the_pose(seed, known):
     caster, camera, pose = photo_of(chair(), seed)
     keypoints = seen_in(camera, pose, off=2.0, seed=seed)
-    thing = ObjectToPlace("chair", caster, evidence_of(caster, camera, pose), keypoints=keypoints)
-    result, found = answered(thing, camera, camera.focal if known else None)
+    obj = ObjectToPlace("chair", caster, evidence_of(caster, camera, pose), keypoints=keypoints)
+    result, found = answered(obj, camera, camera.focal if known else None)
     assert normal_error_deg(caster, camera, pose, result.camera, found) < 2
     assert result.found[0].by_keypoints and result.found[0].runner_up is None
 
@@ -42,8 +42,8 @@ def test_keypoints_decide_where_the_mask_cannot():
     """A ball looks the same from everywhere; the turn is the keypoints'."""
     caster, camera, pose = photo_of(mesh_of([ball()]), 3)
     points = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], float)
-    thing = ObjectToPlace("ball", caster, evidence_of(caster, camera, pose), keypoints=seen_in(camera, pose, points))
-    _, found = answered(thing, camera, camera.focal)
+    obj = ObjectToPlace("ball", caster, evidence_of(caster, camera, pose), keypoints=seen_in(camera, pose, points))
+    _, found = answered(obj, camera, camera.focal)
     assert np.allclose(found.rotation, pose.rotation, atol=0.02)
 
 
@@ -73,7 +73,7 @@ def test_units_and_origin_of_the_mesh_do_not_matter():
 def test_keypoints_that_do_not_agree_are_refused():
     caster, camera, pose = photo_of(chair(), 6)
     pixel = np.random.default_rng(0).uniform(0, 240, (8, 2))
-    thing = ObjectToPlace("chair", caster, Evidence(np.ones((240, 320), np.int16)), keypoints=Keypoints(pixel, TIPS))
+    obj = ObjectToPlace("chair", caster, Evidence(np.ones((240, 320), np.int16)), keypoints=Keypoints(pixel, TIPS))
     with pytest.raises(InputError, match=r"of the 8 keypoints of 'chair' agree") as caught:
-        answered(thing, camera, camera.focal)
+        answered(obj, camera, camera.focal)
     assert caught.value.key == "photo.chair.keypoints" and caught.value.cure

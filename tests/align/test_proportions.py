@@ -17,7 +17,7 @@ from tests.align.scenes import blob, chair, photo_of
 
 
 def sightings(true, given, count=4, focal_sigma=0.0, seed=20):
-    """Photos of `true` told to be of `given`, at the true pose of its middle; and (caster, camera, pose) of each."""
+    """Photos of `true` that are said to show `given`, at the true pose of its middle; and (caster, camera, pose) of each."""
     made, truth = [], []
     for k in range(count):
         caster, camera, pose = photo_of(true, seed + k)

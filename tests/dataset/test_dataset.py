@@ -1,4 +1,4 @@
-"""Datasets: what is good is read, each thing that is wrong is refused with file, key and cure, and slices are small."""
+"""Datasets: what is good is read, each fault is refused with file, key and cure, and slices are small."""
 
 import copy
 import json

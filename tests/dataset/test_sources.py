@@ -28,24 +28,24 @@ PHOTOS = ("hall", "attic")
 def folder(tmp_path):
     path = tmp_path / "set"
     (path / "photos").mkdir(parents=True)
-    for name in ("photos/hall.png", "photos/attic.png", "photos/000007.png", "mask.png", "thing.ply"):
+    for name in ("photos/hall.png", "photos/attic.png", "photos/000007.png", "mask.png", "chair.ply"):
         (path / name).write_text("")
     (tmp_path / "elsewhere").mkdir()
     return path
 
 
-def write(folder, cameras, things=({"name": "thing", "mesh": "thing"},), names=PHOTOS, photo=None):
+def write(folder, cameras, objects=({"name": "chair", "mesh": "chair"},), names=PHOTOS, photo=None):
     """A dataset of photos with a source of cameras; `photo` is laid over the first."""
-    photos = [{"name": name, "image": f"photos/{name}.png", "masks": "mask.png", "objects": list(things)} for name in names]
+    photos = [{"name": name, "image": f"photos/{name}.png", "masks": "mask.png", "objects": list(objects)} for name in names]
     photos[0] |= photo or {}
     for entry in photos:
         entry["name"] = entry["name"].replace("000007", "seven")
-    spec = {"format": 1, "materials": ["red"], "meshes": {"thing": {"file": "thing.ply", "material": "red"}}, "photos": photos}
+    spec = {"format": 1, "materials": ["red"], "meshes": {"chair": {"file": "chair.ply", "material": "red"}}, "photos": photos}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec | {"cameras": cameras}))
     return folder
 
 
-def seen(external, points, name="thing", size=SIZE):
+def seen(external, points, name="chair", size=SIZE):
     """Where the photo shows points of the mesh, by the external camera."""
     focal, centre = focal_and_centre(external, *size, "hall")
     pose = external.poses[name]
@@ -71,7 +71,7 @@ def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE
 def test_points_of_the_mesh_are_where_colmap_puts_them_in_its_world(folder, form):
     images = colmap(folder, form=form)
     world_from_object = {"scale": 2.5, "rotation": TURN.tolist(), "translation": [0.3, -0.2, 0.5]}
-    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": world_from_object}})).external
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"chair": world_from_object}})).external
     in_world = np.array([2.5 * TURN @ point + [0.3, -0.2, 0.5] for point in POINTS])
     for name in PHOTOS:
         assert np.allclose(seen(external[name], POINTS), [images[f"{name}.png"].project_point(p) for p in in_world], atol=1e-9)
@@ -80,10 +80,10 @@ def test_points_of_the_mesh_are_where_colmap_puts_them_in_its_world(folder, form
 
 def test_a_mesh_in_the_worlds_frame_gets_the_models_pose_exactly(folder):
     images = colmap(folder)
-    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).external
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"chair": {}}})).external
     rigid = images["attic.png"].cam_from_world()
-    assert np.allclose(external["attic"].poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-14)
-    assert np.allclose(external["attic"].poses["thing"].translation, rigid.translation, atol=1e-14)
+    assert np.allclose(external["attic"].poses["chair"].rotation, rigid.rotation.matrix(), atol=1e-14)
+    assert np.allclose(external["attic"].poses["chair"].translation, rigid.translation, atol=1e-14)
     assert external["attic"].focal_px == 300.0 and external["attic"].principal_point == (104.0, 71.0)
 
 
@@ -123,8 +123,8 @@ def test_a_light_of_photos_of_which_one_is_not_in_the_model_is_refused(folder):
 )
 def test_a_photo_is_found_by_path_then_file_name_then_that_without_suffix(folder, names, found):
     images = colmap(folder, names)
-    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"thing": {}}})).external["hall"]
-    assert np.allclose(external.poses["thing"].rotation, images[found].cam_from_world().rotation.matrix())
+    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"chair": {}}})).external["hall"]
+    assert np.allclose(external.poses["chair"].rotation, images[found].cam_from_world().rotation.matrix())
 
 
 def test_what_follows_a_dot_is_no_suffix_unless_of_an_image(folder):
@@ -139,9 +139,9 @@ def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(
     with pytest.raises(InputError, match="could be 'x/hall.png', 'y/hall.png'") as caught:
         read_dataset(write(folder, {"colmap": "sparse/0"}))
     assert caught.value.key == "cameras.images.hall"
-    cameras = {"colmap": "sparse/0", "images": {"hall": "y/hall.png", "attic": "x/hall.png"}, "world_from_object": {"thing": {}}}
+    cameras = {"colmap": "sparse/0", "images": {"hall": "y/hall.png", "attic": "x/hall.png"}, "world_from_object": {"chair": {}}}
     external = read_dataset(write(folder, cameras)).external
-    assert np.allclose(external["hall"].poses["thing"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
+    assert np.allclose(external["hall"].poses["chair"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
 
 
 def test_a_photo_that_is_not_in_the_model_is_warned_of_and_searched(folder, caplog):
@@ -164,22 +164,22 @@ def test_keypoints_go_before_the_sources_pose(folder):
     colmap(folder)
     corners = ([0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1])
     keypoints = [{"pixel": [10.0 * k, 5.0 * k * k], "point": point} for k, point in enumerate(corners)]
-    things = ({"name": "thing", "mesh": "thing", "keypoints": keypoints}, {"name": "other", "mesh": "thing"})
-    cameras = {"colmap": "sparse/0", "world_from_object": {"thing": {}, "other": {}}}
-    assert set(read_dataset(write(folder, cameras, things)).external["hall"].poses) == {"other"}
+    objects = ({"name": "chair", "mesh": "chair", "keypoints": keypoints}, {"name": "other", "mesh": "chair"})
+    cameras = {"colmap": "sparse/0", "world_from_object": {"chair": {}, "other": {}}}
+    assert set(read_dataset(write(folder, cameras, objects)).external["hall"].poses) == {"other"}
 
 
 def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
     colmap(folder, model="SIMPLE_RADIAL", params=(300.0, 104.0, 71.0, -0.3))
-    cameras = {"colmap": "sparse/0", "world_from_object": {"thing": {}}}
+    cameras = {"colmap": "sparse/0", "world_from_object": {"chair": {}}}
     given = {"rotation": TURN.tolist(), "translation": [0, 0, 3]}
-    own = {"camera": {"focal_px": 99.0, "principal_point": [100, 75]}, "objects": [{"name": "thing", "mesh": "thing", "pose": given}]}
+    own = {"camera": {"focal_px": 99.0, "principal_point": [100, 75]}, "objects": [{"name": "chair", "mesh": "chair", "pose": given}]}
     dataset = read_dataset(write(folder, cameras, names=("hall",), photo=own))  # its lens is not even looked at
     assert dataset.external["hall"].poses == {} and dataset.external["hall"].focal_px == 99.0
 
 
 def test_a_change_of_one_pose_changes_the_slice_of_that_photo_only(folder):
-    write(folder, {"transforms": "transforms.json", "world_from_object": {"thing": {}}})
+    write(folder, {"transforms": "transforms.json", "world_from_object": {"chair": {}}})
     frames = [frame("hall.png", np.eye(3), (0, 0, 5)), frame("attic.png", np.eye(3), (0, 0, 5))]
     before = read_dataset(transforms(folder, frames))
     frames[1] = frame("attic.png", np.eye(3), (0, 0, 6))
@@ -241,7 +241,7 @@ def transforms(folder, frames, lens=LENS):
 
 def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(folder):
     """5 away, 1 to the right and 2 up: 300 · 1/5 px to the right of the principal point and 300 · 2/5 px above it."""
-    write(folder, {"transforms": "transforms.json", "world_from_object": {"thing": {}}})
+    write(folder, {"transforms": "transforms.json", "world_from_object": {"chair": {}}})
     transforms(folder, [frame("./images/hall", np.eye(3), (0, 0, 5)), frame("images/attic.jpg", FROM_X, (5, 0, 0))])
     external = read_dataset(folder).external
     expected = [[104 + 60, 71 - 120]]
@@ -254,7 +254,7 @@ def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(f
 def test_a_field_of_view_is_a_focal_length_at_any_size(folder):
     """NeRF's own scenes: half a width is seen at half the angle; without w, of whatever width the photo has."""
     angle = 2 * math.atan(100 / 300)
-    write(folder, {"transforms": "transforms.json", "world_from_object": {"thing": {}}})
+    write(folder, {"transforms": "transforms.json", "world_from_object": {"chair": {}}})
     transforms(folder, [frame("hall", np.eye(3), (0, 0, 5)), frame("attic", np.eye(3), (0, 0, 5), w=200, h=150)], {"camera_angle_x": angle})
     external = read_dataset(folder).external
     for name in PHOTOS:
@@ -310,21 +310,21 @@ def bop(folder, cameras=None, poses=None):
 @pytest.mark.parametrize("unit_mm", [1.0, 1000.0])
 def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folder, unit_mm):
     """150 mm to the right at 1500 mm: 30 px; the centre of pixel (103.5, 70.5) lies at (104, 71) here."""
-    bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}, "mesh_unit_mm": unit_mm}, names=("000007",)))
+    bop(write(folder, {"bop": "scene", "obj_ids": {"chair": 5}, "mesh_unit_mm": unit_mm}, names=("000007",)))
     external = read_dataset(folder).external["seven"]
-    assert external.source == "bop" and external.poses["thing"].translation[2] == 1500 / unit_mm
+    assert external.source == "bop" and external.poses["chair"].translation[2] == 1500 / unit_mm
     assert np.allclose(seen(external, np.array([[150.0, 0, 0]]) / unit_mm), [[104 + 30, 71]])
 
 
 def test_bop_turns_the_model_into_the_camera(folder):
-    bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}}, names=("000007",)))
+    bop(write(folder, {"bop": "scene", "obj_ids": {"chair": 5}}, names=("000007",)))
     bop(folder, poses={"7": [GT | {"cam_R_m2c": TURN.ravel().tolist()}]})
     x, y, z = TURN @ [100, 50, 20] + [0, 0, 1500]
     assert np.allclose(seen(read_dataset(folder).external["seven"], np.array([[100.0, 50, 20]])), [[104 + 300 * x / z, 71 + 300 * y / z]])
 
 
 def test_a_scene_without_poses_or_without_this_one_is_searched(folder, caplog):
-    bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}}, names=("000007",)), poses={"7": [GT | {"obj_id": 1}]})
+    bop(write(folder, {"bop": "scene", "obj_ids": {"chair": 5}}, names=("000007",)), poses={"7": [GT | {"obj_id": 1}]})
     with caplog.at_level(logging.WARNING):
         external = read_dataset(folder).external["seven"]
     assert external.poses == {} and external.focal_px == 300.0 and "no obj_id 5 in image 7" in caplog.text
@@ -342,12 +342,12 @@ def test_ids_of_photos_can_be_said(folder):
         ({"7": {"cam_K": [300.0, 0, 103.5, 0, 320.0, 70.5, 0, 0, 1.0]}}, None, "scene_camera.json: 7", "not square"),
         ({"7": {"cam_K": NINE[:4]}}, None, "7.cam_K", "cam_K"),
         ({"first": {"cam_K": K}}, None, "first", "whole numbers"),
-        (None, {"7": [GT, GT]}, "cameras.obj_ids.thing", "2 times"),
+        (None, {"7": [GT, GT]}, "cameras.obj_ids.chair", "2 times"),
         (None, {"7": [GT | {"cam_R_m2c": [2.0, *NINE[1:]]}]}, "7[0].cam_R_m2c", "not a rotation"),
     ],
 )
 def test_wrong_scenes_are_refused_where_they_are_wrong(folder, cameras, poses, key, words):
-    bop(write(folder, {"bop": "scene", "obj_ids": {"thing": 5}}, names=("000007",)), cameras, poses)
+    bop(write(folder, {"bop": "scene", "obj_ids": {"chair": 5}}, names=("000007",)), cameras, poses)
     with pytest.raises(InputError) as caught:
         read_dataset(folder)
     assert caught.value.key == key and words in str(caught.value) and caught.value.cure and caught.value.file
@@ -368,16 +368,16 @@ def test_wrong_scenes_are_refused_where_they_are_wrong(folder, cameras, poses, k
         ({"bop": "photos"}, "cameras.bop", "test/000001"),
         ({"colmap": "sparse/0", "images": {"hal": "hall.png"}}, "cameras.images.hal", "did you mean 'hall'"),
         ({"colmap": "sparse/0", "images": {"hall": "hal.png"}}, "cameras.images.hall", "did you mean 'hall.png'"),
-        ({"colmap": "sparse/0", "world_from_object": {"thin": {}}}, "cameras.world_from_object.thin", "did you mean 'thing'"),
-        ({"colmap": "sparse/0", "world_from_object": {"thing": {"scale": 0}}}, "cameras.world_from_object.thing.scale", "more than 0"),
+        ({"colmap": "sparse/0", "world_from_object": {"chai": {}}}, "cameras.world_from_object.chai", "did you mean 'chair'"),
+        ({"colmap": "sparse/0", "world_from_object": {"chair": {"scale": 0}}}, "cameras.world_from_object.chair.scale", "more than 0"),
         (
-            {"colmap": "sparse/0", "world_from_object": {"thing": {"rotation": (2 * np.eye(3)).tolist()}}},
-            "cameras.world_from_object.thing.rotation",
+            {"colmap": "sparse/0", "world_from_object": {"chair": {"rotation": (2 * np.eye(3)).tolist()}}},
+            "cameras.world_from_object.chair.rotation",
             "unit vectors",
         ),
-        ({"colmap": "sparse/0", "obj_ids": {"thing": 1}}, "cameras.obj_ids", "world_from_object"),
+        ({"colmap": "sparse/0", "obj_ids": {"chair": 1}}, "cameras.obj_ids", "world_from_object"),
         ({"bop": "scene", "world_from_camera": True}, "cameras.world_from_camera", "obj_id"),
-        ({"bop": "scene", "obj_ids": {"thin": 1}}, "cameras.obj_ids.thin", "did you mean 'thing'"),
+        ({"bop": "scene", "obj_ids": {"chai": 1}}, "cameras.obj_ids.chai", "did you mean 'chair'"),
     ],
 )
 def test_a_wrong_key_is_refused_with_a_cure(folder, cameras, key, words):
@@ -400,10 +400,10 @@ def test_a_damaged_model_is_refused(folder, damage):
 
 def test_objects_of_one_photo_share_a_scale(folder):
     colmap(folder)
-    things = [{"name": "thing", "mesh": "thing"}, {"name": "other", "mesh": "thing"}]
-    cameras = {"colmap": "sparse/0", "world_from_object": {"thing": {}, "other": {"scale": 2}}}
+    objects = [{"name": "chair", "mesh": "chair"}, {"name": "other", "mesh": "chair"}]
+    cameras = {"colmap": "sparse/0", "world_from_object": {"chair": {}, "other": {"scale": 2}}}
     with pytest.raises(InputError, match="different scales") as caught:
-        read_dataset(write(folder, cameras, things))
+        read_dataset(write(folder, cameras, objects))
     assert caught.value.key == "cameras.world_from_object"
 
 

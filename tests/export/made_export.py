@@ -88,7 +88,7 @@ def make(folder: Path) -> Inputs:
         "dataset.materials": NAMES,
         "dataset.light": {p: _light_facts(p) for p in MESHES},
         "dataset.objects": {
-            p: {"camera": {}, "objects": [{"name": "thing", "mesh": m}], "meshes": {m: meshes[m]}} for p, m in MESHES.items()
+            p: {"camera": {}, "objects": [{"name": "chair", "mesh": m}], "meshes": {m: meshes[m]}} for p, m in MESHES.items()
         },
     }
     return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
@@ -110,7 +110,7 @@ def _pose_entry(photo: str) -> dict:
     camera, pose = CAMERAS[photo], POSES[photo]
     return {
         "camera": {"focal_px": camera.focal, "principal_point": list(camera.centre)},
-        "objects": {"thing": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}},
+        "objects": {"chair": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}},
     }
 
 

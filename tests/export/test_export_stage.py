@@ -61,7 +61,7 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
 def test_another_choice_of_materials_for_a_mesh_gets_its_own_files(inputs, tmp_path):
     facts = msgspec.to_builtins(inputs.facts)
     facts["dataset.objects"]["front"] = facts["dataset.objects"]["side"] | {
-        "objects": [{"name": "thing", "mesh": "egg", "materials": {"upper": "unseen", "lower": "unseen"}}]
+        "objects": [{"name": "chair", "mesh": "egg", "materials": {"upper": "unseen", "lower": "unseen"}}]
     }
     out = run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
     assert {p.name for p in (out / "scenes" / "meshes").iterdir()} == {"egg.unseen.ply", "egg.2.red.ply", "egg.2.brass.ply"}

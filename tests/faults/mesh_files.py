@@ -11,13 +11,13 @@ import numpy as np
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-OBJ = "mtllib a.mtl\no thing\ng shell\nusemtl red\n{}vn 0 0 1\n{}".format(
+OBJ = "mtllib a.mtl\no chair\ng shell\nusemtl red\n{}vn 0 0 1\n{}".format(
     "".join("v {} {} {}\n".format(*v) for v in VERTICES), "".join("f {} {}//1 {}\n".format(*(f + 1)) for f in FACES)
 )
 OFF = "OFF\n4 4 0\n{}{}".format("".join("{} {} {}\n".format(*v) for v in VERTICES), "".join("3 {} {} {}\n".format(*f) for f in FACES))
 FACET = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
 CORNERS = ["".join("vertex {} {} {}\n".format(*VERTICES[v]) for v in face) for face in FACES]
-STL_TEXT = "solid thing\n{}endsolid thing\n".format("".join(FACET.format(corners) for corners in CORNERS))
+STL_TEXT = "solid chair\n{}endsolid chair\n".format("".join(FACET.format(corners) for corners in CORNERS))
 STL = b"a" * 80 + struct.pack("<I", 4) + b"".join(struct.pack("<12fH", 0, 0, 0, *VERTICES[face].ravel(), 0) for face in FACES)
 PLY_HEADER = """ply
 format {} 1.0
@@ -52,7 +52,7 @@ def gltf_header(uri: str | None = None) -> dict:
         ],
         "materials": [{"name": "red"}],
         "meshes": [{"name": "shell", "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
-        "nodes": [{"name": "thing", "mesh": 0}],
+        "nodes": [{"name": "chair", "mesh": 0}],
         "scenes": [{"nodes": [0]}],
         "scene": 0,
     }

@@ -1,4 +1,4 @@
-"""`make clean` takes what the runner made and nothing else, whatever it is told."""
+"""`make clean` takes what the runner made and nothing else, whatever its arguments are."""
 
 import os
 import shutil

@@ -135,7 +135,7 @@ def _loads(node) -> bool:
     return name in ("import_module", "__import__", "run_path", "run_module", "spec_from_file_location")
 
 
-# ── what a module is told by the environment ─────────────────────────────────────────────────────────────────────────
+# ── what a module reads from the environment ─────────────────────────────────────────────────────────────────────────
 
 SPEAKING = 'import os\nENVIRONMENT = ("TOY_FORM",)\nPROGRAMS = {"TOY_CC": "sh"}\ndef letters(text):\n    return len(text) if os.environ.get("TOY_FORM") == "0" else 1\n'
 

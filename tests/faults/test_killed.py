@@ -1,4 +1,4 @@
-"""Processes that are killed or told to end: one costs only its own step, and what was finished is kept."""
+"""Processes that are killed or asked to end: one costs only its own step, and what was finished is kept."""
 
 import json
 import os

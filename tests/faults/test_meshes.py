@@ -69,7 +69,7 @@ def test_the_tetrahedron_is_the_same_in_every_format(tmp_path, name):
     [
         ("a.obj", OBJ.replace("red", "stühle").encode("latin-1")),
         ("a.off", OFF.replace("OFF\n", "OFF\n# Möbel\n").encode("latin-1")),
-        ("a.stl", STL_TEXT.replace("thing", "Stühle").encode("latin-1")),
+        ("a.stl", STL_TEXT.replace("chair", "Stühle").encode("latin-1")),
         ("b.stl", "Möbel".encode("latin-1").ljust(80) + STL[80:]),
         ("a.ply", PLY_TEXT.replace("TextureFile a", "Möbel").encode("latin-1")),
         ("b.ply", PLY.replace(b"TextureFile a", "Möbel".encode("latin-1"))),
@@ -380,7 +380,7 @@ def test_many_and_long_names_of_parts_stay_cheap(tmp_path):
             read_mesh(path, MATERIALS, {"no such": "red"})
         assert len(str(caught.value)) < 5000 and time.process_time() - started < 2
         with pytest.raises(InputError) as caught:
-            read_mesh(path, MATERIALS, {"thing": "rot"})
+            read_mesh(path, MATERIALS, {"chair": "rot"})
         assert len(str(caught.value)) < 5000
 
 

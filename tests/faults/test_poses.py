@@ -1,4 +1,4 @@
-"""Given poses, cameras and masks that contradict the photo are refused or told, never taken in silence or by raw warnings."""
+"""Given poses, cameras and masks that contradict the photo are refused or reported, never taken in silence or by raw warnings."""
 
 import logging
 import warnings
@@ -25,14 +25,14 @@ def test_a_pose_behind_the_camera(tmp_path, z, focal):
     with warnings.catch_warnings(), pytest.raises(InputError, match="is not before the camera") as caught:
         warnings.simplefilter("error")
         run(tmp_path, given(tmp_path, (0, 0, z), **focal))
-    assert caught.value.key == "photos[a].objects[thing].pose" and "OpenGL" in caught.value.cure
+    assert caught.value.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.value.cure
 
 
 def test_a_pose_around_the_camera(tmp_path, caplog):
     with warnings.catch_warnings(), caplog.at_level(logging.WARNING, "factorlib.align"):
         warnings.simplefilter("error")
         run(tmp_path, given(tmp_path, (0, 0, 0.5)))
-    assert "vertices behind the camera" in caplog.text and "a: thing: its pose (dataset)" in caplog.text
+    assert "vertices behind the camera" in caplog.text and "a: chair: its pose (dataset)" in caplog.text
 
 
 def test_a_pose_of_a_source_names_the_source(tmp_path):

@@ -22,15 +22,15 @@ POSE = {"obj_id": 5, "cam_R_m2c": [1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0], "cam_t_m2c"
 
 @pytest.fixture
 def folder(tmp_path):
-    for name in ("7.png", "mask.png", "thing.ply"):
+    for name in ("7.png", "mask.png", "chair.ply"):
         (tmp_path / name).write_text("")
     (tmp_path / "model").mkdir()
     return tmp_path
 
 
 def read(folder, **cameras):
-    photo = {"name": "hall", "image": "7.png", "masks": "mask.png", "objects": [{"name": "thing", "mesh": "thing"}]}
-    spec = {"format": 1, "materials": ["red"], "meshes": {"thing": {"file": "thing.ply", "material": "red"}}, "photos": [photo]}
+    photo = {"name": "hall", "image": "7.png", "masks": "mask.png", "objects": [{"name": "chair", "mesh": "chair"}]}
+    spec = {"format": 1, "materials": ["red"], "meshes": {"chair": {"file": "chair.ply", "material": "red"}}, "photos": [photo]}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec | {"cameras": cameras}))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -68,11 +68,11 @@ def text(folder, camera="1 SIMPLE_PINHOLE 200 150 300 104 71", image="1 .7 .1 -.
 @pytest.mark.parametrize("form", [binary, text])
 def test_poses_are_those_that_pycolmap_reads(folder, form):
     (form(folder) / "model" / f"points3D.{'bin' if form is binary else 'txt'}").write_bytes(bytes(8) if form is binary else b"")
-    external = read(folder, colmap="model", world_from_object={"thing": {}}).external["hall"]
+    external = read(folder, colmap="model", world_from_object={"chair": {}}).external["hall"]
     model = pycolmap.Reconstruction(str(folder / "model"))
     rigid = model.images[1].cam_from_world()
-    assert np.allclose(external.poses["thing"].rotation, rigid.rotation.matrix(), atol=1e-15)
-    assert np.allclose(external.poses["thing"].translation, rigid.translation)
+    assert np.allclose(external.poses["chair"].rotation, rigid.rotation.matrix(), atol=1e-15)
+    assert np.allclose(external.poses["chair"].translation, rigid.translation)
     assert (external.focal_px, external.principal_point, external.size) == (300.0, (104.0, 71.0), (200, 150))
 
 
@@ -225,7 +225,7 @@ def test_an_id_that_is_none(folder, name):
     ],
 )
 def test_a_scene_that_is_none(folder, cameras, poses):
-    refused(bop(folder, cameras, poses), bop="model", obj_ids={"thing": 5})
+    refused(bop(folder, cameras, poses), bop="model", obj_ids={"chair": 5})
 
 
 @pytest.mark.parametrize("name", ["scene_camera.json", "scene_gt.json"])
@@ -245,8 +245,8 @@ def test_a_scene_that_leads_out_of_the_dataset(folder, tmp_path_factory, name):
 def test_a_photo_named_by_a_superscript_is_looked_for(folder):
     (folder / "7.png").rename(folder / "².png")
     bop(folder)
-    photo = {"name": "hall", "image": "².png", "masks": "mask.png", "objects": [{"name": "thing", "mesh": "thing"}]}
-    spec = {"format": 1, "materials": ["red"], "meshes": {"thing": {"file": "thing.ply", "material": "red"}}, "photos": [photo]}
+    photo = {"name": "hall", "image": "².png", "masks": "mask.png", "objects": [{"name": "chair", "mesh": "chair"}]}
+    spec = {"format": 1, "materials": ["red"], "meshes": {"chair": {"file": "chair.ply", "material": "red"}}, "photos": [photo]}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec | {"cameras": {"bop": "model"}}))
     with pytest.raises(InputError, match="none of its 1 images"):
         read_dataset(folder)

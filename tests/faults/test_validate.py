@@ -41,7 +41,7 @@ def make_set(folder, photos: int = 2, size=SIZE):
     for name, content in (("meshes/a.obj", OBJ.encode()), ("buffers/b 1.bin", DATA), ("a.mtl", b"newmtl red\n"), ("meshes/b.gltf", None)):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content or json.dumps(gltf_header("../buffers/b%201.bin")).encode())
-    meshes = {"solid": {"file": "meshes/a.obj", "parts": {"shell": "red"}}, "box": {"file": "meshes/b.gltf", "parts": {"thing": "oak"}}}
+    meshes = {"solid": {"file": "meshes/a.obj", "parts": {"shell": "red"}}, "box": {"file": "meshes/b.gltf", "parts": {"chair": "oak"}}}
     spec = {"format": 1, "materials": ["red", "oak"], "meshes": meshes, "photos": entries}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
     return folder
@@ -130,7 +130,7 @@ FAULTS = {
     cut_mask: "p1.png",
     no_photo: "p1.jpg",
     no_part: "did you mean 'shell'",
-    part_without_material: "part red / shell2 / thing has no material|no part 'shell'",
+    part_without_material: "part red / shell2 / chair has no material|no part 'shell'",
     no_gltf_part: "no part 'shel'",
     nan_vertex: "not finite",
     flat_mesh: "zero area",

@@ -61,9 +61,9 @@ def test_another_seed_is_another_set(small, tmp_path):
 def test_the_synthetic_set_holds_one_photo_of_each_kind_and_hides_one_pose(small):
     dataset = read_dataset(small)
     assert [Path(photo.image).suffix for photo in dataset.spec.photos] == [".exr", ".png", ".jpg"]
-    hidden = [thing.name for photo in dataset.spec.photos for thing in photo.objects if thing.pose is None]
+    hidden = [obj.name for photo in dataset.spec.photos for obj in photo.objects if obj.pose is None]
     assert hidden == ["red_blob"]
-    assert set(dataset.truth.poses["study"]) == {thing.name for thing in dataset.photo("study").objects}
+    assert set(dataset.truth.poses["study"]) == {obj.name for obj in dataset.photo("study").objects}
 
 
 def test_only_the_jpeg_clips(small):
@@ -96,7 +96,7 @@ def irradiance_of(normal, light):
 
 def test_the_chair_set_tells_no_pose_and_links_its_photos(chairs):
     dataset = read_dataset(chairs)
-    assert all(thing.pose is None for photo in dataset.spec.photos for thing in photo.objects)
+    assert all(obj.pose is None for photo in dataset.spec.photos for obj in photo.objects)
     assert read_photo(chairs / "photos/terrace.jpg").focal_px == pytest.approx(folder.focal_px_of_35mm(45, 96, 72))
     assert read_photo(chairs / "photos/kitchen.jpg").focal_px is None
     assert {photo: len(poses) for photo, poses in dataset.truth.poses.items()} == {"terrace": 2, "kitchen": 1}

@@ -37,26 +37,26 @@ BRIGHTEST = 1.0  # S of a unit lobe is at most that, exactly: the operators hold
 
 
 @lru_cache(maxsize=256)
-def told_by(name: str, changed: str):
+def answer_of(name: str, changed: str):
     return found(FAST[name], case(changed))
 
 
 @fast
 @cases
 def test_everything_is_finite_and_not_negative(name, changed):
-    told = told_by(name, changed)
-    assert told.finite()
-    assert all((told.fields[part] >= 0).all() for part in ("diffuse", "specular"))
+    answer = answer_of(name, changed)
+    assert answer.finite()
+    assert all((answer.fields[part] >= 0).all() for part in ("diffuse", "specular"))
 
 
 @single
 @cases
 def test_single_precision_is_enough(name, changed):
     given = case(changed)
-    told, exactly = told_by(name, changed), told_by(f"{name.split()[0]} float64", changed)
+    answer, exactly = answer_of(name, changed), answer_of(f"{name.split()[0]} float64", changed)
     value, gradient = ROUNDING.get(changed, (1e-4, 1e-3))
-    assert value_error(told, exactly, given).max() < value
-    assert gradient_error(told, exactly, given).max() < gradient
+    assert value_error(answer, exactly, given).max() < value
+    assert gradient_error(answer, exactly, given).max() < gradient
 
 
 @cases
@@ -69,9 +69,9 @@ def test_the_reference_is_finite_and_within_its_law(changed):
 @pytest.mark.parametrize("changed", CASES)
 def test_the_network_is_near_the_reference(changed):
     given, some = case(changed), slice(0, None, 23)
-    told, true = told_by("network", changed), reference_values(given, some)
+    answer, true = answer_of("network", changed), reference_values(given, some)
     for part in true:
-        error = (told.fields[part][some] - true[part]).abs() / (true[part] + given.scale()[some])
+        error = (answer.fields[part][some] - true[part]).abs() / (true[part] + given.scale()[some])
         assert error.max() < VALUE.get(changed, 0.08), part
 
 

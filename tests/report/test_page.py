@@ -173,7 +173,7 @@ def test_missing_pictures_are_left_out_not_fatal(tmp_path):
     for path in [*inputs["render"].rglob("*.exr"), *inputs["align"].glob("*.png"), *inputs["solve"].glob("*.parquet")]:
         path.unlink()
     (inputs["train"] / "accuracy.json").unlink()
-    parsed(page_of(inputs, tmp_path / "bare"))
+    parsed(page_of(inputs, tmp_path / "plain"))
 
 
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)

@@ -24,11 +24,11 @@ PHOTOS = ("a", "b", "c")
 
 
 def made(tmp_path, given, source="found"):
-    """Inputs of photos of a chair, told to be of the mesh `given`, where `align` found its middle; and the truth by photo."""
+    """Inputs of photos of a chair that are said to show the mesh `given`, where `align` found its middle; and the truth by photo."""
     masks, aligned = tmp_path / "masks", tmp_path / "align"
     masks.mkdir()
     aligned.mkdir()
-    write_ply(tmp_path / "thing.ply", given)
+    write_ply(tmp_path / "chair.ply", given)
     poses, truth = {}, {}
     for k, photo in enumerate(PHOTOS):
         caster, camera, pose = photo_of(chair(), 30 + k)
@@ -36,24 +36,24 @@ def made(tmp_path, given, source="found"):
         zero = np.zeros(label.shape)
         write_exr(masks / f"{photo}.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
         write_json(masks / f"{photo}.json", {"width": camera.width, "height": camera.height, "focal_px": camera.focal, "focal_source": "dataset", "factor": 1, "original_size": [camera.width, camera.height]})
-        thing = {
+        obj = {
             "rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "source": source, "silhouette_iou": 0.9,
             "runner_up": None, "left_out": False,
         }  # fmt: skip
         facts = {"focal_px": camera.focal, "focal_source": "dataset", "principal_point": list(camera.centre)}
-        poses[photo] = {"camera": facts, "objects": {"thing": thing}}
+        poses[photo] = {"camera": facts, "objects": {"chair": obj}}
         truth[photo] = caster, camera, pose
     write_poses(aligned / "poses.json", msgspec.convert(poses, dict[str, PhotoPoses]))
-    slice_ = {"camera": {}, "objects": [{"name": "thing", "mesh": "thing"}], "meshes": {"thing": {"file": "thing.ply", "material": "white"}}}
+    slice_ = {"camera": {}, "objects": [{"name": "chair", "mesh": "chair"}], "meshes": {"chair": {"file": "chair.ply", "material": "white"}}}
     facts = {"dataset.materials": ["white"], "dataset.objects": {photo: slice_ for photo in PHOTOS}}
-    return Inputs({"masks": masks, "align": aligned}, facts, {"thing.ply": tmp_path / "thing.ply"}), truth
+    return Inputs({"masks": masks, "align": aligned}, facts, {"chair.ply": tmp_path / "chair.ply"}), truth
 
 
 def run(tmp_path, inputs):
     out = tmp_path / "fit_mesh"
     out.mkdir()
     fit_mesh.main(fit_mesh.Params(), inputs, out, silent)
-    return read_json(out / "meshes.json")["thing"], read_json(out / "poses.json")
+    return read_json(out / "meshes.json")["chair"], read_json(out / "poses.json")
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +68,8 @@ def test_the_factors_undo_what_the_mesh_has_wrong(fitted):
     wanted = 1 / np.array(OFF)
     assert mesh["used"] and np.allclose(mesh["factors"], wanted / wanted.prod() ** (1 / 3), rtol=0.03) and len(mesh["sightings"]) == 3
     assert mesh["held_out_unexplained"]["fitted"] < 0.5 * mesh["held_out_unexplained"]["as_it_is"]
-    assert all(poses[photo]["objects"]["thing"]["scale"] == mesh["factors"] for photo in PHOTOS)
-    assert all(poses[photo]["objects"]["thing"]["silhouette_iou"] > 0.97 for photo in PHOTOS)
+    assert all(poses[photo]["objects"]["chair"]["scale"] == mesh["factors"] for photo in PHOTOS)
+    assert all(poses[photo]["objects"]["chair"]["silhouette_iou"] > 0.97 for photo in PHOTOS)
 
 
 def test_align_uses_the_fitted_mesh(fitted):
@@ -86,7 +86,7 @@ def test_align_uses_the_fitted_mesh(fitted):
         true = rasterise(caster, camera, pose)
         both = (maps["label"] > 0) & (true.label > 0)
         normals[name] = np.sum(np.stack([maps[f"normal.{c}"] for c in "xyz"], -1)[both] * true.normal[both], axis=1)
-    entry = json.loads((folder / "with" / "a.json").read_text())["objects"]["thing"]
+    entry = json.loads((folder / "with" / "a.json").read_text())["objects"]["chair"]
     assert entry["scale"] == mesh["factors"] and entry["silhouette_iou"] > 0.97 and entry["doubts"] == []
     assert np.mean(normals["with"] > np.cos(0.03)) > np.mean(normals["without"] > np.cos(0.03))
 
@@ -95,7 +95,7 @@ def test_urm_and_export_place_the_fitted_mesh_alike(fitted, tmp_path):
     """Both put a vertex where x_cam = R (s ∘ x) + t does."""
     _, inputs, _, mesh, poses = fitted
     slice_ = msgspec.convert(inputs.facts["dataset.objects"]["a"], ObjectsSlice)
-    pose = poses["a"]["objects"]["thing"]
+    pose = poses["a"]["objects"]["chair"]
     given = scaled(chair(), OFF)
     there = (given.vertices * mesh["factors"]) @ np.array(pose["rotation"]).T + pose["translation"]
     one = Inputs(inputs.folders, {**inputs.facts, "dataset.objects": inputs.facts["dataset.objects"]["a"]}, inputs.files, "a")
@@ -118,4 +118,4 @@ def test_an_exact_mesh_and_given_poses_are_left_as_they_are(tmp_path):
         fit_mesh.main(fit_mesh.Params(), inputs, out, silent)
         assert read_json(out / "poses.json") == read_json(inputs["align"] / "poses.json")
         report = read_json(out / "meshes.json")
-        assert report == {} if source == "given" else report["thing"]["factors"] == [1.0, 1.0, 1.0]
+        assert report == {} if source == "given" else report["chair"]["factors"] == [1.0, 1.0, 1.0]

@@ -37,8 +37,8 @@ def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, posed=Tr
     write_photo(folder / "photos/000003.png", np.repeat(label[..., None] * 0.5, 3, axis=-1))
     write_labels(folder / "masks/000003.png", label)
     write_ply(folder / "chair.ply", mesh or chair())
-    thing = {"name": "thing", "mesh": "chair"}
-    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [thing]} | (photo or {})
+    obj = {"name": "chair", "mesh": "chair"}
+    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [obj]} | (photo or {})
     meshes = {"chair": {"file": "chair.ply", "material": "white"}}
     cameras = SOURCES[source](folder, pose) if posed else {source: SOURCES[source](folder, pose)[source]}
     spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
@@ -62,7 +62,7 @@ def colmap(folder, pose):
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
     (folder / "sparse").mkdir()
     model.write_binary(str(folder / "sparse"))
-    return {"colmap": "sparse", "world_from_object": {"thing": WORLD}}
+    return {"colmap": "sparse", "world_from_object": {"chair": WORLD}}
 
 
 def transforms(folder, pose):
@@ -72,15 +72,15 @@ def transforms(folder, pose):
     frame = {"file_path": "./images/000003.png", "transform_matrix": world_from_camera.tolist()}
     lens = {"fl_x": CAMERA.focal, "fl_y": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
-    return {"transforms": "transforms.json", "world_from_object": {"thing": WORLD}}
+    return {"transforms": "transforms.json", "world_from_object": {"chair": WORLD}}
 
 
 def bop(folder, pose):
     (folder / "scene").mkdir()
     matrix = [CAMERA.focal, 0, CAMERA.centre[0] - 0.5, 0, CAMERA.focal, CAMERA.centre[1] - 0.5, 0, 0, 1]
-    thing = {"obj_id": 4, "cam_R_m2c": pose.rotation.ravel().tolist(), "cam_t_m2c": (1000 * pose.translation).tolist()}
+    obj = {"obj_id": 4, "cam_R_m2c": pose.rotation.ravel().tolist(), "cam_t_m2c": (1000 * pose.translation).tolist()}
     (folder / "scene/scene_camera.json").write_text(json.dumps({"3": {"cam_K": matrix}}))
-    (folder / "scene/scene_gt.json").write_text(json.dumps({"3": [thing]}))
+    (folder / "scene/scene_gt.json").write_text(json.dumps({"3": [obj]}))
     return {"bop": "scene", "obj_ids": {"chair": 4}, "mesh_unit_mm": 1000}
 
 
@@ -103,33 +103,33 @@ def aligned(folder, averaged=masks.Params(), **params):
 @pytest.mark.parametrize("source", SOURCES)
 def test_the_poses_of_the_scene_come_out(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source))
-    camera, thing = entry["camera"], entry["objects"]["thing"]
-    assert (camera["focal_source"], thing["source"]) == (source, source) and thing["doubts"] == []
+    camera, obj = entry["camera"], entry["objects"]["chair"]
+    assert (camera["focal_source"], obj["source"]) == (source, source) and obj["doubts"] == []
     assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
-    assert np.allclose(thing["rotation"], POSE.rotation, atol=1e-12) and np.allclose(thing["translation"], POSE.translation, atol=1e-12)
-    assert thing["silhouette_iou"] > 0.995
+    assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and np.allclose(obj["translation"], POSE.translation, atol=1e-12)
+    assert obj["silhouette_iou"] > 0.995
 
 
 @pytest.mark.parametrize("source", ["colmap", "transforms"])
 def test_a_photo_of_twice_the_size_is_the_same_scene(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source, scale=2))
     assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
-    assert entry["objects"]["thing"]["silhouette_iou"] > 0.995
+    assert entry["objects"]["chair"]["silhouette_iou"] > 0.995
 
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_a_known_camera_follows_a_photo_that_is_averaged_down(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source), averaged=masks.Params(frame=200 * 150 // 4))
     assert entry["camera"]["focal_px"] == 150.0 and np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
-    assert entry["objects"]["thing"]["silhouette_iou"] > 0.98
+    assert entry["objects"]["chair"]["silhouette_iou"] > 0.98
 
 
 def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
     entry = aligned(scene(tmp_path / "set", "colmap", posed=False))
-    camera, thing = entry["camera"], entry["objects"]["thing"]
-    assert (camera["focal_source"], thing["source"]) == ("colmap", "found") and camera["focal_px"] == 300.0
+    camera, obj = entry["camera"], entry["objects"]["chair"]
+    assert (camera["focal_source"], obj["source"]) == ("colmap", "found") and camera["focal_px"] == 300.0
     assert camera["principal_point"] == list(CAMERA.centre)
-    found = Pose(np.array(thing["rotation"]), np.array(thing["translation"]))
+    found = Pose(np.array(obj["rotation"]), np.array(obj["translation"]))
     assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, found) < 1
 
 
@@ -145,14 +145,14 @@ def test_what_dataset_yaml_says_of_the_principal_point_wins(tmp_path):
 
 def test_a_pose_in_dataset_yaml_wins(tmp_path):
     given = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 6.0]}
-    entry = aligned(scene(tmp_path / "set", "colmap", photo={"objects": [{"name": "thing", "mesh": "chair", "pose": given}]}))
-    assert entry["objects"]["thing"]["source"] == "given" and entry["objects"]["thing"]["translation"] == [0.0, 0.0, 6.0]
+    entry = aligned(scene(tmp_path / "set", "colmap", photo={"objects": [{"name": "chair", "mesh": "chair", "pose": given}]}))
+    assert entry["objects"]["chair"]["source"] == "given" and entry["objects"]["chair"]["translation"] == [0.0, 0.0, 6.0]
 
 
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
-        thing = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["thing"]
-    assert thing["doubts"] and not thing["left_out"] and "world_from_object" in caplog.text
+        obj = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["chair"]
+    assert obj["doubts"] and not obj["left_out"] and "world_from_object" in caplog.text
 
 
 def test_a_photo_that_was_cropped_is_refused(tmp_path):

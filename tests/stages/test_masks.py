@@ -137,9 +137,9 @@ def test_the_same_input_is_the_same_bytes(folder):
 
 
 def test_progress_ends_where_it_said_it_would(folder):
-    told = []
-    run(folder, progress=lambda done, total, text="": told.append((done, total)))
-    assert told == sorted(told) and told[-1][0] == told[-1][1]
+    reports = []
+    run(folder, progress=lambda done, total, text="": reports.append((done, total)))
+    assert reports == sorted(reports) and reports[-1][0] == reports[-1][1]
 
 
 def _truncated(folder):

@@ -43,18 +43,18 @@ def inputs_of(tmp_path, photo, **entry):
     facts = {"width": zero.shape[1], "height": zero.shape[0], "factor": 1, "original_size": list(zero.shape[::-1]), "focal_px": photo.camera.focal, "focal_source": "dataset"}
     write_json(masks / "a.json", facts)
     camera = {"focal_px": photo.camera.focal, "focal_source": "dataset", "focal_relative_stderr": 0.0, "principal_point": list(photo.camera.centre)}
-    thing = {**pose_entry(photo.pose), "source": "found", "runner_up": None, "left_out": False, "silhouette_iou": 0.0} | entry
-    write_json(aligned / "a.json", {"camera": camera, "objects": {"thing": thing}})
+    obj = {**pose_entry(photo.pose), "source": "found", "runner_up": None, "left_out": False, "silhouette_iou": 0.0} | entry
+    write_json(aligned / "a.json", {"camera": camera, "objects": {"chair": obj}})
     write_materials(solved, [0.1] * 3)
-    write_ply(tmp_path / "thing.ply", photo.given.mesh)
+    write_ply(tmp_path / "chair.ply", photo.given.mesh)
     facts = {
         "dataset.materials": NAMES,
         "dataset.objects": {
-            "camera": {}, "objects": [{"name": "thing", "mesh": "thing"}], "meshes": {"thing": {"file": "thing.ply", "material": "blue"}},
+            "camera": {}, "objects": [{"name": "chair", "mesh": "chair"}], "meshes": {"chair": {"file": "chair.ply", "material": "blue"}},
         },
     }  # fmt: skip
     folders = {"masks": masks, "align": aligned, "solve": solved, "train": SHIPPED}
-    return Inputs(folders, facts, {"thing.ply": tmp_path / "thing.ply"}, "a")
+    return Inputs(folders, facts, {"chair.ply": tmp_path / "chair.ply"}, "a")
 
 
 def write_materials(folder, stderr):
@@ -75,17 +75,17 @@ def run(stage, inputs, out, **params):
 def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
     inputs = inputs_of(tmp_path, turned)
     entry = run(refine, inputs, tmp_path / "refined")
-    thing = entry["objects"]["thing"]
-    assert np.allclose(thing["rotation"], turned.truth.rotation, atol=0.02) and not np.allclose(turned.pose.rotation, turned.truth.rotation, atol=0.02)
-    told = thing["refined"]
-    assert told["chosen"] == "moved" and told["moved"]["rotation_deg"] > 2 and thing["silhouette_iou"] > 0.98
-    assert told["candidates"]["moved"]["held_out_loss"] < told["candidates"]["found"]["held_out_loss"]
-    assert told["candidates"]["moved"]["gain"] > 2 * told["candidates"]["moved"]["gain_stderr"]
+    obj = entry["objects"]["chair"]
+    assert np.allclose(obj["rotation"], turned.truth.rotation, atol=0.02) and not np.allclose(turned.pose.rotation, turned.truth.rotation, atol=0.02)
+    choice = obj["refined"]
+    assert choice["chosen"] == "moved" and choice["moved"]["rotation_deg"] > 2 and obj["silhouette_iou"] > 0.98
+    assert choice["candidates"]["moved"]["held_out_loss"] < choice["candidates"]["found"]["held_out_loss"]
+    assert choice["candidates"]["moved"]["gain"] > 2 * choice["candidates"]["moved"]["gain_stderr"]
     write_json(tmp_path / "refined" / "poses.json", {"a": entry})
     again = msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": tmp_path / "refined"})
-    thing_again = run(align, again, tmp_path / "aligned")["objects"]["thing"]
-    assert all(thing_again[name] == thing[name] for name in ("rotation", "translation")) and thing_again["source"] == "refined"
-    assert not thing_again["left_out"]
+    obj_again = run(align, again, tmp_path / "aligned")["objects"]["chair"]
+    assert all(obj_again[name] == obj[name] for name in ("rotation", "translation")) and obj_again["source"] == "refined"
+    assert not obj_again["left_out"]
 
 
 def test_a_photo_with_a_tone_curve_is_straightened_first(tmp_path, turned):
@@ -97,7 +97,7 @@ def test_a_photo_with_a_tone_curve_is_straightened_first(tmp_path, turned):
     table = inputs["solve"] / "materials.json"
     write_json(table, read_json(table) | {"model": {"tone": {"a": tone}}})
     again = run(refine, inputs, tmp_path / "again")
-    found, expected = (entry["objects"]["thing"]["refined"]["candidates"]["found"]["held_out_loss"] for entry in (again, straight))
+    found, expected = (entry["objects"]["chair"]["refined"]["candidates"]["found"]["held_out_loss"] for entry in (again, straight))
     assert found == pytest.approx(expected, rel=1e-2)
 
 
@@ -109,9 +109,9 @@ def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, capl
     inputs = inputs_of(unknown, turned)
     write_materials(inputs["solve"], [0.8] * 3)
     for entry in (given, run(refine, inputs, unknown / "out")):
-        thing = entry["objects"]["thing"]
-        assert thing["refined"] is None
-        assert {name: thing[name] for name in ("rotation", "translation")} == pose_entry(turned.pose)
+        obj = entry["objects"]["chair"]
+        assert obj["refined"] is None
+        assert {name: obj[name] for name in ("rotation", "translation")} == pose_entry(turned.pose)
     assert "too few pixels of known materials" in caplog.text
 
 

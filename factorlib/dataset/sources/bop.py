@@ -67,8 +67,8 @@ def _camera(image: str, camera: SceneCamera, refuse: Refusal) -> pycolmap.Camera
 
 def _poses(image: str, poses: dict[str, list[SceneObject]], refuse: Refusal) -> dict[int, list[Pose]]:
     result: dict[int, list[Pose]] = {}
-    for index, thing in enumerate(poses.get(image, [])):
-        rows = tuple(thing.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
+    for index, obj in enumerate(poses.get(image, [])):
+        rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
         check_rotation(f"{image}[{index}].cam_R_m2c", rows, refuse)
-        result.setdefault(thing.obj_id, []).append(Pose(rows, thing.cam_t_m2c))
+        result.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
     return result

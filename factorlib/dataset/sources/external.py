@@ -100,11 +100,11 @@ def _external(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, re
 
 def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> dict[str, Pose]:
     """object -> pose, of those whose place the source gives and dataset.yaml does not."""
-    things = [thing for thing in photo.objects if thing.pose is None and not thing.keypoints]
+    objects = [obj for obj in photo.objects if obj.pose is None and not obj.keypoints]
     if source.bop is not None:
-        found = {thing.name: _instance(photo, thing, shot, source, refuse) for thing in things if thing.mesh in source.obj_ids}
+        found = {obj.name: _instance(photo, obj, shot, source, refuse) for obj in objects if obj.mesh in source.obj_ids}
         return {name: pose for name, pose in found.items() if pose is not None}
-    placed = [thing.name for thing in things if thing.name in source.world_from_object]
+    placed = [obj.name for obj in objects if obj.name in source.world_from_object]
     scales = {source.world_from_object[name].scale for name in placed}
     if len(scales) > 1:
         found = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{scale:g}' for scale in sorted(scales))}"
@@ -119,16 +119,16 @@ def _pose(name: str, shot: Shot, source: CameraSource) -> Pose:
     return Pose(as_rows(cam_from_object.rotation), tuple(float(x) / similarity.scale for x in cam_from_object.translation))
 
 
-def _instance(photo: PhotoEntry, thing: ObjectEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Pose | None:
+def _instance(photo: PhotoEntry, obj: ObjectEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Pose | None:
     """The one instance of the object's mesh, in units of the mesh; None, with a warning, where the scene names none."""
-    obj_id = source.obj_ids[thing.mesh]
+    obj_id = source.obj_ids[obj.mesh]
     poses = shot.poses.get(obj_id, [])
     if len(poses) > 1:
         found = f"image {shot.image} of photo {photo.name!r} shows obj_id {obj_id} {len(poses)} times"
-        refuse(f"cameras.obj_ids.{thing.mesh}", found, f"give the pose of {thing.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance")
+        refuse(f"cameras.obj_ids.{obj.mesh}", found, f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance")
     if not poses:
         log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
-                    refuse.file, obj_id, shot.image, thing.name, photo.name)  # fmt: skip
+                    refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip
         return None
     return Pose(poses[0].rotation, tuple(x / source.mesh_unit_mm for x in poses[0].translation))
 
