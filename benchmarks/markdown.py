@@ -1,12 +1,21 @@
-"""Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`."""
+"""Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`.
+
+Each ends with a line that no reader sees, the command that wrote it and a hash of that command's sources, so that
+`benchmarks.stale` knows which tables are of other sources than those that are here.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from factorlib.errors import InputError
+from factorlib.runner.closure import Sources
+from factorlib.runner.filehash import FileHashes
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -29,12 +38,26 @@ def replaced(text: str, name: str, inner: str, file: Path | None = None) -> str:
     return pattern.sub(lambda found: f"{found[1]}{inner}\n{found[2]}", text)
 
 
-def refresh(path: Path, parts: dict[str, str]) -> None:
-    """Write each part between its marks in the file."""
+def refresh(path: Path, parts: dict[str, str], command: str, root: Path = ROOT) -> None:
+    """Write each part between its marks in the file, with the stamp of the module `command`, which measured it."""
     text = path.read_text(encoding="utf-8")
+    stamp = f"<!-- written by {command} for sources {sources_hash(command, root)} -->"
     for name, inner in parts.items():
-        text = replaced(text, name, inner, path)
+        text = replaced(text, name, f"{inner}\n{stamp}", path)
     path.write_text(text, encoding="utf-8")
+
+
+def sources_hash(command: str, root: Path = ROOT) -> str:
+    """Eight digits of a hash of all modules of the project, and their data, that `python -m command` imports.
+
+    Comments and docstrings do not count, as for the keys of steps.  Raises InputError where there is no such module.
+    """
+    sources = Sources([root], FileHashes(None))
+    file = sources.find(command)
+    module = f"{command}.__main__" if file is not None and file.name == "__init__.py" else command
+    package, _, name = module.rpartition(".")
+    closure = sources.closure(package, name, root / "pipeline.yaml")
+    return hashlib.sha256(repr(sorted((closure.modules | closure.data).items())).encode()).hexdigest()[:8]
 
 
 def exact(value: float, digits: int = 2) -> str:

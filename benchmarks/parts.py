@@ -261,7 +261,7 @@ def main(
     tables = as_tables(results)
     print("\n\n".join(tables.values()))
     if docs:
-        refresh(DOCS, tables)
+        refresh(DOCS, tables, "benchmarks.parts")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,46 @@
+"""A table of a page says of which sources it is, and is named when they are others."""
+
+import pytest
+
+from benchmarks.markdown import refresh, table
+from benchmarks.stale import stale
+
+PAGE = "Text.\n\n<!-- begin speed -->\n<!-- end speed -->\n"
+SPEED = {"speed": table(["case", "s"], [["one", "2"]])}
+
+
+@pytest.fixture
+def page(tmp_path):
+    """A page whose table the module `measures.speed` has written, which imports `library`."""
+    (tmp_path / "measures").mkdir()
+    (tmp_path / "measures/__init__.py").write_text("")
+    (tmp_path / "measures/speed.py").write_text("import library\n\nCASES = 1\n")
+    (tmp_path / "library.py").write_text("STEPS = 3\n")
+    page = tmp_path / "speed.md"
+    page.write_text(PAGE)
+    refresh(page, SPEED, "measures.speed", tmp_path)
+    return page
+
+
+def test_a_fresh_table_is_of_these_sources(page):
+    assert "| one | 2 |\n<!-- written by measures.speed for sources " in page.read_text()
+    assert not list(stale([page], page.parent))
+
+
+@pytest.mark.parametrize("file", ["library.py", "measures/speed.py"])
+def test_other_sources_make_it_stale_and_comments_do_not(page, file):
+    source = page.parent / file
+    source.write_text(source.read_text() + "# a remark\n")
+    assert not list(stale([page], page.parent))
+    source.write_text(source.read_text() + "MORE = 4\n")
+    (line,) = stale([page], page.parent)
+    assert line.startswith("speed.md: speed: of sources ") and "python -m measures.speed --docs" in line
+    refresh(page, SPEED, "measures.speed", page.parent)
+    assert not list(stale([page], page.parent))
+
+
+def test_a_table_without_stamp_or_without_its_command_is_named(page):
+    (page.parent / "measures/speed.py").unlink()
+    assert "written by measures.speed, of which" in next(stale([page], page.parent))
+    page.write_text(PAGE)
+    assert list(stale([page], page.parent)) == ["speed.md: speed: does not say of which sources it is"]
