@@ -4,7 +4,7 @@ The formulas are written once, in torch.  They are run on a `Tape`, which derive
 that code can leave the derivatives out.  With t = tanh(net/s) the result is R = formula · exp(fade · s · t).  kernel.c computes the
 network and its derivative by the features itself, and its part BACKWARD begins with ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
 
-Without a C compiler (`cc`, or what CC says) torch computes the same, an order of magnitude slower.
+Without a C compiler (`cc`, or what CC says) torch computes the same in 6.5 times the time.  `tape` says how this compares with other generators.
 """
 
 from __future__ import annotations

@@ -3,6 +3,17 @@
 The function is run once with a `Value` in place of each tensor, and its operations are recorded on a `Tape`, equal ones only once.
 `Tape.gradient` goes backward over the tape and records the derivatives in the same way (reverse mode).  `Tape.c_code` writes the
 operations that given results need as C statements on floats, one a line.
+
+Why not a generator that exists (numbers by `python -m benchmarks.operator.generators`, processor time of one core)?
+
+- SymPy derives symbolically, without sharing.  The diffuse part has 376 operations here, derived in .01 s, and 520 by SymPy after 1.8 s;
+  the specular part 1,914 in .04 s, and SymPy had not finished after 60 s.
+- CasADi (not measured) works as the tape does and writes C, too.  It would replace `gradient` and `c_code`, some fifty lines, but not
+  `Value`, which takes torch's functions, and would be one more compiled dependency.
+- Enzyme differentiates inside LLVM: every user would need Clang and its plugin, where any C compiler does now.
+- torch.compile (not measured) chooses the order of operations itself.  Here it is fixed, so that every processor gives the same bits.
+
+Torch without compilation takes 6.5 times as long for values and derivatives at 4096 points × 64 lobes (1563 ms against 241 ms).
 """
 
 from __future__ import annotations
