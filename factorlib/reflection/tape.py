@@ -8,7 +8,7 @@ Why not a generator that exists (numbers by `python -m benchmarks.operator.gener
 
 - SymPy derives symbolically, without sharing.  The diffuse part has 376 operations here, derived in .01 s, and 520 by SymPy after 1.8 s;
   the specular part 1,914 in .04 s, and SymPy had not finished after 60 s.
-- CasADi (not measured) works as the tape does and writes C, too.  It would replace `gradient` and `c_code`, some fifty lines, but not
+- CasADi (not measured) works as the tape does and writes C, too.  It would replace `gradient` and `c_code`, some forty lines, but not
   `Value`, which takes torch's functions, and would be one more compiled dependency.
 - Enzyme differentiates inside LLVM: every user would need Clang and its plugin, where any C compiler does now.
 - torch.compile (not measured) chooses the order of operations itself.  Here it is fixed, so that every processor gives the same bits.
