@@ -115,7 +115,7 @@ def real_set(folder):
     text = (folder / "dataset.yaml").read_text(encoding="utf-8")
     (folder / "dataset.yaml").write_text(text.replace("mesh: stack", f"mesh: stack\n    pose: {pose}"), encoding="utf-8")
     camera = {"focal_px": 1.1 * made.camera.focal, "principal_point": list(made.camera.centre)}
-    write_json(folder / "reference_poses.json", {made.name: {"camera": camera, "objects": {"chair": pose}, "silhouette_iou": 0.9}})
+    write_json(folder / "reference_poses.json", {made.name: {"camera": camera, "objects": {"object": pose}, "silhouette_iou": 0.9}})
     return made
 
 
@@ -128,7 +128,7 @@ def test_a_real_photo_is_aligned_with_its_cameras_withheld(tmp_path):
     assert 0 < row["rotation_error_deg"] < 0.5 and row["focal_source"] == "estimated" and row["silhouette_iou"] > 0.98
     assert row["focal_ratio"] == pytest.approx(1 / 1.1, rel=0.02) and row["doubts"] == []
     tables = real_tables([row])
-    assert "| set chair | 1 |" in tables["real-sets"] and f"| set, {made.name} |" in tables["real-photos"]
+    assert "| set object | 1 |" in tables["real-sets"] and f"| set, {made.name} |" in tables["real-photos"]
     page = tmp_path / "align.md"
     page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
     refresh(page, tables, "benchmarks.align")
