@@ -37,8 +37,8 @@ def measured() -> dict:
     fast = variants(("float32", "float64"))
     shown = {label: operator for label, operator in fast.items() if "float64" not in label}
     rows = {name: _case(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
-    measured = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
-    return {"cases": rows, "laws": measured}
+    by_law = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
+    return {"cases": rows, "laws": by_law}
 
 
 def _case(given: Pairs, shown: dict[str, Operator], fast: dict[str, Operator], with_reference: bool) -> dict:
@@ -79,13 +79,13 @@ def as_tables(result: dict) -> dict[str, str]:
         for name, row in result["cases"].items()
     ]
     values = [[name, *cells(row, "value")] for name, row in result["cases"].items() if name != ALL]
-    measured = [
+    by_law = [
         [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)] for law, row in result["laws"].items()
     ]
     return {
         "stability": table(["changed", *head], rounding),
         "special values": table(["changed", *head], values),
-        "laws": table(["law", *head], measured),
+        "laws": table(["law", *head], by_law),
     }
 
 
