@@ -1,0 +1,112 @@
+"""What natural light looks like: log radiance over the sphere as a Gaussian process.
+
+A photograph fixes the light from some directions well and from others hardly at all. What is known of all natural light fills the rest: neighbouring
+directions are similarly bright, colour varies much less than luminance, and above is brighter than below.
+
+    y = A u,  u = log (R, G, B) of the mean radiance of a cell of the sphere:
+    y_0 = (log R + log G + log B)/3,   y_1 = log R − log G,   y_2 = log B − log G                                   (1)
+    cov[y_k(a), y_k(b)] = variance_k exp(−θ_ab / decay_k) + level_k + [a = b] nugget_k,   θ_ab the angle of a and b    (2)
+    mean[y_k(a)] = Σ_l profile_kl P_l(a · up),   P_l Legendre's polynomial of degree l = 1, 2, 3                       (3)
+
+y_0, y_1 and y_2 are independent of each other. exp(−θ/c) is positive definite on the sphere for every c > 0 (Gneiting, "Strictly and non-strictly
+positive definite functions on spheres", 2013). `factorlib.light.prior_fit` finds the numbers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.jsonfile import read_json
+from factorlib.light.lobes import squared_distances
+from factorlib.reading import reading
+
+MIX = np.array([[1 / 3, 1 / 3, 1 / 3], [1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])  # A of equation (1)
+SHIPPED = Path(__file__).with_name("prior.json")
+
+Three = tuple[float, float, float]
+
+
+class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A map that a prior was fitted to: its file's name and the SHA-256 of its bytes."""
+
+    name: str
+    sha256: str
+
+
+class LeaveOneOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Mean log likelihood (nats) of the log radiances of all cells of a map under a prior fitted to all other maps.
+
+    white_noise: the same variance, level and profile, but neighbours know nothing of each other;  no_profile: fitted without equation (3)
+    """
+
+    prior: float
+    white_noise: float
+    no_profile: float
+
+
+class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The numbers of equations (2) and (3), each for y_0, y_1, y_2; variances are of natural logarithms.
+
+    variance, decay_deg:  of what varies over the sphere, and the angle over which it is alike
+    level:      variance of a constant that all directions share: for y_0 the unknown exposure, for y_1 and y_2 the white balance
+    nugget:     variance of a cell on its own, which no neighbour knows
+    profile:    coefficients of P_1, P_2, P_3 of the sine of elevation
+    cell_deg:   size of the cells it was fitted at: smaller cells vary more
+    """
+
+    variance: Three
+    decay_deg: Three
+    level: Three
+    nugget: Three
+    profile: tuple[Three, Three, Three]
+    cell_deg: float
+    made_from: tuple[Source, ...] = ()
+    leave_one_out: LeaveOneOut | None = None
+
+    def covariance(self, k: int, directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:
+        """Covariance of y_k in unit `directions`, any frame: equation (2)."""
+        alike = correlation(angles(directions), np.radians(self.decay_deg[k]))
+        return self.variance[k] * alike + self.level[k] + self.nugget[k] * np.eye(len(directions))
+
+    def mean(self, directions: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "3 p"]:
+        """Mean of y in unit `directions`: equation (3); zeros where the unit vector `up` (same frame) is not known."""
+        if up is None:
+            return np.zeros((3, len(directions)))
+        return np.array(self.profile) @ legendre(directions @ up).T
+
+    def precision(self, directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3p 3p"]:
+        """Inverse covariance of u: log R of all `directions`, then log G, then log B: Σ_k A_kᵀ A_k ⊗ K_k⁻¹."""
+        return sum(np.kron(np.outer(row, row), _inverse(self.covariance(k, directions))) for k, row in enumerate(MIX))
+
+
+def correlation(angle: Float[np.ndarray, "*n"], decay: float) -> Float[np.ndarray, "*n"]:
+    """exp(−θ/decay), both in radians."""
+    return np.exp(-angle / decay)
+
+
+def angles(directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:
+    """Radians between unit directions; by the chord, which keeps its digits where they are close."""
+    return 2 * np.arcsin(np.minimum(np.sqrt(squared_distances(directions, directions)) / 2, 1))
+
+
+def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
+    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
+    return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
+
+
+def _inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Of a positive definite matrix, exactly symmetric."""
+    inverse = np.linalg.inv(matrix)
+    return (inverse + inverse.T) / 2
+
+
+def read_light_prior(path: Path | None = None) -> LightPrior:
+    """The prior in a file that `python -m factorlib.light_prior` wrote; None: the one this package ships. InputError for a file that is none."""
+    path = path or SHIPPED
+    value = read_json(path)
+    with reading("a light prior", path, cure="write it by python -m factorlib.light_prior"):
+        return msgspec.convert(value, LightPrior)
