@@ -12,7 +12,7 @@ no property of light. For the same reason the level of y_0 is not fitted but wid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -50,9 +50,8 @@ def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n
     return np.stack([np.bincount(cell, area * channel, len(cells)) for channel in lat_long.reshape(-1, 3).T], axis=-1) / total[:, None]
 
 
-def log_cells(maps: Sequence[Float[np.ndarray, "h w 3"]], cells: Float[np.ndarray, "n 3"]) -> Logs:
-    """y of the cells of each map (lat-long, linear Rec. 709, finite, not black)."""
-    means = np.stack([cell_means(lat_long, cells) for lat_long in maps])
+def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
+    """y of the mean radiances (linear Rec. 709, finite, no map black) of cells of some maps."""
     floor = FLOOR * means.mean(axis=(1, 2), keepdims=True)
     return np.einsum("kc,mnc->kmn", MIX, np.log(np.maximum(means, floor)))
 

@@ -1,0 +1,107 @@
+"""python -m factorlib.light_prior FOLDER…: the prior on natural light, fitted to the lat-long maps (.hdr, .exr) in some folders.
+
+Prints the table, and how well such a prior foresees a map that it was not fitted to, beside two nulls.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import typer
+from jaxtyping import Float
+from rich.progress import Progress
+
+from factorlib.errors import InputError
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.photo import read_photo
+from factorlib.jsonfile import json_text, write_json
+from factorlib.light.prior import LightPrior, Source
+from factorlib.light.prior_fit import cell_means, fitted, leave_one_out, log_cells, rounded
+from factorlib.reading import read_bytes
+
+CELLS = 400  # of equal area, some 10° apart
+SUFFIXES = (".hdr", ".exr")
+Map = Float[np.ndarray, "h w 3"]
+
+
+def maps_in(folders: Sequence[Path]) -> list[Path]:
+    """The maps in each folder, by name; InputError for what is no folder, and for a folder without any."""
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
+        here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not here:
+            raise InputError("no .hdr or .exr in this folder", file=folder, cure="name a folder of lat-long maps; folders within it count by themselves")
+        found += here
+    return found
+
+
+def read_map(path: Path) -> Map:
+    """Linear radiance of a lat-long map; InputError for a file that is none, is black, or holds what is no number."""
+    photo = read_photo(path, "linear")
+    if photo.width != 2 * photo.height:
+        raise InputError(f"{photo.width} × {photo.height} pixels is no lat-long map", file=path, cure="its width must be twice its height")
+    if not photo.finite.all():
+        raise InputError(f"{(~photo.finite).sum()} pixels are no numbers", file=path, cure="mend or remove this map")
+    if not (photo.radiance > 0).any():
+        raise InputError("the map is black", file=path, cure="mend or remove this map")
+    return photo.radiance.astype(float)
+
+
+def means_of(path: Path, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """`cell_means` of a map in a file; InputError where it is too coarse."""
+    try:
+        return cell_means(read_map(path), cells)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(str(error), file=path, cure="a map of 64 rows or more will do") from None
+
+
+def prior_of(paths: Sequence[Path], count: int | None = None, bar: Progress | None = None) -> LightPrior:
+    """The prior of the maps in some files; with two or more also its leave-one-out scores."""
+    cells, bar = fibonacci_sphere(count or CELLS), bar or Progress(disable=True)
+    means = np.stack([means_of(path, cells) for path in bar.track(paths, description="reading")])
+    logs, task = log_cells(means), bar.add_task("leaving one out", total=len(paths))
+    scores = leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done)) if len(paths) > 1 else None
+    sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
+    return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
+
+
+def summary(prior: LightPrior) -> str:
+    """The scores in words."""
+    scores = prior.leave_one_out
+    if scores is None:
+        return "one map: its prior cannot be checked on another"
+    return (
+        f"log likelihood of a map that was left out, mean over {len(prior.made_from)} (nats, {round(129600 / np.pi / prior.cell_deg**2)} cells):\n"
+        f"  this prior {scores.prior:.1f}\n  white noise of the same variance {scores.white_noise:.1f}\n  without the profile {scores.no_profile:.1f}"
+    )
+
+
+def main(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of lat-long maps; folders within them count by themselves.", metavar="FOLDER…")],
+    out: Annotated[Path | None, typer.Option(help="File to write the table to; without it the table is printed.")] = None,
+) -> None:
+    """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders."""
+    try:
+        with Progress() as bar:
+            prior = prior_of(maps_in(folders), bar=bar)
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    if out is None:
+        typer.echo(json_text(prior))
+    else:
+        write_json(out, prior)
+    typer.echo(summary(prior))
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,88 @@
+"""The command that fits the prior on natural light: what it writes, and what it says of folders and maps that will not do."""
+
+import hashlib
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from factorlib import light_prior
+from factorlib.errors import InputError
+from factorlib.images.exr import write_rgb_exr
+from factorlib.light.prior import read_light_prior
+
+COUNT = 40
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three maps, brighter above."""
+    rng = np.random.default_rng(1)
+    (tmp_path / "maps").mkdir()
+    for name in "abc":
+        write_rgb_exr(tmp_path / f"maps/{name}.exr", np.exp(np.linspace(1, -1, 16)[:, None, None] + 0.5 * rng.normal(size=(16, 32, 3))))
+    return tmp_path / "maps"
+
+
+@pytest.fixture
+def run(monkeypatch):
+    monkeypatch.setattr(light_prior, "CELLS", COUNT)
+    app = typer.Typer()
+    app.command()(light_prior.main)
+    return lambda *words: CliRunner().invoke(app, list(map(str, words)))
+
+
+def test_the_table_says_what_it_was_made_from_and_how_good_it_is(folder, run, tmp_path):
+    done = run(folder, "--out", tmp_path / "table.json")
+    assert done.exit_code == 0, done.output
+    prior = read_light_prior(tmp_path / "table.json")
+    assert [source.name for source in prior.made_from] == ["a.exr", "b.exr", "c.exr"]
+    assert prior.made_from[0].sha256 == hashlib.sha256((folder / "a.exr").read_bytes()).hexdigest()
+    assert f"this prior {prior.leave_one_out.prior:.1f}" in done.output and f"{COUNT} cells" in done.output
+    assert prior.profile[0][0] > 0.5
+    assert '"decay_deg"' in run(folder).output
+
+
+def test_one_map_cannot_be_checked_and_that_is_said(folder, run, tmp_path):
+    for name in "bc":
+        (folder / f"{name}.exr").unlink()
+    done = run(folder, "--out", tmp_path / "table.json")
+    assert done.exit_code == 0 and "one map" in done.output
+    assert read_light_prior(tmp_path / "table.json").leave_one_out is None
+
+
+def test_folders_that_hold_no_map_are_named(tmp_path, run):
+    for place, said in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "no .hdr or .exr")):
+        done = run(place)
+        assert done.exit_code == 2 and said in done.output and place.name in done.output
+
+
+def black(light):
+    light[:] = 0
+
+
+def not_a_number(light):
+    light[3, 4, 1] = np.nan
+
+
+@pytest.mark.parametrize("spoil, said", [(black, "black"), (not_a_number, "1 pixels are no numbers")])
+def test_maps_that_tell_nothing_are_named(folder, spoil, said):
+    light = np.ones((16, 32, 3))
+    spoil(light)
+    write_rgb_exr(folder / "b.exr", light)
+    with pytest.raises(InputError, match=said) as error:
+        light_prior.prior_of(light_prior.maps_in([folder]), COUNT)
+    assert error.value.file == folder / "b.exr"
+
+
+def test_files_that_are_no_map_are_named(folder):
+    (folder / "b.exr").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="b.exr"):
+        light_prior.read_map(folder / "b.exr")
+    write_rgb_exr(folder / "b.exr", np.ones((8, 8, 3)))
+    with pytest.raises(InputError, match="no lat-long"):
+        light_prior.read_map(folder / "b.exr")
+    write_rgb_exr(folder / "b.exr", np.ones((4, 8, 3)))
+    with pytest.raises(InputError, match="too few"):
+        light_prior.prior_of([folder / "b.exr"], COUNT)

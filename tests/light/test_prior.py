@@ -1,0 +1,131 @@
+"""The prior on natural light: what its covariance must be, and that a fit finds the prior from which maps were drawn."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from factorlib.errors import InputError
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.light.prior import MIX, LightPrior, read_light_prior
+from factorlib.light.prior_fit import cell_means, fitted, leave_one_out, log_cells, log_likelihood, rounded
+
+KNOWN = LightPrior(
+    variance=(1.5, 0.05, 0.1), decay_deg=(40.0, 30.0, 60.0), level=(100.0, 0.1, 0.04), nugget=(0.2, 0.01, 0.01),
+    profile=((0.5, 0.1, -0.2), (-0.2, 0.0, 0.05), (0.2, 0.1, 0.0)), cell_deg=20.0,
+)  # fmt: skip
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
+    """y of `count` maps."""
+    rng = np.random.default_rng(seed)
+    roots = [np.linalg.cholesky(prior.covariance(k, cells)) for k in range(3)]
+    return np.stack([rng.normal(size=(count, len(cells))) @ root.T + mean for root, mean in zip(roots, prior.mean(cells, UP))])
+
+
+@pytest.mark.parametrize("decay_deg", [1.0, 40.0, 400.0])
+@pytest.mark.parametrize("k", range(3))
+def test_covariance_is_positive_definite_without_a_nugget(k, decay_deg):
+    prior = msgspec.structs.replace(KNOWN, nugget=(0.0,) * 3, decay_deg=(decay_deg,) * 3)
+    covariance = prior.covariance(k, np.concatenate([fibonacci_sphere(150), [[1, 0, 0], [-1, 0, 0], [0, 1, 0]]]))
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_covariance_is_that_of_the_equation():
+    directions = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0]])
+    half, quarter = 1.5 * np.exp(-180 / 40) + 100, 1.5 * np.exp(-90 / 40) + 100
+    expected = [[101.7, quarter, half], [quarter, 101.7, quarter], [half, quarter, 101.7]]
+    np.testing.assert_allclose(KNOWN.covariance(0, directions), expected, rtol=1e-12)
+
+
+def test_without_up_all_frames_are_alike_and_with_up_it_turns_along():
+    directions, rotation = fibonacci_sphere(40), Rotation.random(random_state=3).as_matrix()
+    turned = directions @ rotation.T
+    np.testing.assert_allclose(KNOWN.precision(turned), KNOWN.precision(directions), atol=1e-7)
+    assert not KNOWN.mean(turned, None).any()
+    np.testing.assert_allclose(KNOWN.mean(turned, rotation @ UP), KNOWN.mean(directions, UP), atol=1e-12)
+
+
+def test_the_profile_leaves_the_level_alone():
+    np.testing.assert_allclose(KNOWN.mean(fibonacci_sphere(5000), np.array([0.6, 0.0, 0.8])).mean(axis=1), 0, atol=1e-3)
+
+
+def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():
+    directions = fibonacci_sphere(12)
+    of_y = np.zeros((36, 36))
+    for k in range(3):
+        of_y[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] = KNOWN.covariance(k, directions)
+    unmix = np.kron(np.linalg.inv(MIX), np.eye(12))
+    np.testing.assert_allclose(KNOWN.precision(directions) @ unmix @ of_y @ unmix.T, np.eye(36), atol=1e-8)
+
+
+def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
+    cells = fibonacci_sphere(100)
+    found = fitted(drawn(KNOWN, cells, 150), cells)
+    np.testing.assert_allclose(found.variance, KNOWN.variance, rtol=0.25)
+    np.testing.assert_allclose(found.decay_deg, KNOWN.decay_deg, rtol=0.25)
+    np.testing.assert_allclose(found.nugget, KNOWN.nugget, rtol=0.3)
+    np.testing.assert_allclose(found.level, KNOWN.level, rtol=0.4)
+    np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
+
+
+def test_leave_one_out_prefers_the_true_kind_of_prior():
+    cells = fibonacci_sphere(60)
+    scores = leave_one_out(drawn(KNOWN, cells, 20), cells)
+    assert scores.prior > scores.white_noise + 10 and scores.prior > scores.no_profile
+
+
+def test_the_likelihood_is_highest_at_the_truth():
+    cells = fibonacci_sphere(60)
+    logs = drawn(KNOWN, cells, 60)
+    wrong = [msgspec.structs.replace(KNOWN, **change) for change in ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})]
+    truth = log_likelihood(KNOWN, logs, cells, UP).mean()
+    assert all(log_likelihood(prior, logs, cells, UP).mean() < truth for prior in wrong)
+    assert log_likelihood(KNOWN, logs, cells, None).mean() < truth
+
+
+def test_brighter_maps_give_the_same_prior():
+    cells, rng = fibonacci_sphere(40), np.random.default_rng(0)
+    maps = np.exp(rng.normal(size=(4, 16, 32, 3)))
+    dim, bright = (fitted(log_cells(np.stack([cell_means(scale * one, cells) for one in maps])), cells) for scale in (1e-4, 1e4))
+    for name in ("variance", "decay_deg", "level", "nugget", "profile"):
+        np.testing.assert_allclose(getattr(dim, name), getattr(bright, name), rtol=1e-3, atol=1e-4)
+
+
+def test_one_map_is_enough_for_a_fit():
+    cells = fibonacci_sphere(60)
+    prior = fitted(drawn(KNOWN, cells, 1), cells)
+    assert np.isfinite(prior.precision(cells)).all() and np.linalg.eigvalsh(prior.precision(cells)).min() > 0
+
+
+def test_cells_hold_the_energy_of_the_map():
+    cells = fibonacci_sphere(50)
+    np.testing.assert_allclose(cell_means(np.full((32, 64, 3), 2.0), cells), 2.0)
+    lamp = np.zeros((64, 128, 3))
+    lamp[20, 40] = 1
+    assert np.count_nonzero(cell_means(lamp, cells).sum(axis=1)) == 1
+    with pytest.raises(ValueError, match="too few"):
+        cell_means(np.ones((2, 4, 3)), cells)
+
+
+def test_dark_cells_are_floored():
+    means = np.ones((1, 5, 3))
+    means[0, 0] = 0
+    assert np.isfinite(log_cells(means)).all() and log_cells(means)[0, 0, 0] == pytest.approx(np.log(0.8e-4))
+
+
+def test_the_shipped_table_reads_and_beats_its_nulls():
+    prior = read_light_prior()
+    assert prior == rounded(prior) and len(prior.made_from) >= 30 and prior.level[0] == 100
+    scores = prior.leave_one_out
+    assert scores.prior > scores.white_noise and scores.prior > scores.no_profile
+    assert np.linalg.eigvalsh(prior.precision(fibonacci_sphere(200))).min() > 0
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"variance": [1, 2, 3]}', '{"varianse": 1}'])
+def test_a_file_that_is_no_prior_says_so(tmp_path, text):
+    (tmp_path / "table.json").write_text(text)
+    with pytest.raises(InputError, match="table.json"):
+        read_light_prior(tmp_path / "table.json")
