@@ -8,6 +8,10 @@ directions are similarly bright, colour varies much less than luminance, and abo
     cov[y_k(a), y_k(b)] = variance_k exp(−θ_ab / decay_k) + level_k + [a = b] nugget_k,   θ_ab the angle of a and b    (2)
     mean[y_k(a)] = Σ_l profile_kl P_l(a · up),   P_l Legendre's polynomial of degree l = 1, 2, 3                       (3)
 
+    s_k² ~ inverse gamma(ν_k/2, ν_k/2)                                                                                 (4)
+
+is a factor of the covariance (2) of a whole map: some scenes have much contrast or much colour, others little. `covariance` and `precision` are those
+at s = 1, a typical map; a solve finds s by evidence. With s integrated over, a map is drawn from Student's t of ν_k degrees of freedom.
 y_0, y_1 and y_2 are independent of each other. exp(−θ/c) is positive definite on the sphere for every c > 0 (Gneiting, "Strictly and non-strictly
 positive definite functions on spheres", 2013). `factorlib.light.prior_fit` finds the numbers.
 """
@@ -56,6 +60,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     nugget:     variance of a cell on its own, which no neighbour knows
     profile:    coefficients of P_1, P_2, P_3 of the sine of elevation
     cell_deg:   size of the cells it was fitted at: smaller cells vary more
+    freedom:    ν of equation (4): about 3 says that maps differ much in contrast, 10⁴ that they do not
     """
 
     variance: Three
@@ -64,6 +69,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     nugget: Three
     profile: tuple[Three, Three, Three]
     cell_deg: float
+    freedom: Three = (1e4, 1e4, 1e4)
     made_from: tuple[Source, ...] = ()
     leave_one_out: LeaveOneOut | None = None
 

@@ -1,13 +1,16 @@
 """Fitting the light prior to captured maps: maximum likelihood, and how well it foresees maps it was not fitted to.
 
 Each map is a sample. Its area means over cells of equal area (a map's own texels are too fine, and smaller toward the poles) are the u of
-`factorlib.light.prior`. y_0, y_1 and y_2 are independent, so each is fitted by itself, over n cells and m maps:
+`factorlib.light.prior`. y_0, y_1 and y_2 are fitted each by itself, over n cells and m maps. Maps differ in contrast as a whole: a circus has a
+hundred times the variance of colour of a grey studio. So each map is drawn from Student's t of ν degrees of freedom (Lange, Little and Taylor,
+"Robust statistical modeling using the t distribution", 1989), in which a map of much contrast has little weight w:
 
-    −log L = m/2 log|2πK| + 1/2 Σ_m r_mᵀ K⁻¹ r_m,   r_m = y_m − X β,   β = (Xᵀ K⁻¹ X)⁻¹ Xᵀ K⁻¹ mean_m(y_m)            (1)
-    ∂(−log L)/∂t = 1/2 tr[(m K⁻¹ − Σ_m K⁻¹ r_m r_mᵀ K⁻¹) ∂K/∂t]   (β is optimal, so its own derivative drops out)      (2)
+    −log L = Σ_m [log|πνK|/2 + (ν+n)/2 log(1 + d_m/ν) + log Γ(ν/2) − log Γ((ν+n)/2)],   d_m = r_mᵀ K⁻¹ r_m,   r_m = y_m − X β      (1)
+    β = (Xᵀ K⁻¹ X)⁻¹ Xᵀ K⁻¹ Σ_m w_m y_m / Σ_m w_m,   w_m = (ν + n) / (ν + d_m)                                                 (2)
+    ∂(−log L)/∂t = 1/2 Σ_m tr[(K⁻¹ − w_m K⁻¹ r_m r_mᵀ K⁻¹) ∂K/∂t]   (β is optimal, so its own derivative drops out)              (3)
 
-over t = log of variance, decay, nugget and level. X holds the profile's polynomials, and for y_0 a one: its mean is the maps' mean exposure, which is
-no property of light. For the same reason the level of y_0 is not fitted but wide, EXPOSURE_VARIANCE.
+over t = log of variance, decay, nugget, level and ν. X holds the profile's polynomials, and for y_0 a one: its mean is the maps' mean exposure, which
+is no property of light. For the same reason the level of y_0 is not fitted but wide, EXPOSURE_VARIANCE.
 """
 
 from __future__ import annotations
@@ -17,9 +20,10 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
+from scipy.special import digamma, gammaln
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, angles, correlation, legendre
@@ -27,9 +31,10 @@ from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, angles, correlat
 EXPOSURE_VARIANCE = 100.0  # log²: a photo's exposure may be wrong by a factor e^±10
 FLOOR = 1e-4  # of a map's mean radiance: what is darker than that is noise of the capture
 UP = np.array([0.0, 1.0, 0.0])  # of a lat-long map
-# log of variance, decay (radians), nugget, level: where the search starts, and where it must stay
-START = np.log([1.0, 0.7, 0.05, 0.1])
-BOUNDS = [(np.log(low), np.log(high)) for low, high in ((1e-4, 1e2), (0.03, 12.0), (1e-5, 1e1), (1e-5, 1e2))]
+# log of variance, decay (radians), nugget, level, degrees of freedom: where the search starts, and where it must stay
+START = np.log([1.0, 0.7, 0.05, 0.1, 5.0])
+BOUNDS = [(np.log(low), np.log(high)) for low, high in ((1e-4, 1e2), (0.03, 12.0), (1e-5, 1e1), (1e-5, 1e2), (0.5, 1e4))]
+WEIGHTINGS = 10  # times that β and w are found from each other: far more than they need
 DIGITS = 4  # significant ones of what is shipped
 
 Logs = Float[np.ndarray, "3 m n"]  # y_0, y_1, y_2 of m maps in n cells
@@ -62,61 +67,76 @@ def fitted(logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, st
     profile: whether the mean depends on elevation;  start: where to begin the search
     """
     found = [_fitted_one(k, logs[k], cells, profile, START if start is None else _log_parameters(start, k)) for k in range(3)]
-    (variance, decay, nugget, level), coefficients = np.exp([t for t, _ in found]).T, [b for _, b in found]
+    (variance, decay, nugget, level, freedom), coefficients = np.exp([t for t, _ in found]).T, [b for _, b in found]
     return LightPrior(
         tuple(variance.tolist()), tuple(np.degrees(decay).tolist()), tuple(level.tolist()), tuple(nugget.tolist()),
-        tuple(tuple(b.tolist()) for b in coefficients), cell_deg=float(np.degrees(np.sqrt(4 * np.pi / len(cells)))),
+        tuple(tuple(b.tolist()) for b in coefficients), float(np.degrees(np.sqrt(4 * np.pi / len(cells)))), tuple(freedom.tolist()),
     )  # fmt: skip
 
 
-def _log_parameters(prior: LightPrior, k: int) -> Float[np.ndarray, "4"]:
-    return np.log([prior.variance[k], np.radians(prior.decay_deg[k]), prior.nugget[k], prior.level[k]])
+def _log_parameters(prior: LightPrior, k: int) -> Float[np.ndarray, "5"]:
+    return np.log([prior.variance[k], np.radians(prior.decay_deg[k]), prior.nugget[k], prior.level[k], prior.freedom[k]])
 
 
 def _fitted_one(
-    k: int, values: Float[np.ndarray, "m n"], cells: Float[np.ndarray, "n 3"], profile: bool, start: Float[np.ndarray, "4"]
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
-    """Logs of variance, decay, nugget and level of y_k, and its profile."""
-    exposure = [np.ones(len(cells))] if k == 0 else []
-    design = np.stack([*(legendre(cells @ UP).T if profile else []), *exposure], axis=-1) if profile or exposure else np.zeros((len(cells), 0))
-    bounds, start = list(BOUNDS), start.copy()
+    k: int, values: Float[np.ndarray, "m n"], cells: Float[np.ndarray, "n 3"], profile: bool, start: Float[np.ndarray, "5"]
+) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "3"]]:
+    """t of y_k, and its profile."""
+    design = np.hstack([legendre(cells @ UP)[:, : 3 * int(profile)], np.ones((len(cells), int(k == 0)))])
+    bounds, start, angle = list(BOUNDS), start.copy(), angles(cells)
     if k == 0:
         start[3] = np.log(EXPOSURE_VARIANCE)
         bounds[3] = (start[3], start[3])
-    angle = angles(cells)
-    best = minimize(lambda t: _cost(t, angle, design, values)[:2], start, jac=True, method="L-BFGS-B", bounds=bounds)
-    coefficients = _cost(best.x, angle, design, values)[2]
-    return best.x, coefficients[:3] if profile else np.zeros(3)
+    best = minimize(lambda t: _cost(t, angle, design, values)[:2], start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    return best, _cost(best, angle, design, values)[2][:3] if profile else np.zeros(3)
 
 
 def _cost(
-    t: Float[np.ndarray, "4"], angle: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"]
-) -> tuple[float, Float[np.ndarray, "4"], Float[np.ndarray, " q"]]:
-    """−log L per map without its constant, its gradient by t, and β: equations (1) and (2)."""
-    variance, decay, nugget, level = np.exp(t)
-    alike = variance * correlation(angle, decay)
-    count = len(angle)
+    t: Float[np.ndarray, "5"], angle: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"]
+) -> tuple[float, Float[np.ndarray, "5"], Float[np.ndarray, " q"]]:
+    """−log L per map, its gradient by t, and β: equations (1) to (3)."""
+    variance, decay, nugget, level, freedom = np.exp(t)
+    alike, count = variance * correlation(angle, decay), len(angle)
     factor = cho_factor(alike + level + nugget * np.eye(count), lower=True)
     inverse = cho_solve(factor, np.eye(count))
-    weighted = inverse @ design
-    beta = np.linalg.solve(design.T @ weighted, weighted.T @ values.mean(axis=0))
-    residual = values - design @ beta
+    beta, residual, weight = _weighted_means(inverse, design, values, freedom)
     solved = residual @ inverse
-    cost = np.log(np.diag(factor[0])).sum() + 0.5 * np.sum(solved * residual) / len(values)
-    slope = 0.5 * (inverse - solved.T @ solved / len(values))
-    return cost, np.array([np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope), level * slope.sum()]), beta
+    square = np.sum(solved * residual, axis=1)
+    slope = 0.5 * (inverse - (weight[:, None] * solved).T @ solved / len(values))
+    by_freedom = np.log1p(square / freedom) - weight * square / freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
+    gradient = [np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope), level * slope.sum()]
+    return -_log_density(factor[0], square, freedom).mean(), np.array([*gradient, freedom * by_freedom.mean() / 2]), beta
+
+
+def _weighted_means(
+    inverse: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"], freedom: float
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
+    """β, the residuals of each map, and its weight: equation (2)."""
+    count, weight = values.shape[1], np.ones(len(values))
+    towards = inverse @ design
+    project = np.linalg.solve(design.T @ towards, towards.T)
+    for _ in range(WEIGHTINGS):
+        beta = project @ (weight @ values / weight.sum())
+        residual = values - design @ beta
+        weight = (freedom + count) / (freedom + np.einsum("mn,np,mp->m", residual, inverse, residual, optimize=True))
+    return beta, residual, weight
+
+
+def _log_density(root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"], freedom: float) -> Float[np.ndarray, " m"]:
+    """Of Student's t: `root` is the lower Cholesky factor of K, `square` is d."""
+    count = len(root)
+    constant = gammaln((freedom + count) / 2) - gammaln(freedom / 2) - count / 2 * np.log(np.pi * freedom) - np.log(np.diag(root)).sum()
+    return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
 def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, " m"]:
     """Log density of y of each map under a prior, nats."""
-    residual = logs - prior.mean(cells, up)[:, None]
-    return sum(_log_density(prior.covariance(k, cells), residual[k]) for k in range(3))
-
-
-def _log_density(covariance: Float[np.ndarray, "n n"], residual: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " m"]:
-    factor = cho_factor(covariance, lower=True)
-    square = np.einsum("mn,nm->m", residual, cho_solve(factor, residual.T))
-    return -0.5 * square - np.log(np.diag(factor[0])).sum() - 0.5 * len(covariance) * np.log(2 * np.pi)
+    total = np.zeros(logs.shape[1])
+    for k, residual in enumerate(logs - prior.mean(cells, up)[:, None]):
+        root = np.linalg.cholesky(prior.covariance(k, cells))
+        square = np.sum(solve_triangular(root, residual.T, lower=True) ** 2, axis=0)
+        total += _log_density(root, square, prior.freedom[k])
+    return total
 
 
 def white_noise(prior: LightPrior) -> LightPrior:
@@ -145,7 +165,7 @@ def rounded(prior: LightPrior) -> LightPrior:
     def short(value: float) -> float:
         return float(f"{value:.{DIGITS}g}")
 
-    names = ("variance", "decay_deg", "level", "nugget")
+    names = ("variance", "decay_deg", "level", "nugget", "freedom")
     numbers = {name: tuple(map(short, getattr(prior, name))) for name in names}
     profile = tuple(tuple(map(short, each)) for each in prior.profile)
     scores = prior.leave_one_out and LeaveOneOut(*(round(score, 1) for score in msgspec.structs.astuple(prior.leave_one_out)))
