@@ -37,7 +37,9 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
             raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
         here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not here:
-            raise InputError("no .hdr or .exr in this folder", file=folder, cure="name a folder of lat-long maps; folders within it count by themselves")
+            raise InputError(
+                "no .hdr or .exr in this folder", file=folder, cure="name a folder of lat-long maps; folders within it count by themselves"
+            )
         found += here
     return found
 
@@ -86,7 +88,9 @@ def summary(prior: LightPrior) -> str:
 
 
 def main(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of lat-long maps; folders within them count by themselves.", metavar="FOLDER…")],
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of lat-long maps; folders within them count by themselves.", metavar="FOLDER…")
+    ],
     out: Annotated[Path | None, typer.Option(help="File to write the table to; without it the table is printed.")] = None,
 ) -> None:
     """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders."""

@@ -7,6 +7,7 @@ from shutil import rmtree
 from types import ModuleType
 from typing import Annotated
 
+import msgspec
 import typer
 from rich.progress import Progress
 
@@ -25,18 +26,29 @@ def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
     """Three materials in three lights on exact shapes, direct light only."""
     from factorlib.generate import synthetic as set_
 
-    _write(set_, out or Path("data/synthetic"), seed, lights)
+    _write(set_, out or Path("data/synthetic"), seed, lights, set_.Parameters())
 
 
 @app.command()
-def eames(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
+def eames(
+    seed: Seed = 0,
+    out: Out = None,
+    lights: Lights = None,
+    exact: Annotated[bool, typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")] = False,
+    distant: Annotated[bool, typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")] = False,
+    direct: Annotated[bool, typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")] = False,
+) -> None:
     """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
     from factorlib.generate import eames as set_
 
-    _write(set_, out or Path("data/eames"), seed, lights)
+    if (exact or distant or direct) and out is None:
+        typer.echo("error: data/eames is the set without --exact, --distant and --direct\n  name another folder by --out", err=True)
+        raise typer.Exit(2)
+    parameters = set_.Parameters(exact=exact, distant=distant, direct=direct)
+    _write(set_, out or Path("data/eames"), seed, lights, parameters)
 
 
-def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None) -> None:
+def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, parameters: msgspec.Struct) -> None:
     """Generate beside `out`, then put it in its place."""
     try:
         maps = sorted(path for path in lights.iterdir() if path.suffix.lower() in (".hdr", ".exr")) if lights else []
@@ -51,7 +63,7 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None) -> None:
                 fresh,
                 seed,
                 maps,
-                set_.Parameters(),
+                parameters,
                 lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
             )
         sync_tree(fresh)

@@ -2,7 +2,8 @@
 
 What makes it harder than the synthetic set is what makes photographs hard: JPEGs with clipped highlights, chairs that
 shadow and mirror themselves, each other and the ground, a mesh coarser than and a few millimetres off the chair that
-was photographed, no poses, and half of the focal lengths unknown.
+was photographed, no poses, and half of the focal lengths unknown.  Three of these can be taken away, each by itself, so that
+one sees what each costs: `exact` geometry, `distant` light, `direct` light.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from jaxtyping import Bool, Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
-from factorlib.generate.chair import chair, labelled, rough_chair
+from factorlib.generate.chair import Part, chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, SceneDict
+from factorlib.generate.shapes import smooth
 from factorlib.generate.synthetic import drawn_materials
-from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced
+from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced, transform
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
@@ -31,13 +33,26 @@ Progress = Callable[[int, int, str], None]
 
 
 class Parameters(msgspec.Struct, frozen=True):
-    """Pixels, pixels, rows, samples per pixel of photos and of lights."""
+    """Pixels, pixels, rows, samples per pixel of photos and of lights, and what is made easier.
+
+    exact:    the data set's mesh is the one that was photographed, and poses and focal lengths are given
+    distant:  nothing lights or surrounds the chairs but the light's map, infinitely far away
+    direct:   light is not reflected on its way: only what shines by itself lights the chairs
+    """
 
     width: int = 480
     height: int = 360
     light_rows: int = 128
     spp: int = 224
     light_spp: int = 24
+    exact: bool = False
+    distant: bool = False
+    direct: bool = False
+
+    @property
+    def options(self) -> str:
+        """What is made easier, as options of the command."""
+        return "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(self, name))
 
 
 class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,15 +97,23 @@ def generate(
         (out / name).mkdir(parents=True)
     rng = np.random.default_rng([11, seed])
     materials = drawn_materials(rng, 0.0 if seed == 0 else 0.2, SET.materials)
-    folder.write_obj(out / "meshes/chair.obj", rough_chair(rng))
+    write_mesh(out / "meshes/chair.obj", rough_chair(rng), parameters)
     photos, poses = [], {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
         scene = laid_out(shot, number, lat_longs, rng, 0.0 if seed == 0 else 1.0, parameters)
         poses[shot.name] = scene.poses()
         photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
-    write_records(out, materials, photos, poses)
+    write_records(out, materials, photos, poses, parameters)
     progress(len(shots), len(shots), "done")
+
+
+def write_mesh(path: Path, rough: dict[str, Part], parameters: Parameters) -> None:
+    """The mesh given: the rough one, or the one that is photographed."""
+    if parameters.exact:
+        folder.write_exact_obj(path, {name: smooth(*part) for name, part in chair().items()})
+    else:
+        folder.write_obj(path, rough)
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -130,10 +153,11 @@ def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.
 def surroundings(
     shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
 ) -> SceneDict:
-    """A sky, a room, or a user's map over a grey ground; nothing stands between camera and chairs."""
+    """A sky, a room, or a user's map over a grey ground (without it where light is `distant`); nothing stands between camera and chairs."""
     if lat_longs:
         light = lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
-        return {"light": envmap(light), "ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
+        ground = {} if parameters.distant else {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
+        return {"light": envmap(light), **ground}
     if shot.sun:
         return lights.daylight(rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows)
     return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
@@ -144,17 +168,35 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     shot, order, poses = scene.shot, list(materials), list(scene.poses().values())
     meshes = [labelled(chair(), {"shell": order.index(colour) + 1, "legs": order.index("wood") + 1}) for colour in shot.chairs]
     labels = folder.labels_of(meshes, scene.camera, poses)
-    radiance = traced(scene.things | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, -1)
+    light = light_at_chairs(scene, parameters, seed)
+    around = distant(light, scene) if parameters.distant else scene.things
+    depth = 2 if parameters.direct else -1
+    radiance = traced(around | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, depth)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT))
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, shot.focal_35mm if shot.focal_known_from == "exif" else None)
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
     for name, mask in own_masks(scene, meshes, poses).items():
         folder.write_labels(out / name, np.where(mask, 255, 0))
-    turn = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
-    light = lights.map_of(scene.things, turn, parameters.light_rows, parameters.light_spp, seed, (0, SET.middle - EYE, 0))
     folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
     folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(meshes, scene.camera, poses).normal)
-    return entry(scene)
+    return entry(scene, parameters.exact)
+
+
+def world_from_light(scene: Scene) -> Float[np.ndarray, "3 3"]:
+    """The light's frame is the camera's, turned y-up."""
+    return scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
+
+
+def distant(light: Float[np.ndarray, "h w 3"], scene: Scene) -> SceneDict:
+    """The map alone, infinitely far away."""
+    return {"light": envmap(light) | {"to_world": transform(rigid(world_from_light(scene), (0, 0, 0)))}}
+
+
+def light_at_chairs(scene: Scene, parameters: Parameters, seed: int) -> Float[np.ndarray, "h w 3"]:
+    """The surroundings' light at the chairs' middle, without the chairs; where light is direct but not distant, what shines by itself."""
+    depth = 1 if parameters.direct and not parameters.distant else -1
+    place = (0, SET.middle - EYE, 0)
+    return lights.map_of(scene.things, world_from_light(scene), parameters.light_rows, parameters.light_spp, seed, place, depth)
 
 
 def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material]) -> dict[str, Any]:
@@ -185,19 +227,23 @@ def own_mask(shot: Shot, name: str) -> str:
     return f"masks/{shot.name}_{name}.png"
 
 
-def entry(scene: Scene) -> dict[str, Any]:
-    """The photo in dataset.yaml: no pose; the focal length only where the user is to give it there."""
+def entry(scene: Scene, exact: bool) -> dict[str, Any]:
+    """The photo in dataset.yaml; poses only if `exact`, the focal length only then and where the user is to give it there."""
     shot, objects = scene.shot, []
-    for colour, name in zip(shot.chairs, scene.chairs, strict=True):
+    for colour, (name, pose) in zip(shot.chairs, scene.poses().items(), strict=True):
         mask = {"mask": own_mask(shot, name)} if len(shot.chairs) > 1 else {}
-        objects.append({"name": name, "mesh": "chair", "materials": {"shell": colour}, **mask})
-    camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if shot.focal_known_from == "given" else {}
+        posed = {"pose": folder.pose_entry(pose)} if exact else {}
+        objects.append({"name": name, "mesh": "chair", "materials": {"shell": colour}, **mask, **posed})
+    camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if exact or shot.focal_known_from == "given" else {}
     return {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png", **camera, "objects": objects}
 
 
-def write_records(out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]]) -> None:
+def write_records(
+    out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]], parameters: Parameters
+) -> None:
     """dataset.yaml and truth/truth.yaml."""
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
     record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
-    folder.write_yaml(out / "dataset.yaml", record, "Generated (rendered, not photographed): python -m factorlib.generate eames")
+    command = f"python -m factorlib.generate eames{parameters.options}"
+    folder.write_yaml(out / "dataset.yaml", record, f"Generated (rendered, not photographed): {command}")
     folder.write_truth(out, materials, poses)

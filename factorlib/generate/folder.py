@@ -77,6 +77,20 @@ def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> No
     write_text(path, "\n".join(lines) + "\n")
 
 
+def write_exact_obj(path: Path, parts: dict[str, Mesh]) -> None:
+    """Parts as groups of a Wavefront OBJ, with their vertex normals, to nine digits."""
+    lines, first = [], 1
+    for name, mesh in parts.items():
+        lines += [
+            f"g {name}",
+            *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices),
+            *(f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals),
+        ]
+        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in mesh.faces + first]
+        first += len(mesh.vertices)
+    write_text(path, "\n".join(lines) + "\n")
+
+
 def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
     """The material label of each pixel; 255 where its square, or a quarter pixel beyond, shows more than one material."""
     return whole_pixels(_subpixels(meshes, camera, poses).label)

@@ -133,10 +133,19 @@ def block(
 
 
 def map_of(
-    scene: SceneDict, world_from_light: Float[np.ndarray, "3 3"], height: int, spp: int, seed: int, place: Sequence[float] = (0, 0, 0)
+    scene: SceneDict,
+    world_from_light: Float[np.ndarray, "3 3"],
+    height: int,
+    spp: int,
+    seed: int,
+    place: Sequence[float] = (0, 0, 0),
+    max_depth: int = -1,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The light of a surrounding at a place of the world, a lat-long map of `height` rows in a turned y-up frame."""
-    return light_seen(scene, rigid(world_from_light, place), height, spp, seed)
+    """The light of a surrounding at a place of the world, a lat-long map of `height` rows in a turned y-up frame.
+
+    max_depth: as in `tracing.rendered`; 1 is what shines by itself
+    """
+    return light_seen(scene, rigid(world_from_light, place), height, spp, seed, max_depth)
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:

@@ -99,27 +99,29 @@ def _cost(
     alike, count = variance * correlation(angle, decay), len(angle)
     factor = cho_factor(alike + level + nugget * np.eye(count), lower=True)
     inverse = cho_solve(factor, np.eye(count))
-    beta, residual, weight = _weighted_means(inverse, design, values, freedom)
+    beta, weight = _weighted_means(inverse, design, values, freedom)
+    residual = values - design @ beta
     solved = residual @ inverse
     square = np.sum(solved * residual, axis=1)
     slope = 0.5 * (inverse - (weight[:, None] * solved).T @ solved / len(values))
-    by_freedom = np.log1p(square / freedom) - weight * square / freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
+    by_freedom = (
+        np.log1p(square / freedom) - weight * square / freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
+    )
     gradient = [np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope), level * slope.sum()]
     return -_log_density(factor[0], square, freedom).mean(), np.array([*gradient, freedom * by_freedom.mean() / 2]), beta
 
 
 def _weighted_means(
     inverse: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"], freedom: float
-) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
-    """β, the residuals of each map, and its weight: equation (2)."""
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " m"]]:
+    """β, and the weight of each map: equation (2).  d is quadratic in β, so what is summed over cells is summed once."""
     count, weight = values.shape[1], np.ones(len(values))
     towards = inverse @ design
-    project = np.linalg.solve(design.T @ towards, towards.T)
+    gram, along, own = design.T @ towards, values @ towards, np.sum(values @ inverse * values, axis=1)
     for _ in range(WEIGHTINGS):
-        beta = project @ (weight @ values / weight.sum())
-        residual = values - design @ beta
-        weight = (freedom + count) / (freedom + np.einsum("mn,np,mp->m", residual, inverse, residual, optimize=True))
-    return beta, residual, weight
+        beta = np.linalg.solve(gram, weight @ along / weight.sum())
+        weight = (freedom + count) / (freedom + own - 2 * along @ beta + beta @ gram @ beta)
+    return beta, weight
 
 
 def _log_density(root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"], freedom: float) -> Float[np.ndarray, " m"]:
@@ -129,7 +131,9 @@ def _log_density(root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"]
     return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
-def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, " m"]:
+def log_likelihood(
+    prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, " m"]:
     """Log density of y of each map under a prior, nats."""
     total = np.zeros(logs.shape[1])
     for k, residual in enumerate(logs - prior.mean(cells, up)[:, None]):

@@ -12,7 +12,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
 from factorlib.light.prior import read_light_prior
 
-COUNT = 40
+COUNT = 25
 
 
 @pytest.fixture
