@@ -89,6 +89,10 @@ class JointProblem(msgspec.Struct, frozen=True):
         """The same observations, as if meshes cast no shadows."""
         return msgspec.structs.replace(self, blocks=[block.without_shadows() for block in self.blocks])
 
+    def without_bounces(self) -> JointProblem:
+        """The same observations, as if surfaces sent no light to each other."""
+        return msgspec.structs.replace(self, blocks=[block.without_bounces() for block in self.blocks])
+
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""
         return msgspec.structs.replace(self, blocks=[block.with_none_held_out() for block in self.blocks])
