@@ -20,10 +20,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
-from factorlib.urm.observations import MET_BINS, UNMET, Observations
+from factorlib.urm.observations import Observations
 
 ROUGHNESS = 0.35  # of the highlight through which hidden surfaces are seen, whatever the material: of most materials a few tenths
 PSEUDO, NEARNESS = 3.0, 4.0
@@ -50,12 +51,12 @@ def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Flo
 
 def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
     """B of every code of `Observations.met` in one photo, from its observations; last what an unknown surface sends."""
-    normal, bins = unit(shown.normal), fibonacci_sphere(MET_BINS)
+    normal, bins = unit(shown.normal), fibonacci_sphere(BINS)
     everything = np.average(radiance, axis=0, weights=shown.weight)
-    found = np.tile(everything, (len(shown.materials) * MET_BINS + 1, 1))
+    found = np.tile(everything, (len(shown.materials) * BINS + 1, 1))
     for m in np.unique(shown.material):
         of = shown.material == m
-        codes = slice(m * MET_BINS, (m + 1) * MET_BINS)
+        codes = slice(m * BINS, (m + 1) * BINS)
         found[codes] = _by_bin(normal[of] @ bins.T, radiance[of], shown.weight[of].astype(float))
     return found
 

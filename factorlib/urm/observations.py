@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
@@ -32,10 +32,9 @@ VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
     "azimuth about z from x toward y = k π (3 − √5)"
 )
-MET_BINS, UNMET = 64, 65535  # directions that normals are told apart by; what is met nowhere, or not known
 MET = (
-    f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in `materials` · {MET_BINS} + "
-    f"number of the direction of {MET_BINS}, placed as those of `visibility`, that is nearest to its normal; {UNMET}: none, or not known"
+    f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in `materials` · {BINS} + "
+    f"number of the direction of {BINS}, placed as those of `visibility`, that is nearest to its normal; {UNMET}: none, or not known"
 )
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
@@ -60,7 +59,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of surfaces that hide directions (`met_codes`); only beside `visibility`
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of surfaces that hide directions (factorlib.geometry.met); only beside `visibility`
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
 
     def __len__(self) -> int:
@@ -82,17 +81,6 @@ WIDE = {"visibility": np.dtype("u1"), "met": np.dtype("<u2")}  # K values a row,
 NOTHING = {"visibility": 255, "met": UNMET}  # of observations that see everything
 DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
           "x": "i4", "y": "i4", "weight": "f4"}  # fmt: skip
-
-
-def met_codes(material: Int[np.ndarray, " n"], normal: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
-    """Codes of surfaces, by number of the material and unit normal (camera frame, on the side that is met); UNMET where material < 0.
-
-    >>> met_codes(np.array([0, 2, -1]), np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])).tolist()
-    [0, 128, 65535]
-    """
-    nearest = np.argmax(normal @ fibonacci_sphere(MET_BINS).T, axis=1)
-    known = (material >= 0) & (material < UNMET // MET_BINS)
-    return np.where(known, material * MET_BINS + nearest, UNMET).astype(np.uint16)
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
@@ -140,7 +128,7 @@ def _check(observations: Observations) -> None:
         if observations.visibility is None or observations.visibility.shape != observations.met.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
         known = observations.met[observations.met != UNMET]
-        if len(known) and known.max() >= MET_BINS * len(observations.materials):
+        if len(known) and known.max() >= BINS * len(observations.materials):
             raise ValueError("column 'met' points beyond the names of the metadata")
 
 

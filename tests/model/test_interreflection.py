@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.solve.problems import MATERIALS, block, random_light
+from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
@@ -17,7 +18,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.normal_equations import energy_equations, normal_equations
 from factorlib.solve.weights import fitted_illumination
-from factorlib.urm.observations import UNMET, Observations, concatenate, met_codes
+from factorlib.urm.observations import Observations, concatenate
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=3.0, prior=0.0)
