@@ -66,6 +66,11 @@ class JointProblem(msgspec.Struct, frozen=True):
         return float(losses.mean()) if len(losses) else 0.0
 
     @property
+    def has_bounces(self) -> bool:
+        """Whether it is known what surfaces send to each other in any block."""
+        return any(block.bounced is not None for block in self.blocks)
+
+    @property
     def none_held_out(self) -> bool:
         """Whether all observations are fitted, so that none can choose a model."""
         return not any(block.held_out.any() for block in self.blocks)
