@@ -38,7 +38,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import Solution, models, solve
+from factorlib.solve.bundle import Solution, solve
 from factorlib.solve.descent import Descent, descend
 from factorlib.solve.history import Run
 from factorlib.solve.insertion import blurred, pruned
@@ -99,7 +99,7 @@ def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dic
 
 def shown(solution: Solution, block: Block, operator: Operator) -> Block:
     """With what the solve took of visibility."""
-    return models(JointProblem([block], operator), "on" if solution.shadows.kept else "off").popitem()[1].blocks[0]
+    return solution.shown(JointProblem([block], operator)).blocks[0]
 
 
 def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> np.ndarray:

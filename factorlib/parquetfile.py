@@ -18,7 +18,7 @@ from factorlib.reading import check_plain, reading
 from factorlib.wholefile import writing
 
 MOST_ROWS = 100_000_000
-MOST_BYTES = 4096  # of one value: a visibility has as many directions
+MOST_BYTES = 8192  # of one value: what hides each of as many directions as visibility may have
 
 
 def read_columns(

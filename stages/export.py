@@ -19,7 +19,7 @@ from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
-from factorlib.export.mitsuba import Environment, Shape, View, write_scene
+from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
@@ -69,14 +69,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         write_glb(out / f"{name}.glb", files.mesh(name, mesh, {}), names, materials)
     progress(3, 4, "scenes")
-    poses = read_poses(inputs["align"] / "poses.json")
+    poses, max_depth = read_poses(inputs["align"] / "poses.json"), ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, light in lights.items():
         view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
         shapes = [
             shape for obj in objects[photo].objects for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
         ]
         environment = _environment(out, photo, light, lobes[light.illumination], np.array(exposures.get(photo, [1.0] * 3)), params)
-        write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment)
+        write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment, max_depth)
     progress(4, 4)
 
 

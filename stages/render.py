@@ -17,16 +17,17 @@ from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.light.lobes import Lobes
+from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.ball import ball, ball_normals, observed_cells
 from factorlib.render.reflect import TAIL, Reflector
-from factorlib.render.resynthesis import resynthesised
+from factorlib.render.resynthesis import Surroundings, resynthesised
 from factorlib.results.exposures import read_exposures
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Model, Reflectance, in_order, read_materials
+from factorlib.results.materials import Gauge, Model, Reflectance, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
-from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.observations import read_observations
 
 log = logging.getLogger("factorlib.render")
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
@@ -50,7 +51,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render a photo again, and balls and reflectance maps of every material in its light."""
     name, names = inputs.photo, inputs.facts["dataset.materials"]
     file = inputs["export"] / "materials.json"
-    materials = in_order(read_materials(file), names, file)
+    exported = read_materials(file)
+    materials = in_order(exported, names, file)
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light_of_photo(inputs), params.tail)
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
@@ -61,7 +63,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     model = read_materials(inputs["solve"] / "materials.json").model
     tone = model.tone.get(name)
-    again = resynthesised(reflector, materials, photo, geometry, report, shadowed(inputs, model))
+    again = resynthesised(reflector, materials, photo, geometry, report, surroundings(inputs, model, exported.gauge))
     _write(out / "resynthesis" / name, shown(again, tone.exponent, tone.pivot) if tone else again, exposure)
     seen = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
@@ -73,9 +75,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(total, total, name)
 
 
-def shadowed(inputs: Inputs, model: Model) -> Observations | None:
-    """The photo's observations, where the solve took their visibility into account."""
-    return read_observations(inputs["urm"] / f"{inputs.photo}.parquet") if model.self_shadowing else None
+def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | None:
+    """What the solve took into account of the photo's visibility, and of what its surfaces send to each other.
+
+    gauge: of the materials that are rendered; its factor went out of the lights, but not out of what the photo shows
+    """
+    if not model.self_shadowing:
+        return None
+    seen = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
+    sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None
+    return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
 
 
 def light_of_photo(inputs: Inputs) -> Lobes:

@@ -53,7 +53,7 @@ class Params(Choices, frozen=True, forbid_unknown_fields=True):
     """Those of the bundle solver, those of the paper's solver (paper_…), and what both take.
 
     The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
-    from it, and whether they have specular parts, and whether there are shadows, stays as it was decided there.
+    from it, and whether they have specular parts, whether there are shadows, and whether surfaces light each other, stays as it was decided there.
     """
 
     solver: Literal["bundle", "paper"] = "bundle"
@@ -122,9 +122,10 @@ def _solved(params: Params, problem: JointProblem, earlier: Earlier | None, inpu
         return solve_as_the_paper(problem, len(names), paper, of_subsets(progress))
     bundle = Bundle(**{name: getattr(params, name) for name in Choices.__struct_fields__})
     start = from_earlier(earlier, names, bundle.specular) if earlier else from_nothing(len(names))
-    if earlier and bundle.self_shadowing == "auto" and earlier.self_shadowing:
-        bundle = msgspec.structs.replace(bundle, self_shadowing=earlier.self_shadowing)
-    report = of_rounds(progress, bundle, len(models(problem, bundle.self_shadowing)))
+    for choice in ("self_shadowing", "interreflection"):
+        if earlier and getattr(bundle, choice) == "auto" and getattr(earlier, choice):
+            bundle = msgspec.structs.replace(bundle, **{choice: getattr(earlier, choice)})
+    report = of_rounds(progress, bundle, len(models(problem, bundle)))
     journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
     return solve(problem, start, Run(bundle, report, journal=journal))
 

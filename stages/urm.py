@@ -1,6 +1,7 @@
 """Unstructured reflectance map: every pixel whose material and normal are known becomes an observation, or a sample of them.
 
-What an observation sees past its own mesh and the photo's other objects stands in its `visibility`.
+What an observation sees past its own mesh and the photo's other objects stands in its `visibility`, and which
+surfaces hide the rest in its `met`.
 """
 
 import logging
@@ -10,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.geometry.visibility import Occluders, visibility
+from factorlib.geometry.visibility import Occluders, sight
 from factorlib.images.exr import read_exr
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
@@ -65,8 +66,8 @@ def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, 
     """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
     found = read_photo_poses(inputs["align"] / f"{inputs.photo}.json")
     camera, occluders = found.camera.camera(shape[1], shape[0]), occluders_of(inputs, found.objects)
-    seen_past = visibility(occluders, camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
-    return msgspec.structs.replace(seen, visibility=seen_past)
+    past = sight(occluders, camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
+    return msgspec.structs.replace(seen, visibility=past.visibility, met=past.met) if past else seen
 
 
 def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:

@@ -8,10 +8,10 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from factorlib.diagnose.uncertainty import GAUGE, StandardErrors
+from factorlib.diagnose.uncertainty import ABSOLUTE, GAUGE, StandardErrors
 from factorlib.light.lobes import Lobes
 from factorlib.model.components import connected_components
-from factorlib.model.gauge import RULE
+from factorlib.model.gauge import DETERMINED, RULE
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
@@ -44,11 +44,13 @@ class Answer(msgspec.Struct, frozen=True):
         solved = {name: table.solved(table.Reflectance(*row), stderr[name]) for name, row in zip(self.names, materials, strict=True)}
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
-        return table.MaterialTable(solved, table.Gauge(RULE, component, GAUGE), self.model())
+        absolute = self.solution.interreflection.kept
+        gauge = table.Gauge(RULE + DETERMINED * absolute, component, GAUGE + ABSOLUTE * absolute)
+        return table.MaterialTable(solved, gauge, self.model())
 
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""
-        return Uncertainty(errors.deviation, _errors(self.names, errors), GAUGE)
+        return Uncertainty(errors.deviation, _errors(self.names, errors), GAUGE + ABSOLUTE * self.solution.interreflection.kept)
 
     def lights(self) -> dict[str, Lobes]:
         """By illumination, in scene radiance."""
@@ -67,7 +69,6 @@ class Answer(msgspec.Struct, frozen=True):
     def model(self) -> table.Model:
         """What was decided of the model, and by what."""
         names, solution, blocks = self.names, self.solution, self.problem.blocks
-        shadows = {"with": solution.shadows.held_out_loss_with, "without": solution.shadows.held_out_loss_without}
         return table.Model(
             solver=self.solver,
             lobes={block.name: len(light) for block, light in zip(blocks, solution.point.lights, strict=True)},
@@ -76,7 +77,9 @@ class Answer(msgspec.Struct, frozen=True):
             specular={name: not bool(solution.lambertian[m]) for m, name in enumerate(names)},
             specular_chosen_by=_by_name(names, solution.specular),
             self_shadowing=solution.shadows.kept,
-            self_shadowing_chosen_by={f"held_out_loss_{name}": loss for name, loss in shadows.items() if loss is not None},
+            self_shadowing_chosen_by=_losses(solution.shadows),
+            interreflection=solution.interreflection.kept,
+            interreflection_chosen_by=_losses(solution.interreflection),
             tone=self.tone(),
             tone_chosen_by=_by_name([block.name for block in blocks], solution.tone),
             started_from=self.started_from(),
@@ -105,6 +108,12 @@ def _rows(materials: Materials) -> list[tuple[list[float], list[float], float]]:
 
 def _errors(names: Sequence[str], errors: StandardErrors) -> dict[str, table.StandardErrors]:
     return {name: table.StandardErrors(*row) for name, row in zip(names, _rows(errors.materials), strict=True)}
+
+
+def _losses(evidence: Evidence) -> dict[str, float]:
+    """Of the models that were tried."""
+    losses = {"with": evidence.held_out_loss_with, "without": evidence.held_out_loss_without}
+    return {f"held_out_loss_{name}": loss for name, loss in losses.items() if loss is not None}
 
 
 def _by_name(names: Sequence[str], evidence: Sequence[Evidence]) -> dict[str, table.Decision]:

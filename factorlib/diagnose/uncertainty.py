@@ -18,6 +18,7 @@ treats as outliers are parts of the light that the lobes do not show, and how fa
 The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
 Here the sum of diffuse and specular reflectance over a component's materials is fixed in each channel: with g the
 direction of that factor and h the gradient of the fixed sum, covariances are projected by P = I − g hᵀ / (hᵀ g).
+A component in which surfaces light each other has no free factor: its errors are of absolute reflectances.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
 from factorlib.model.components import connected_components
+from factorlib.model.gauge import is_free
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
@@ -46,6 +48,7 @@ from factorlib.solve.arrow import ArrowSystem
 from factorlib.solve.normal_equations import NormalEquations, normal_equations
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
+ABSOLUTE = "; in components with interreflection nothing is held fixed"
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
 LEAST_DEVIATION = 1e-4  # of the noise model: what a single observation is explained to says nothing
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
@@ -102,9 +105,9 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
 
 
 def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]) -> Float[np.ndarray, "k k"]:
-    """The covariance where the sum of each component and channel is fixed."""
-    for members, _ in connected_components(blocks, len(materials)):
-        for channel in range(3):
+    """The covariance where the sum of each component and channel that has a free factor is fixed."""
+    for members, illuminations in connected_components(blocks, len(materials)):
+        for channel in range(3) if is_free(blocks, illuminations) else ():
             project = _gauge_projection(materials, members, channel)
             covariance = project @ covariance @ project.T
     return covariance

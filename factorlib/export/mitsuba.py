@@ -4,8 +4,8 @@ Frame      The camera frame turned y-up, camera at the origin: `YUP_FROM_CAMERA 
 Camera     Mitsuba's principal point offset counts against the axes of the picture: (W/2 − c_x)/W, (H/2 − c_y)/H.
 Material   k_d/π + k_s D G/(4 …) is a mixture, weight w = max k_s / (max k_d + max k_s), of `diffuse` with k_d/(1−w) and
            `roughconductor` (material none: no Fresnel) with k_s/w.  w = 0, w = 1 and black have no mixture.
-Light      As it was solved for: seen directly, without bounces between objects (`max_depth` 2).
-           `mitsuba -D max_depth=-1 scene.xml` traces them all; `-D spp=…` sets the samples per pixel.
+Light      As it was solved for: seen directly, without bounces between objects (`max_depth` 2), or with all of them (−1).
+           `mitsuba -D max_depth=-1 scene.xml` traces them in any case; `-D spp=…` sets the samples per pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
 
 VERSION = "3.0.0"
-DEFAULTS = {"spp": 256, "max_depth": 2}
+SAMPLES, DIRECT, ALL_BOUNCES = 256, 2, -1
 
 
 class View(msgspec.Struct, frozen=True):
@@ -56,10 +56,12 @@ class Environment(msgspec.Struct, frozen=True):
     camera_from_light: Float[np.ndarray, "3 3"]
 
 
-def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment) -> str:
+def scene_xml(
+    view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT
+) -> str:
     """The scene as XML; `materials` are those that shapes name, by name."""
     scene = ET.Element("scene", version=VERSION)
-    for name, value in DEFAULTS.items():
+    for name, value in {"spp": SAMPLES, "max_depth": max_depth}.items():
         ET.SubElement(scene, "default", name=name, value=str(value))
     integrator = ET.SubElement(scene, "integrator", type="path")
     _values(integrator, integer={"max_depth": "$max_depth"}, boolean={"hide_emitters": "true"})
@@ -73,9 +75,16 @@ def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflecta
     return ET.tostring(scene, encoding="unicode") + "\n"
 
 
-def write_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment) -> None:
+def write_scene(
+    path: str | Path,
+    view: View,
+    shapes: Sequence[Shape],
+    materials: dict[str, Reflectance],
+    light: Environment,
+    max_depth: int = DIRECT,
+) -> None:
     """Write the text of `scene_xml` to `path`."""
-    write_text(path, scene_xml(view, shapes, materials, light))
+    write_text(path, scene_xml(view, shapes, materials, light, max_depth))
 
 
 def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:

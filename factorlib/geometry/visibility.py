@@ -7,6 +7,8 @@ normal's horizon are not cast and count as seen; nothing is reflected from there
 
 Of more than `most_points` points an evenly spread subset is cast, and the others take the visibility of the nearest cast
 one, near in place and in normal alike.
+
+Of a ray that is not free it is also kept which surface it meets, as a code of `factorlib.geometry.met`.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 import open3d as o3d
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from scipy.spatial import cKDTree
 
 from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import Mesh, area_vectors
 
@@ -38,6 +41,21 @@ class Points(msgspec.Struct, frozen=True):
     found: Bool[np.ndarray, " n"]
 
 
+class Sight(msgspec.Struct, frozen=True):
+    """What n points see of k directions.
+
+    visibility  255 where a direction is free of the objects, 0 where not
+    met         codes of the surfaces that are met
+    """
+
+    visibility: UInt8[np.ndarray, "n k"]
+    met: UInt16[np.ndarray, "n k"]
+
+    def take(self, rows: Int[np.ndarray, " m"]) -> Sight:
+        """Of the points `rows`."""
+        return Sight(self.visibility[rows], self.met[rows])
+
+
 class Occluders:
     """The posed objects of one photo as one scene."""
 
@@ -49,6 +67,7 @@ class Occluders:
         vertices = np.vstack(vertices)
         self.normal = area_vectors(vertices, faces)
         self.normal /= np.maximum(np.linalg.norm(self.normal, axis=1, keepdims=True), 1e-300)
+        self.material = np.concatenate([mesh.face_label for mesh in meshes]).astype(np.int64) - 1
         self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
         used = vertices[np.unique(faces)]
         self.centre = (used.min(0) + used.max(0)) / 2
@@ -71,23 +90,35 @@ class Occluders:
 
     def seen_from(
         self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]
-    ) -> UInt8[np.ndarray, "n k"]:
-        """255 where `directions` (camera frame, unit) are free of the objects, 0 where not."""
+    ) -> Sight:
+        """What the points see along `directions` (camera frame, unit)."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
+        met = np.full(seen.shape, UNMET, np.uint16)
         for i in range(0, len(seen), ROWS):
             rows = slice(i, i + ROWS)
             row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
             normal, place, along = points.face_normal[rows][row], points.place[rows][row], directions[k]
             along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
-            seen[rows][row, k] = np.where(self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy(), 0, 255)
-        return seen
+            hidden = self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy()
+            seen[rows][row, k] = np.where(hidden, 0, 255)
+            met[rows][row[hidden], k[hidden]] = self._codes(place[hidden], along[hidden])
+        return Sight(seen, met)
+
+    def _codes(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
+        """Of what rays meet first."""
+        hits = self.scene.cast_rays(self._rays(start, along), nthreads=1)
+        found = np.isfinite(hits["t_hit"].numpy())
+        face = np.where(found, hits["primitive_ids"].numpy(), 0).astype(np.int64)
+        normal = self.normal[face]
+        toward = np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
+        return met_codes(np.where(found, self.material[face], -1), toward)
 
     def _rays(self, start: np.ndarray, along: np.ndarray) -> o3d.core.Tensor:
         """In the scene's frame, where `along` keeps its length: distances come back in units of the radius."""
         return o3d.core.Tensor(np.column_stack([(start - self.centre) / self.radius, along]).astype(np.float32))
 
 
-def visibility(
+def sight(
     occluders: Occluders,
     camera: Camera,
     x: Int[np.ndarray, " n"],
@@ -95,17 +126,17 @@ def visibility(
     shading_normal: Float[np.ndarray, "n 3"],
     directions: int,
     most_points: int,
-) -> UInt8[np.ndarray, "n k"] | None:
+) -> Sight | None:
     """What the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all."""
     points = occluders.points_under(camera, x, y)
     cast = spread_subset(x, y, most_points)
     some = Points(*(getattr(points, name)[cast] for name in points.__struct_fields__))
     seen = occluders.seen_from(some, shading_normal[cast], fibonacci_sphere(directions))
-    if (seen == 255).all():
+    if (seen.visibility == 255).all():
         return None
     if len(cast) == len(x):
         return seen
-    return seen[nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)]
+    return seen.take(nearest(points.place[cast], shading_normal[cast], points.place, shading_normal))
 
 
 def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:

@@ -17,6 +17,8 @@ class Block(msgspec.Struct, frozen=True):
     held_out    observations that choose between models and are not fitted
     visibility  how much of each of k directions an observation sees, 0 (nothing) to 255 (all); None: all see everything
     directions  the k directions of `visibility`, in the block's frame, for each of the f photos
+    bounced     what hidden directions send, by the cosine (RGB) and by a highlight (RGB): G_d and G_s of `factorlib.model.interreflection`,
+                in the block's unit; None: nothing
     """
 
     name: str
@@ -32,14 +34,16 @@ class Block(msgspec.Struct, frozen=True):
     held_out: Bool[np.ndarray, " n"]
     visibility: UInt8[np.ndarray, "n k"] | None = None
     directions: Float[np.ndarray, "f k 3"] | None = None
+    bounced: Float[np.ndarray, "n 6"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """The observations `rows` (numbers or a mask) alone."""
-        visibility = None if self.visibility is None else self.visibility[rows]
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, visibility=visibility)
+        where_hidden = {name: getattr(self, name) for name in ("visibility", "bounced")}
+        kept = {name: None if values is None else values[rows] for name, values in where_hidden.items()}
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, **kept)
 
     def fitted(self) -> Block:
         """The observations that are not held out."""
@@ -60,7 +64,11 @@ class Block(msgspec.Struct, frozen=True):
 
     def without_shadows(self) -> Block:
         """The same observations, as if nothing hid anything."""
-        return msgspec.structs.replace(self, visibility=None)
+        return msgspec.structs.replace(self, visibility=None, bounced=None)
+
+    def without_bounces(self) -> Block:
+        """The same observations, as if what hides the light were black."""
+        return msgspec.structs.replace(self, bounced=None)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""

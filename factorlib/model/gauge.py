@@ -1,5 +1,7 @@
 """The gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
 
+Where surfaces light each other (interreflection), what they send is known and no factor is free: such a component stays as it is.
+
 Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
        light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
        lights of E_ic, each light counting alike.  In logarithms the rule does not depend on the gauge it starts from.
@@ -29,6 +31,7 @@ RULE = (
     "per connected component: channel factors make the geometric means over lights of their summed lobe energies grey (after the prior of Wang et al.); "
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
+DETERMINED = "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
 
 
 def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
@@ -38,7 +41,7 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
-        if not own:
+        if not own or not is_free(blocks, illuminations):
             continue
         rows = list(members)
         factor = 1 / _greying([lights[i] for i in own])  # multiplies reflectances
@@ -47,6 +50,11 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
         for i in own:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
     return Point(Materials(diffuse, specular, materials.roughness), lights)
+
+
+def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
+    """Whether the component of these illuminations has a free factor."""
+    return all(block.bounced is None for block in blocks if block.name in illuminations)
 
 
 def _greying(lights: Sequence[Light]) -> Float[np.ndarray, "3"]:

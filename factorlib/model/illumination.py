@@ -1,9 +1,9 @@
 """One illumination of the joint problem at a point: what its photos show, and what the model says they should.
 
-    predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc),     B_ipc = k_d,c D_ip + k_s,c S_ip,  τ the photo's tone curve
+    predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc + G_ic),   B_ipc = k_d,c D_ip + k_s,c S_ip,   G_ic = k_d,c G_d,ic + k_s,c G_s,ic,   τ the tone curve
     residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 
-D and S are the responses of `factorlib.model.responses`.  These two modules are where a new physical effect is added.
+D and S are the responses of `factorlib.model.responses`, G is what other surfaces send (`factorlib.model.interreflection`).  These two modules are where a new physical effect is added.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from factorlib.model.jacobian import Linearised, linearised
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.responses import Responses, Rows, material_slices, radiance_of, responses, unit_values
+from factorlib.model.responses import Responses, Rows, bounced_of, material_slices, radiance_of, responses, unit_values
 from factorlib.model.tone import slope_at, toned
 from factorlib.reflection.operator import Operator
 
@@ -46,7 +46,7 @@ class Illumination(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, light=light)
 
     def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Σ_p D w and Σ_p S w at `rows`: radiance of a material of that roughness with k_d = 1 and with k_s = 1, before exposure."""
+        """Σ_p D w and Σ_p S w at `rows`: radiance of a material of that roughness with k_d = 1 and with k_s = 1, before exposure, without bounces."""
         parts = unit_values(self.block, rows, self.light.unit_lobes, roughness, self.operator)
         diffuse, specular = (part @ self.light.weight for part in parts)
         return diffuse, specular
@@ -57,6 +57,7 @@ class Illumination(msgspec.Struct, frozen=True):
         for m, rows in material_slices(self.block):
             parts = self.lit(rows, float(self.materials.roughness[m]))
             linear[rows] = radiance_of(exposure[rows], self.materials.diffuse[m], self.materials.specular[m], *parts)
+            linear[rows] += bounced_of(self.block, rows, self.materials, m)
         return toned(linear, self.light, self.block.photo)
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:

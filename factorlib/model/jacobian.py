@@ -74,8 +74,11 @@ def linearised(block: Block, light: Light, materials: Materials, some: Responses
         columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / unit_energy]
         linear = product(basis, weight[:, c])
         lit = [product(r[name], weight[:, c]) for name in ("diffuse", "specular", "specular_by_roughness")]
-        own = [lit[0], lit[1], ks * lit[2]]
-        seen = whitened(block, light, rows, c, linear, loss)
+        own, shown = [lit[0], lit[1], ks * lit[2]], linear
+        if block.bounced is not None:
+            sent = [torch.from_numpy(block.bounced[rows, k]) for k in (c, 3 + c)]
+            own, shown = [own[0] + sent[0], own[1] + sent[1], own[2]], linear + kd * sent[0] + ks * sent[1]
+        seen = whitened(block, light, rows, c, shown, loss)
         jacobian = torch.cat([*columns, photos[:, 1:] * linear[:, None], torch.stack(own, 1)], 1) * seen.rising
         jacobian = torch.cat([jacobian, photos * seen.by_tone], 1) if len(light.log_tone) else jacobian
         places = _places(light, len(materials), m, c, p)

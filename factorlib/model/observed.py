@@ -12,6 +12,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.cells import HELD_OUT_CELL, held_out_by_cells
+from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.urm.observations import Observations
 
@@ -74,7 +75,7 @@ def _block(seen: Observations, name: str, how: _How) -> Block:
     held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, how.held_out, how.seed)
     return Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), how.noise.precision(scaled, seen.weight),
-        seen.material.astype(np.int64), local, held_out, *_visibility(seen, photos, how.world_from_camera),
+        seen.material.astype(np.int64), local, held_out, *_visibility(seen, photos, how.world_from_camera), _bounced(seen, scaled),
     )  # fmt: skip
 
 
@@ -87,6 +88,12 @@ def _visibility(
     directions = fibonacci_sphere(seen.visibility.shape[1])
     frames = [np.eye(3) if rotations.get(photo) is None else np.asarray(rotations[photo], dtype=float) for photo in photos]
     return seen.visibility, np.stack([directions @ frame.T for frame in frames])
+
+
+def _bounced(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"] | None:
+    """None where no observation is hidden from anything."""
+    sent = bounced_light(seen, radiance)
+    return sent if sent is not None and sent.any() else None
 
 
 def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:

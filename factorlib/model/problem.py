@@ -66,6 +66,11 @@ class JointProblem(msgspec.Struct, frozen=True):
         return float(losses.mean()) if len(losses) else 0.0
 
     @property
+    def has_bounces(self) -> bool:
+        """Whether it is known what surfaces send to each other in any block."""
+        return any(block.bounced is not None for block in self.blocks)
+
+    @property
     def none_held_out(self) -> bool:
         """Whether all observations are fitted, so that none can choose a model."""
         return not any(block.held_out.any() for block in self.blocks)
@@ -88,6 +93,10 @@ class JointProblem(msgspec.Struct, frozen=True):
     def without_shadows(self) -> JointProblem:
         """The same observations, as if meshes cast no shadows."""
         return msgspec.structs.replace(self, blocks=[block.without_shadows() for block in self.blocks])
+
+    def without_bounces(self) -> JointProblem:
+        """The same observations, as if surfaces sent no light to each other."""
+        return msgspec.structs.replace(self, blocks=[block.without_bounces() for block in self.blocks])
 
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""

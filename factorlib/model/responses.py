@@ -6,6 +6,10 @@
 From them follows radiance: at exposure e, a material k_d, k_s under lobes of weight w shows, before its photo's tone curve,
 
     y_ic = e_i (k_d,c Σ_p D_ip w_pc + k_s,c Σ_p S_ip w_pc)                                                    (1)
+
+and beside it what other surfaces send there, which the photo itself shows, so without e (interreflection):
+
+    k_d,c G_d,ic + k_s,c G_s,ic                                                                               (2)
 """
 
 from __future__ import annotations
@@ -33,6 +37,14 @@ Rows = slice | Int[np.ndarray, " n"]
 def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular: A) -> A:
     """Equation (1) [n, 3];  exposure [n, 1];  diffuse, specular: k_d, k_s [3];  by_…: Σ_p D w and Σ_p S w [n, 3]."""
     return exposure * (diffuse * by_diffuse + specular * by_specular)
+
+
+def bounced_of(block: Block, rows: Rows, materials: Materials, m: int) -> Float[np.ndarray, "n 3"] | float:
+    """Equation (2) at `rows`, which show material m; 0 for a block without bounces."""
+    if block.bounced is None:
+        return 0.0
+    sent = block.bounced[rows]
+    return materials.diffuse[m] * sent[:, :3] + materials.specular[m] * sent[:, 3:]
 
 
 def cosines(normal: A, view: A, axis: A) -> tuple[A, A, A]:

@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, face_normals, unit
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.geometry.visibility import Occluders, visibility
+from factorlib.geometry.visibility import Occluders, sight
 from factorlib.model.blocks import Block
 from factorlib.model.noise import Noise
 from factorlib.urm.extract import GRAZING
@@ -121,7 +121,7 @@ class View:
 
     def _shadowed(self, block: Block, camera: Camera, seen: Seen, poses: Sequence[Pose]) -> Block:
         meshes, directions = [caster.mesh for caster in self.casters], fibonacci_sphere(self.shadows)
-        found = visibility(Occluders(meshes, poses), camera, self.pixels.x, self.pixels.y, seen.normal, self.shadows, len(self.pixels))
-        return block if found is None else msgspec.structs.replace(block, visibility=found, directions=directions[None])
+        found = sight(Occluders(meshes, poses), camera, self.pixels.x, self.pixels.y, seen.normal, self.shadows, len(self.pixels))
+        return block if found is None else msgspec.structs.replace(block, visibility=found.visibility, directions=directions[None])
 
 

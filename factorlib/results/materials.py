@@ -99,7 +99,7 @@ class Model(msgspec.Struct, frozen=True):
     lobes:           number of lobes by illumination
     held_out_loss:   after each round
     specular:        whether a material has a specular part
-    self_shadowing_chosen_by: the held-out loss of each model that was tried
+    self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
     """
 
@@ -111,6 +111,8 @@ class Model(msgspec.Struct, frozen=True):
     specular_chosen_by: dict[str, Decision] = {}
     self_shadowing: bool = False
     self_shadowing_chosen_by: dict[str, float] = {}
+    interreflection: bool = False
+    interreflection_chosen_by: dict[str, float] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     started_from: Started | UnsetType = UNSET

@@ -27,12 +27,21 @@ class Earlier(msgspec.Struct, frozen=True):
     @property
     def self_shadowing(self) -> str | None:
         """`on` or `off`, as it was decided, where both were tried; else None."""
-        return ("on" if self.table.model.self_shadowing else "off") if len(self.table.model.self_shadowing_chosen_by) == 2 else None
+        return _decided(self.table.model.self_shadowing, self.table.model.self_shadowing_chosen_by)
+
+    @property
+    def interreflection(self) -> str | None:
+        """As `self_shadowing`."""
+        return _decided(self.table.model.interreflection, self.table.model.interreflection_chosen_by)
 
     def beside(self, relative: dict[str, float]) -> Earlier:
         """With exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
         exposures = {photo: tuple(e / relative.get(photo, 1.0) for e in channels) for photo, channels in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)
+
+
+def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
+    return ("on" if kept else "off") if len(chosen_by) == 2 else None
 
 
 def read_earlier(folder: Path) -> Earlier:

@@ -2,6 +2,8 @@
 
     rounds    find the lobes on a sample of the observations.  Where meshes hide a part of the light and self_shadowing = auto, they are
               run with shadows and without, and the model that explains the held-out pixels better goes on
+    bounces   Where shadows go on and interreflection = auto, the light that surfaces send to each other is added, if held-out pixels
+              are explained better with it after equally many iterations; further rounds follow
     choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
     polish    brings the answer to its optimum, first on many observations, then on all
 """
@@ -24,9 +26,10 @@ from factorlib.solve.descent import Descent, descend
 from factorlib.solve.evidence import Evidence, decide
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
+from factorlib.solve.options import Choices
 from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
-from factorlib.solve.thresholds import SHADOWS
+from factorlib.solve.thresholds import INTERREFLECTION, SHADOWS
 
 MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
 
@@ -36,7 +39,7 @@ class Solution(msgspec.Struct, frozen=True):
 
     history     every accepted point on the way;  loss: the loss function that was lowered last
     lambertian  materials without specular part
-    shadows     whether visibility was used, with its evidence
+    shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
     specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
     """
 
@@ -45,12 +48,20 @@ class Solution(msgspec.Struct, frozen=True):
     loss: Loss
     lambertian: Bool[np.ndarray, " m"]
     shadows: Evidence = Evidence(False)
+    interreflection: Evidence = Evidence(False)
     specular: list[Evidence] = []
     tone: list[Evidence] = []
 
     def shown(self, problem: JointProblem) -> JointProblem:
-        """The problem that the answer solves: with shadows or without, with the last loss."""
-        return (problem if self.shadows.kept else problem.without_shadows()).with_loss(self.loss)
+        """The problem that the answer solves: with shadows and bounces or without, with the last loss."""
+        return _of_model(problem, self.shadows.kept, self.interreflection.kept).with_loss(self.loss)
+
+
+class Bounces(msgspec.Struct, frozen=True):
+    """The fit with bounces or without, and what decided."""
+
+    fit: Fit
+    evidence: Evidence
 
 
 class Polished(msgspec.Struct, frozen=True):
@@ -67,11 +78,11 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     earlier solution;  run: options, reports and journal; None: the defaults
     """
     run, fits = run or Run(), dict[str, Fit]()
-    for name, model in models(problem, run.options.self_shadowing).items():
+    for name, model in models(problem, run.options).items():
         fits[name] = best_round(model, start, run, f"rounds {name}", list(fits.values()))
     shadows = _shadows(fits)
-    problem = problem if shadows.kept else problem.without_shadows()
-    fit = fits["with" if shadows.kept else "without"]
+    bounces = with_bounces_chosen(problem, fits["with"], run) if shadows.kept else Bounces(fits["without"], Evidence(False))
+    problem, fit = _of_model(problem, shadows.kept, bounces.evidence.kept), bounces.fit
     curves = with_tone_chosen(problem, fit, run)
     if any(of_light.kept for of_light in curves.evidence):  # what the curves explain had stopped the rounds early
         fit = further_rounds(problem, fit, curves.point, run)
@@ -80,14 +91,23 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     found = end.point.materials
     materials = Materials(found.diffuse, np.where(chosen.lambertian[:, None], 0.0, found.specular), found.roughness)
     point = Point(materials, end.point.lights)
-    return Solution(point, end.history, fit.loss, chosen.lambertian, shadows, chosen.evidence, curves.evidence)
+    return Solution(point, end.history, fit.loss, chosen.lambertian, shadows, bounces.evidence, chosen.evidence, curves.evidence)
 
 
-def models(problem: JointProblem, self_shadowing: str) -> dict[str, JointProblem]:
-    """The models to choose from: `with` self-shadowing, `without`, or both; `without` alone where nothing is hidden."""
-    shadows = self_shadowing != "off" and any(block.visibility is not None for block in problem.blocks)
-    found = {"without": problem.without_shadows()} if not shadows or self_shadowing == "auto" else {}
-    return found | ({"with": problem} if shadows else {})
+def models(problem: JointProblem, choices: Choices) -> dict[str, JointProblem]:
+    """The models that rounds start with: `with` self-shadowing, `without`, or both; `without` alone where nothing is hidden.
+
+    `with` has bounces where they are `on`; else they are decided from its best round (`with_bounces_chosen`)
+    """
+    shadows = choices.self_shadowing != "off" and any(block.visibility is not None for block in problem.blocks)
+    found = {"without": problem.without_shadows()} if not shadows or choices.self_shadowing == "auto" else {}
+    return found | ({"with": _of_model(problem, True, choices.interreflection == "on")} if shadows else {})
+
+
+def _of_model(problem: JointProblem, shadows: bool, bounces: bool) -> JointProblem:
+    if not shadows:
+        return problem.without_shadows()
+    return problem if bounces else problem.without_bounces()
 
 
 def _shadows(fits: dict[str, Fit]) -> Evidence:
@@ -96,6 +116,29 @@ def _shadows(fits: dict[str, Fit]) -> Evidence:
     if len(losses) == 2:
         return decide(losses["without"], losses["with"], SHADOWS)
     return Evidence("with" in losses, losses.get("with"), losses.get("without"))
+
+
+def with_bounces_chosen(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
+    """The fit, which has shadows, with bounces and after further rounds where they explain held-out observations better."""
+    if run.options.interreflection != "auto" or not problem.has_bounces:
+        kept = run.options.interreflection == "on" and problem.has_bounces
+        return Bounces(fit, Evidence(kept, fit.held_out if kept else None))
+    if not (decided := run.journal.kept("bounces", Bounces)):
+        decided = run.journal.keep("bounces", _bounces_decided(problem, fit, run))
+    if not decided.evidence.kept:
+        return decided
+    return Bounces(further_rounds(problem, decided.fit, decided.fit.point, run, "rounds bounces"), decided.evidence)
+
+
+def _bounces_decided(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
+    """Both models are brought near their optimum by equally many iterations; the fit keeps its point where bounces are not kept."""
+    held_out, points = [], []
+    for model in (problem.without_bounces(), problem):
+        sample = sampled_for(model, fit.point, run.options)
+        points.append(near_optimum(sample.with_loss(fit.loss), fit.point).point)
+        held_out.append(sample.held_out_loss(points[-1]))
+    evidence = decide(*held_out, INTERREFLECTION)
+    return Bounces(msgspec.structs.replace(fit, point=points[1]) if evidence.kept else fit, evidence)
 
 
 def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:

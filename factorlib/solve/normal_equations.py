@@ -13,7 +13,7 @@ from factorlib.elementary import product
 from factorlib.model.illumination import Illumination
 from factorlib.model.jacobian import whitened
 from factorlib.model.loss import Loss
-from factorlib.model.responses import Responses
+from factorlib.model.responses import Responses, bounced_of
 
 
 class NormalEquations(msgspec.Struct, frozen=True):
@@ -76,7 +76,10 @@ def energy_equations(illumination: Illumination, known: Iterable[Responses], los
     for some in known:
         for c in range(3):
             basis = some.basis(materials, c)
-            seen = whitened(block, light, some.rows, c, product(basis, weight[:, c]), loss)
+            linear = product(basis, weight[:, c])
+            if block.bounced is not None:
+                linear = linear + torch.from_numpy(bounced_of(block, some.rows, materials, some.material)[:, c])
+            seen = whitened(block, light, some.rows, c, linear, loss)
             scaled = basis / unit_energy * (seen.rising * seen.scale[:, None])
             hessian[c] += product(scaled.T, scaled).numpy()
             gradient[c] += product(scaled.T, seen.residual).numpy()

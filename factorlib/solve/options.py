@@ -16,6 +16,7 @@ Tolerance = Annotated[float, Meta(gt=0, lt=1)]
 Share = Annotated[float, Meta(ge=0, lt=1)]
 Seed = Annotated[int, Meta(ge=0)]
 SelfShadowing = Literal["auto", "on", "off"]
+Interreflection = Literal["auto", "on", "off"]
 SpecularParts = Literal["auto", "on"]
 ToneCurves = Literal["auto", "off"]
 
@@ -43,6 +44,8 @@ class Choices(Struct, frozen=True):
     """Share of the held-out loss that a round must gain to be taken as the best one."""
     self_shadowing: SelfShadowing = "auto"
     """Whether what meshes hide of the light is dark; auto: where that explains held-out observations better."""
+    interreflection: Interreflection = "auto"
+    """Whether surfaces that hide the light send their own, as the photo shows it; auto: where that explains held-out observations better."""
     specular: SpecularParts = "auto"
     """Whether every material has a specular part; auto: where held-out observations are explained worse without."""
     tone: ToneCurves = "auto"

@@ -21,7 +21,7 @@ Step         halved until it lowers the objective enough (Armijo), no further th
              ones drive the sigmoids to where their slopes vanish.
 Clipping     at least this much, as in the bundle solver: a clipped channel pulls from below only.
 Exposures    of photos that share a light, beyond the first: unknowns of their own.
-Not modelled are self-shadowing, robustness against outliers, and how many lobes a light needs.
+Not modelled are self-shadowing, interreflection, robustness against outliers, and how many lobes a light needs.
 """
 
 from __future__ import annotations

@@ -15,6 +15,9 @@ class Threshold(msgspec.Struct, frozen=True):
 
 SHADOWS = Threshold(gain=0.0)  # both models have as many unknowns: whichever explains more
 
+# As many unknowns, too; but both are only brought near their optimum, and the scale of reflectances is no longer free.
+INTERREFLECTION = Threshold(gain=0.01)
+
 # The held-out loss of all observations moves by some 3 % as a descent goes on: less says nothing of a specular part.
 SPECULAR = Threshold(gain=0.03, harm=0.05)
 

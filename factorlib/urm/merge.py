@@ -26,7 +26,7 @@ ROWS = 1 << 16  # observations whose visibility is in memory as floats
 def merge(observations: Observations, degrees: float) -> Observations:
     """Merge within cells of about `degrees`; 0 merges nothing.  The total weight is kept.
 
-    `x` and `y` become those of the group's first pixel.
+    `x`, `y` and `met` become those of the group's first pixel.
     """
     if degrees <= 0 or len(observations) == 0:
         return observations
@@ -65,6 +65,7 @@ def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
         **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
         visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
+        met=kept.met,
     )
 
 

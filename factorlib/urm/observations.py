@@ -4,7 +4,7 @@ The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, ra
 indices and the units in the schema metadata under the key `factorlib`.
 
 `visibility`, where some observation does not see every direction, is a further column of K bytes: the share of each
-direction of `fibonacci_sphere(K)` that is seen, 0 to 255.
+direction of `fibonacci_sphere(K)` that is seen, 0 to 255.  `met`, beside it, says which surface hides a direction.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
@@ -30,6 +31,10 @@ WHAT, CURE = "a reflectance map", "run the stage `urm` again"
 VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
     "azimuth about z from x toward y = k π (3 − √5)"
+)
+MET = (
+    f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in `materials` · {BINS} + "
+    f"number of the direction of {BINS}, placed as those of `visibility`, that is nearest to its normal; {UNMET}: none, or not known"
 )
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
@@ -54,6 +59,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of surfaces that hide directions (factorlib.geometry.met); only beside `visibility`
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
 
     def __len__(self) -> int:
@@ -66,17 +72,19 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        visibility = None if self.visibility is None else self.visibility[rows]
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, visibility=visibility)
+        wide = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in WIDE}
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, **wide)
 
 
 COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
+WIDE = {"visibility": np.dtype("u1"), "met": np.dtype("<u2")}  # K values a row, where there are any
+NOTHING = {"visibility": 255, "met": UNMET}  # of observations that see everything
 DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
           "x": "i4", "y": "i4", "weight": "f4"}  # fmt: skip
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns, and `visibility` where there is one."""
+    """Write the fixed Parquet columns, and `visibility` and `met`, where there is one."""
     columns = {}
     for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:]):
         dtype = DTYPES.get(name, "f4")
@@ -87,8 +95,9 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     about = {**UNITS, **names}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
-    if observations.visibility is not None:
-        columns["visibility"], about["visibility"] = _bytes(observations.visibility), VISIBILITY
+    for name, meaning in (("visibility", VISIBILITY), ("met", MET)):
+        if (values := getattr(observations, name)) is not None:
+            columns[name], about[name] = _bytes(values, WIDE[name]), meaning
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
     with writing(path):
         pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
@@ -96,10 +105,10 @@ def write_observations(path: str | Path, observations: Observations) -> None:
 
 def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
-    parts, about = read_columns(path, WHAT, COLUMNS, ("visibility",), CURE)
+    parts, about = read_columns(path, WHAT, COLUMNS, tuple(WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
         columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in COLUMNS}
-        columns["visibility"] = _of_bytes(parts["visibility"]) if "visibility" in parts else None
+        columns |= {name: _of_bytes(parts[name], dtype) for name, dtype in WIDE.items() if name in parts}
         named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**columns, **named, exposures=exposures)
@@ -115,6 +124,12 @@ def _check(observations: Observations) -> None:
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
     if observations.exposures and len(observations.exposures) != len(observations.photos):
         raise ValueError("its exposures are not one a photo")
+    if observations.met is not None:
+        if observations.visibility is None or observations.visibility.shape != observations.met.shape:
+            raise ValueError("column 'met' has not the directions of a column 'visibility'")
+        known = observations.met[observations.met != UNMET]
+        if len(known) and known.max() >= BINS * len(observations.materials):
+            raise ValueError("column 'met' points beyond the names of the metadata")
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -129,36 +144,38 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
         columns[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    return Observations(
-        **columns, materials=materials, **names, visibility=_all_visibility(parts), exposures=tuple(exposures.get(p) for p in names["photos"])
-    )
+    columns |= {name: _of_all(parts, name) for name in WIDE}
+    return Observations(**columns, materials=materials, **names, exposures=tuple(exposures.get(p) for p in names["photos"]))
 
 
-def _all_visibility(parts: Sequence[Observations]) -> UInt8[np.ndarray, "n k"] | None:
-    """Of all parts; those without see everything."""
-    counts = {part.visibility.shape[1] for part in parts if part.visibility is not None}
+def _of_all(parts: Sequence[Observations], name: str) -> np.ndarray | None:
+    """`visibility` or `met` of all parts; those without see everything."""
+    counts = {getattr(part, name).shape[1] for part in parts if getattr(part, name) is not None}
     if len(counts) > 1:
-        raise InputError(
-            f"reflectance maps whose visibility has {sorted(counts)} directions", cure="run the stage `urm` again for all photos"
-        )
+        raise InputError(f"reflectance maps whose {name} has {sorted(counts)} directions", cure="run the stage `urm` again for all photos")
     if not counts:
         return None
     (k,) = counts
-    return np.concatenate([np.full((len(part), k), 255, "u1") if part.visibility is None else part.visibility for part in parts])
+    given = [getattr(part, name) for part in parts]
+    return np.concatenate([np.full((len(part), k), NOTHING[name], WIDE[name]) if own is None else own for part, own in zip(parts, given)])
 
 
 def _renumber(index: np.ndarray, old: Sequence[str], new: Sequence[str]) -> np.ndarray:
     return np.array([new.index(name) for name in old], dtype="i4")[index] if len(old) else index
 
 
-def _bytes(values: UInt8[np.ndarray, "n k"]) -> pa.Array:
-    data = pa.py_buffer(np.ascontiguousarray(values, dtype="u1"))
-    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(values.shape[1]), len(values), [None, data])
+def _bytes(values: np.ndarray, dtype: np.dtype) -> pa.Array:
+    """A row's values as one binary of fixed size."""
+    data = pa.py_buffer(np.ascontiguousarray(values, dtype=dtype))
+    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(values.shape[1] * dtype.itemsize), len(values), [None, data])
 
 
-def _of_bytes(column: pa.Array) -> UInt8[np.ndarray, "n k"]:
-    k = column.type.byte_width
-    return np.frombuffer(column.buffers()[1], "u1").reshape(-1, k)[column.offset : column.offset + len(column)].copy()
+def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
+    """The inverse of `_bytes`; ValueError for bytes that are no whole values."""
+    k, over = divmod(column.type.byte_width, dtype.itemsize)
+    if over:
+        raise ValueError(f"a binary of {column.type.byte_width} bytes holds no numbers of {dtype.itemsize}")
+    return np.frombuffer(column.buffers()[1], dtype).reshape(-1, k)[column.offset : column.offset + len(column)].copy()
 
 
 def _array(column: pa.Array, dtype: str, is_vector: bool) -> np.ndarray:

@@ -58,6 +58,15 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     assert first == second
 
 
+def test_scenes_have_the_bounces_that_the_solve_chose(inputs, tmp_path):
+    file = inputs["solve"] / "materials.json"
+    table = read_json(file)
+    for bounces, depth in ((False, 2), (True, -1)):
+        write_json(file, table | {"model": {"self_shadowing": True, "interreflection": bounces}})
+        scene = (run(inputs, tmp_path / str(bounces)) / "scenes" / "front.xml").read_text()
+        assert f'name="max_depth" value="{depth}"' in scene
+
+
 def test_another_choice_of_materials_for_a_mesh_gets_its_own_files(inputs, tmp_path):
     facts = msgspec.to_builtins(inputs.facts)
     facts["dataset.objects"]["front"] = facts["dataset.objects"]["side"] | {

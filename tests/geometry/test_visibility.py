@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.geometry.raster import rasterise
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.geometry.visibility import Occluders, visibility
+from factorlib.geometry.visibility import Occluders, Points, sight
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate, read_observations, write_observations
 from tests.align.scenes import at, ball, mesh_of
@@ -29,7 +30,8 @@ def pixels(meshes, poses, camera=CAMERA):
 
 def seen_by(meshes, poses, count=256, most=10_000, camera=CAMERA):
     x, y, normal, thing = pixels(meshes, poses, camera)
-    return visibility(Occluders(meshes, poses), camera, x, y, normal, count, most), normal, thing
+    found = sight(Occluders(meshes, poses), camera, x, y, normal, count, most)
+    return found and found.visibility, normal, thing
 
 
 def open_share(seen, normal):
@@ -141,3 +143,54 @@ def test_photos_without_hidden_directions_see_all_beside_others():
 def test_sets_of_different_directions_are_not_mixed():
     with pytest.raises(InputError, match="64, 128"):
         concatenate([with_visibility("a"), with_visibility("b", count=128)])
+
+
+def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
+    """A floor of material 1 under a ball of material 3: straight up the floor meets the ball's underside."""
+    floor = mesh_of([trimesh.creation.box(extents=(8, 8, 0.1))])
+    thing = mesh_of([ball(1.0, 4)], [3])
+    poses = [Pose(np.eye(3), np.array([0.0, 0.0, 6.05])), Pose(np.eye(3), np.array([0.0, 0.0, 3.5]))]
+    occluders, directions = Occluders([floor, thing], poses), fibonacci_sphere(256)
+    place = np.array([[1.5, 0.0, 5.99], [3.5, 0.0, 5.99]])
+    up = np.tile([0.0, 0.0, -1.0], (2, 1))
+    past = occluders.seen_from(Points(place, up, np.ones(2, bool)), up, directions)
+    hidden = past.visibility == 0
+    assert hidden[0].any() and (past.met[~hidden] == UNMET).all()
+    material, faces = np.divmod(past.met[hidden].astype(int), BINS)
+    assert (material == 2).all()
+    row, k = np.nonzero(hidden)
+    assert (np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1) < 0.2).all()  # toward the floor, to the width of a bin
+
+
+def with_met():
+    seen = with_visibility()
+    codes = np.random.default_rng(1).integers(0, BINS * len(seen.materials), seen.visibility.shape)
+    return msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, codes, UNMET).astype(np.uint16))
+
+
+def test_codes_are_kept_in_parquet_taken_and_merged(tmp_path):
+    seen = with_met()
+    write_observations(tmp_path / "a.parquet", seen)
+    again = read_observations(tmp_path / "a.parquet")
+    assert again.met.dtype == np.uint16
+    np.testing.assert_array_equal(again.met, seen.met)
+    write_observations(tmp_path / "b.parquet", again)
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    write_observations(tmp_path / "c.parquet", with_visibility())
+    assert read_observations(tmp_path / "c.parquet").met is None
+    np.testing.assert_array_equal(seen.take(np.array([2, 0])).met, seen.met[[2, 0]])
+    merged = merge(seen, 8.0)
+    first = [int(np.flatnonzero((seen.x == x) & (seen.y == y))[0]) for x, y in zip(merged.x, merged.y, strict=True)]
+    np.testing.assert_array_equal(merged.met, seen.met[first])
+    both = concatenate([seen, observations("other", "other")])
+    assert (both.met[both.photo == both.photos.index("other")] == UNMET).all()
+
+
+def test_codes_that_name_no_material_are_refused(tmp_path):
+    seen = with_met()
+    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, met=seen.met * 0 + BINS * len(seen.materials)))
+    with pytest.raises(InputError, match="met"):
+        read_observations(tmp_path / "a.parquet")
+    write_observations(tmp_path / "b.parquet", msgspec.structs.replace(seen, met=seen.met[:, :32]))
+    with pytest.raises(InputError, match="met"):
+        read_observations(tmp_path / "b.parquet")

@@ -5,14 +5,18 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT
+from factorlib.geometry.met import UNMET
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.tone import curve
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
+from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials
-from factorlib.stage import silent
+from factorlib.stage import Inputs, silent
+from factorlib.urm.observations import Observations, write_observations
 from stages import export, render
 from tests.export import made_export
 
@@ -97,3 +101,37 @@ def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(ma
     np.testing.assert_allclose(shown, 0.3 * curve(linear / 0.3, 1.5), rtol=1e-4, atol=1e-6)
     other = [p for p in straight.rglob("*.exr") if "resynthesis" not in p.parts]
     assert all(p.read_bytes() == (curved / p.relative_to(straight)).read_bytes() for p in other)
+
+
+def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
+    """In the gauge of the solve: the factor that `export` took from the reflectances does not weaken it."""
+    inputs, exported = made
+    label = read_exr(inputs["masks"] / "front.exr")["label"]
+    y, x = np.nonzero(label > 0)
+    n = len(x)
+    visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(np.uint8)  # the lower half is hidden, by nothing known
+    geometry = read_exr(inputs["align"] / "front.exr")
+    normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
+    seen = Observations(
+        normal=normal, view=view, radiance=np.full((n, 3), 0.3), clipped=np.zeros((n, 3), bool), material=np.zeros(n, int),
+        photo=np.zeros(n, int), illumination=np.zeros(n, int), x=x, y=y, weight=np.ones(n), materials=tuple(made_export.NAMES),
+        photos=("front",), illuminations=("front",), visibility=np.tile(visibility, (n, 1)), met=np.full((n, 64), UNMET, np.uint16),
+    )  # fmt: skip
+    (tmp_path / "urm").mkdir()
+    write_observations(tmp_path / "urm" / "front.parquet", seen)
+    file, pictures = inputs["solve"] / "materials.json", {}
+    before, solved = file.read_bytes(), read_json(file)
+    try:
+        for bounces in (True, False):
+            write_json(file, solved | {"model": {"self_shadowing": True, "interreflection": bounces}})
+            of = made_export.of_photo(inputs, exported, "front")
+            (tmp_path / str(bounces)).mkdir()
+            render.main(FAST, Inputs({**of.folders, "urm": tmp_path / "urm"}, of.facts, of.files, "front"), tmp_path / str(bounces), silent)
+            pictures[bounces] = read_rgb_exr(tmp_path / str(bounces) / "resynthesis" / "front.exr")[y, x]
+    finally:
+        file.write_bytes(before)
+    assert read_materials(exported / "materials.json").gauge.export_factor < 1
+    red, sent = made_export.MATERIALS["red"], bounced_light(seen, seen.radiance)
+    expected = np.array(red["diffuse"]) * sent[:, :3] + np.array(red["specular"]) * sent[:, 3:]
+    np.testing.assert_allclose(pictures[True] - pictures[False], expected, rtol=1e-3, atol=1e-4)
+    assert expected.max() > 0.1

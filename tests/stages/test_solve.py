@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.solve.problems import MATERIALS, random_light, sphere_normals
 from factorlib.errors import InputError
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.jsonfile import read_json
 from factorlib.model.illumination import Illumination
 from factorlib.model.noise import Noise
@@ -86,6 +87,26 @@ def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, li
     for file in ("lobes.parquet", "uncertainty.json"):
         assert (tmp_path / "auto" / "out" / file).read_bytes() == (tmp_path / "off" / "out" / file).read_bytes(), file
     assert set(models["on"]["self_shadowing_chosen_by"]) == {"held_out_loss_with"}
+
+
+def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_start(tmp_path, linked):
+    def lit(part):
+        hidden = np.random.default_rng(0).random((len(part), 64)) < 0.3
+        met = np.where(hidden, part.material[:, None] * BINS, UNMET).astype(np.uint16)
+        return msgspec.structs.replace(part, visibility=np.where(hidden, 0, 255).astype(np.uint8), met=met)
+
+    seen = {k: lit(v) for k, v in linked.items()}
+    tables = {c: read_json(run(tmp_path / c, seen, self_shadowing="on", interreflection=c) / "materials.json") for c in ("auto", "on", "off")}
+    models = {c: table["model"] for c, table in tables.items()}
+    assert models["on"]["interreflection"] and not models["off"]["interreflection"]
+    evidence = models["auto"]["interreflection_chosen_by"]
+    assert models["auto"]["interreflection"] == (evidence["held_out_loss_without"] > 1.01 * evidence["held_out_loss_with"])
+    assert "no free factor" in tables["on"]["gauge"]["rule"] and "no free factor" not in tables["off"]["gauge"]["rule"]
+    assert models["off"]["interreflection_chosen_by"] == {}
+    earlier = tmp_path / "auto" / "out"
+    again = read_json(run(tmp_path / "again", seen, start=earlier, self_shadowing="on") / "materials.json")["model"]
+    assert again["interreflection"] == models["auto"]["interreflection"]
+    assert len(again["interreflection_chosen_by"]) < 2  # as it was decided
 
 
 def test_the_same_observations_give_the_same_bytes(tmp_path, linked):

@@ -1,0 +1,109 @@
+"""Interreflection: from a direction that is hidden comes the light of the surface that hides it.
+
+    G_d,i = Σ_k w_ik (1 − V_ik) B_ik,                w_ik the cosine weights of factorlib.light.visibility, Σ_k w_ik = 1
+    G_s,i = Σ_k D G1 G1 / (4 n·o) (1 − V_ik) B_ik Ω,   GGX at the roughness ROUGHNESS, Ω = 4π/K                (1)
+
+B_ik is the radiance of what observation i meets in direction k.  It is taken from the photo itself: the mean radiance of the
+observations of that material whose normals lie in that bin.  Few observations are no sure mean, so it is drawn, as by `PSEUDO` further
+observations, toward the mean of the whole material with weights exp(NEARNESS n·b): a bin that the photo does not show gets the radiance
+of the nearest normals.  What met nothing known, or a material that the photo does not show, sends the photo's mean radiance.
+
+So B holds all bounces, and is known: G does not depend on materials or lights.  Surfaces are taken to send the same light everywhere:
+toward the camera and toward each other.  Absolute reflectances become observable, for G does not scale with the light.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from factorlib.geometry.met import BINS, UNMET
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.light.visibility import cosine_weights, widest_sharpness
+from factorlib.reflection.brdf import specular
+from factorlib.urm.observations import Observations
+
+ROUGHNESS = 0.35  # of the highlight through which hidden surfaces are seen, whatever the material: of most materials a few tenths
+PSEUDO, NEARNESS = 3.0, 4.0
+ROWS = 1024  # observations whose weights are held at once
+
+
+def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"] | None:
+    """G_d and G_s in the unit of `radiance`, which the n observations show; None where nothing is known of what hides the light.
+
+    normals, views and directions: in the camera frame of each photo
+    """
+    if seen.visibility is None or seen.met is None:
+        return None
+    sent = np.zeros((len(seen), 6))
+    hidden = (seen.visibility < 255).any(1)
+    for photo in np.unique(seen.photo):
+        rows = np.flatnonzero(seen.photo == photo)
+        surfaces = radiance_by_code(seen.take(rows), radiance[rows])
+        shadowed = rows[hidden[rows]]
+        for some in np.split(shadowed, range(ROWS, len(shadowed), ROWS)):
+            sent[some] = _sent_to(seen.take(some), surfaces)
+    return sent
+
+
+def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
+    """B of every code of `Observations.met` in one photo, from its observations; last what an unknown surface sends."""
+    normal, bins = unit(shown.normal), fibonacci_sphere(BINS)
+    everything = np.average(radiance, axis=0, weights=shown.weight)
+    found = np.tile(everything, (len(shown.materials) * BINS + 1, 1))
+    for m in np.unique(shown.material):
+        of = shown.material == m
+        codes = slice(m * BINS, (m + 1) * BINS)
+        found[codes] = _by_bin(normal[of] @ bins.T, radiance[of], shown.weight[of].astype(float))
+    return found
+
+
+def _by_bin(
+    cosine: Float[np.ndarray, "n b"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "b 3"]:
+    """The mean radiance of one material by bin of its normals; cosine: of each normal with each bin's direction."""
+    near = np.exp(NEARNESS * cosine) * weight[:, None]
+    expected = near.T @ radiance / near.sum(0)[:, None]
+    own, bins = cosine.argmax(1), cosine.shape[1]
+    total = np.bincount(own, weight, bins)
+    mean = np.column_stack([np.bincount(own, weight * r, bins) for r in radiance.T]) / np.maximum(total, 1e-300)[:, None]
+    count = np.bincount(own, minlength=bins)[:, None]
+    return (count * mean + PSEUDO * expected) / (count + PSEUDO)
+
+
+def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
+    """(1) at observations of one photo."""
+    directions = torch.from_numpy(fibonacci_sphere(seen.visibility.shape[1])).float()
+    normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
+    hidden = 1 - torch.from_numpy(seen.visibility).float() / 255
+    weights = [hidden * of(normal, view, directions) for of in (_by_cosine, _by_highlight)]
+    code = torch.from_numpy(_places(seen.met, len(surfaces) - 1))
+    by_channel = [torch.from_numpy(surfaces[:, c]).float()[code] for c in range(3)]
+    return np.column_stack([(weight * met).sum(1).double().numpy() for weight in weights for met in by_channel])
+
+
+def _places(met: Int[np.ndarray, "n k"], unknown: int) -> Int[np.ndarray, "n k"]:
+    """Rows of `radiance_by_code`."""
+    return np.where((met == UNMET) | (met >= unknown), unknown, met).astype(np.int64)
+
+
+def _by_cosine(normal: torch.Tensor, view: torch.Tensor, directions: torch.Tensor) -> Float[torch.Tensor, "n k"]:
+    return cosine_weights(normal, directions)
+
+
+def _by_highlight(normal: torch.Tensor, view: torch.Tensor, directions: torch.Tensor) -> Float[torch.Tensor, "n k"]:
+    """No narrower than the directions lie apart, as in factorlib.light.visibility."""
+    count = len(directions)
+    alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
+    nd, no, od = normal @ directions.T, (normal * view).sum(1, keepdim=True), view @ directions.T
+    nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
+    return specular(alpha, nd, no, nh) * (4 * math.pi / count)
+
+
+def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Of length 1, float64."""
+    vectors = vectors.astype(float)
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
