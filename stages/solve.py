@@ -10,15 +10,18 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import LightSlice
 from factorlib.diagnose.answer import Answer
 from factorlib.diagnose.coverage import relative_standard_errors
-from factorlib.diagnose.uncertainty import standard_errors
+from factorlib.diagnose.posterior import Posterior
+from factorlib.diagnose.uncertainty import StandardErrors, standard_errors
 from factorlib.diagnose.warnings import after_solving, before_solving, unusable_observations
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.light.prior import read_light_prior
 from factorlib.model.gathered import gathered
 from factorlib.model.loss import Loss
 from factorlib.model.noise import Noise
@@ -89,7 +92,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     problem = _problem(params, inputs, at_one_exposure(seen, relative))
     _warn(before_solving(names, seen.photos, problem.blocks))
     answer = Answer(names, problem, _solved(params, problem, earlier, inputs, progress), relative, params.solver, earlier)
-    _write(out, answer)
+    _write(out, answer, params)
 
 
 def operator_of(params: Params) -> str:
@@ -130,10 +133,10 @@ def _solved(params: Params, problem: JointProblem, earlier: Earlier | None, inpu
     return solve(problem, start, Run(bundle, report, journal=journal))
 
 
-def _write(out: Path, answer: Answer) -> None:
+def _write(out: Path, answer: Answer, params: Params) -> None:
     """All files of the stage, and what they leave open."""
-    problem, point = answer.solution.shown(answer.problem), answer.solution.point
-    errors = standard_errors(problem, point)
+    problem = answer.solution.shown(answer.problem)
+    errors, coverages = _uncertainty(answer, problem, params)
     _warn(after_solving(answer, errors))
     write_materials(out / "materials.json", answer.material_table(errors))
     write_uncertainty(out / "uncertainty.json", answer.uncertainty(errors))
@@ -141,9 +144,19 @@ def _write(out: Path, answer: Answer) -> None:
     write_exposures(out / "exposures.json", answer.exposures())
     write_rows(out / "convergence.parquet", Event, answer.solution.history)
     (out / "coverage").mkdir()
-    for illumination in problem.illuminations(point):
-        coverage = relative_standard_errors(illumination, problem.loss, errors.deviation)
-        write_rgb_exr(out / "coverage" / f"{illumination.block.name}.exr", coverage, LAT_LONG)
+    for name, coverage in coverages.items():
+        write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
+
+
+def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
+    """Standard errors of the materials, and relative ones of each light."""
+    solution = answer.solution
+    if solution.natural:
+        posterior = Posterior(problem.sampled(params.sample, params.seed), solution.natural, read_light_prior())
+        return posterior.standard_errors(), posterior.relative_standard_errors()
+    errors = standard_errors(problem, solution.point)
+    lit = problem.illuminations(solution.point)
+    return errors, {one.block.name: relative_standard_errors(one, problem.loss, errors.deviation) for one in lit}
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -72,7 +72,7 @@ class Answer(msgspec.Struct, frozen=True):
         return table.Model(
             solver=self.solver,
             lobes={block.name: len(light) for block, light in zip(blocks, solution.point.lights, strict=True)},
-            lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
+            lobes_chosen_by="the lattice of the light prior" if solution.light_prior.kept else LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase in ("round", "subset")],
             specular={name: not bool(solution.lambertian[m]) for m, name in enumerate(names)},
             specular_chosen_by=_by_name(names, solution.specular),
@@ -80,6 +80,8 @@ class Answer(msgspec.Struct, frozen=True):
             self_shadowing_chosen_by=_losses(solution.shadows),
             interreflection=solution.interreflection.kept,
             interreflection_chosen_by=_losses(solution.interreflection),
+            light_prior=solution.light_prior.kept,
+            light_prior_chosen_by=_losses(solution.light_prior),
             tone=self.tone(),
             tone_chosen_by=_by_name([block.name for block in blocks], solution.tone),
             started_from=self.started_from(),

@@ -74,7 +74,7 @@ def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
     information, widths = system.schur_complement(point), np.tile(WIDTHS, count)
     inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
     by_cell = system.reduced_scores(point)
-    covariances = inverse, _sandwich(inverse, np.vstack(by_cell), sigma), _sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
+    covariances = inverse, sandwich(inverse, np.vstack(by_cell), sigma), sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
     variances = [np.diag(in_gauge(covariance, materials, problem.blocks)) for covariance in covariances]
     errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
     return StandardErrors(Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma)
@@ -85,8 +85,8 @@ def clustered_equations(illumination: Illumination, loss: Loss) -> NormalEquatio
     return normal_equations(illumination, loss, clusters_of(illumination.block))
 
 
-def _sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float) -> Float[np.ndarray, "k k"]:
-    """(1), as wide as Student's t asks for so few clusters."""
+def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float) -> Float[np.ndarray, "k k"]:
+    """(1) from scores that lights were eliminated from, one a row, as wide as Student's t asks for so few clusters."""
     count = len(scores)
     if count < 2:
         return np.zeros_like(inverse)

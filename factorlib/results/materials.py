@@ -99,7 +99,8 @@ class Model(msgspec.Struct, frozen=True):
     lobes:           number of lobes by illumination
     held_out_loss:   after each round
     specular:        whether a material has a specular part
-    self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried
+    light_prior:     whether lights follow the statistics of natural light
+    self_shadowing_chosen_by, interreflection_chosen_by, light_prior_chosen_by: the held-out loss of each model that was tried
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
     """
 
@@ -113,6 +114,8 @@ class Model(msgspec.Struct, frozen=True):
     self_shadowing_chosen_by: dict[str, float] = {}
     interreflection: bool = False
     interreflection_chosen_by: dict[str, float] = {}
+    light_prior: bool = False
+    light_prior_chosen_by: dict[str, float] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     started_from: Started | UnsetType = UNSET

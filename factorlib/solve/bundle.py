@@ -5,7 +5,8 @@
     bounces   Where shadows go on and interreflection = auto, the light that surfaces send to each other is added, if held-out pixels
               are explained better with it after equally many iterations; further rounds follow
     choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
-    polish    brings the answer to its optimum, first on many observations, then on all
+    prior     lights with the statistics of natural light instead of lobes, where that explains held-out pixels better (natural)
+    polish    if lights are lobes: brings the answer to its optimum, first on many observations, then on all
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
+from factorlib.light.prior import read_light_prior
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -26,10 +28,11 @@ from factorlib.solve.descent import Descent, descend
 from factorlib.solve.evidence import Evidence, decide
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
+from factorlib.solve.natural import Natural, naturally
 from factorlib.solve.options import Choices
 from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
-from factorlib.solve.thresholds import INTERREFLECTION, SHADOWS
+from factorlib.solve.thresholds import INTERREFLECTION, LIGHT_PRIOR, SHADOWS, WELL_EXPLAINED
 
 MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
 
@@ -40,6 +43,7 @@ class Solution(msgspec.Struct, frozen=True):
     history     every accepted point on the way;  loss: the loss function that was lowered last
     lambertian  materials without specular part
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
+    natural     the lights with a prior, where they are such;  light_prior: the evidence for that
     specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
     """
 
@@ -51,6 +55,8 @@ class Solution(msgspec.Struct, frozen=True):
     interreflection: Evidence = Evidence(False)
     specular: list[Evidence] = []
     tone: list[Evidence] = []
+    natural: Natural | None = None
+    light_prior: Evidence = Evidence(False)
 
     def shown(self, problem: JointProblem) -> JointProblem:
         """The problem that the answer solves: with shadows and bounces or without, with the last loss."""
@@ -61,6 +67,13 @@ class Bounces(msgspec.Struct, frozen=True):
     """The fit with bounces or without, and what decided."""
 
     fit: Fit
+    evidence: Evidence
+
+
+class Prior(msgspec.Struct, frozen=True):
+    """The fit with a prior on lights, and the evidence for it."""
+
+    fit: Natural
     evidence: Evidence
 
 
@@ -87,11 +100,15 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     if any(of_light.kept for of_light in curves.evidence):  # what the curves explain had stopped the rounds early
         fit = further_rounds(problem, fit, curves.point, run)
     chosen = with_specular_chosen(problem, fit, start, run)
+    natural = with_prior_chosen(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
+    decided = (shadows, bounces.evidence, chosen.evidence, curves.evidence)
+    if natural and natural.evidence.kept:
+        return Solution(natural.fit.point, fit.history, problem.loss, chosen.lambertian, *decided, natural.fit, natural.evidence)
     end = polished(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
     found = end.point.materials
     materials = Materials(found.diffuse, np.where(chosen.lambertian[:, None], 0.0, found.specular), found.roughness)
     point = Point(materials, end.point.lights)
-    return Solution(point, end.history, fit.loss, chosen.lambertian, shadows, bounces.evidence, chosen.evidence, curves.evidence)
+    return Solution(point, end.history, fit.loss, chosen.lambertian, *decided, None, natural.evidence if natural else Evidence(False))
 
 
 def models(problem: JointProblem, choices: Choices) -> dict[str, JointProblem]:
@@ -166,6 +183,23 @@ def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run
         return run.journal.keep("choice", Specular(before, start.lambertian, evidence))
     sample = sampled_for(problem, before, run.options)
     return run.journal.keep("choice", without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian))
+
+
+def with_prior_chosen(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Prior | None:
+    """The fit with a prior on lights, and whether it explains held-out observations better than the lobes of `fit`; None if not tried."""
+    choice = run.options.light_prior
+    well = problem.none_held_out or fit.held_out < WELL_EXPLAINED
+    if choice == "none" or (choice == "auto" and well):
+        return None
+    if kept := run.journal.kept("light prior", Prior):
+        return kept
+    sample = problem.sampled(run.options.sample, run.options.seed)
+    number, lobes = fit.history[-1].round, sum(map(len, fit.point.lights))
+    found = naturally(
+        sample, fit.point, read_light_prior(), lambertian, lambda k, loss: run.report(Event(number, "light prior", k, loss, np.nan, lobes))
+    )
+    evidence = decide(sample.held_out_loss(fit.point), sample.held_out_loss(found.point), LIGHT_PRIOR)
+    return run.journal.keep("light prior", Prior(found, msgspec.structs.replace(evidence, kept=evidence.kept or choice == "on")))
 
 
 def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Polished:

@@ -19,6 +19,7 @@ SelfShadowing = Literal["auto", "on", "off"]
 Interreflection = Literal["auto", "on", "off"]
 SpecularParts = Literal["auto", "on"]
 ToneCurves = Literal["auto", "off"]
+LightPriors = Literal["auto", "on", "none"]
 
 
 class Choices(Struct, frozen=True):
@@ -50,6 +51,9 @@ class Choices(Struct, frozen=True):
     """Whether every material has a specular part; auto: where held-out observations are explained worse without."""
     tone: ToneCurves = "auto"
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
+    light_prior: LightPriors = "auto"
+    """Whether lights follow the statistics of natural light (`factorlib.light.prior`) instead of being a few lobes; auto: where that
+    explains held-out observations better."""
     seed: Seed = 0
     """Seed of the samples, and of what is held out."""
 

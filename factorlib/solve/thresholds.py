@@ -15,6 +15,9 @@ class Threshold(msgspec.Struct, frozen=True):
 
 SHADOWS = Threshold(gain=0.0)  # both models have as many unknowns: whichever explains more
 
+LIGHT_PRIOR = Threshold(gain=0.0)  # lobes and lattice show any light alike, in their own way: whichever explains more
+WELL_EXPLAINED = 0.1  # σ² of the noise model: lobes with a smaller held-out loss show a light better than any lattice, which is not tried
+
 # As many unknowns, too; but both are only brought near their optimum, and the scale of reflectances is no longer free.
 INTERREFLECTION = Threshold(gain=0.01)
 

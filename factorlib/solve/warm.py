@@ -77,7 +77,7 @@ def _light(earlier: Earlier, block: Block) -> Light | None:
     """In the block's radiance unit; NaN is the log exposure of a photo that was not there.  None without lobes or photos."""
     lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
-    if not lobes or np.isnan(exposure).all():
+    if not lobes or np.isnan(exposure).all() or earlier.table.model.light_prior:  # a lattice is no start for a few lobes
         return None
     axis = lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True)
     tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]

@@ -1,0 +1,79 @@
+"""Standard errors of materials and lights that were found with a prior on lights (`factorlib.solve.natural`).
+
+Materials   The information is the Schur complement of the marginal likelihood's system.  As in `factorlib.diagnose.uncertainty` its
+            inverse and two sandwiches, over clusters of mirror directions and over whole lights, are compared, and the largest counts.
+Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equation (1) of `factorlib.solve.marginal`).  A map's radiance in
+            direction d is Σ_p φ_p(d) w_p with w = exp(u), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation tells
+            anything, Σ is the prior's covariance.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.diagnose.coverage import LARGEST, ROWS
+from factorlib.diagnose.uncertainty import WIDTHS, StandardErrors, clusters_of, in_gauge, residual_deviation, sandwich
+from factorlib.light.lobes import squared_distances
+from factorlib.light.prior import LightPrior
+from factorlib.model.materials import Materials
+from factorlib.model.problem import JointProblem
+from factorlib.solve.lattice import Lattice
+from factorlib.solve.marginal import Field, Marginal, marginal
+from factorlib.solve.natural import LOBES, MaterialPrior, Natural, fields_of, unknowns_of
+
+
+class Posterior:
+    """What is uncertain at an answer with a prior on lights; problem: what it was fitted to."""
+
+    def __init__(self, problem: JointProblem, answer: Natural, prior: LightPrior):
+        self.problem, self.answer = problem, answer
+        self.fields = fields_of(problem, answer.point, prior, answer.temperatures)
+
+    @cached_property
+    def systems(self) -> list[Marginal]:
+        """Of each illumination."""
+
+        def system(one: tuple[Field, np.ndarray]) -> Marginal:
+            field, log_radiance = one
+            return marginal(field, log_radiance, self.answer.point.materials, clusters_of(field.block))
+
+        return list(self.problem.spread(system, list(zip(self.fields, self.answer.log_radiance, strict=True))))
+
+    def standard_errors(self) -> StandardErrors:
+        """Standard error of every material unknown."""
+        materials = self.answer.point.materials
+        information = MaterialPrior(materials, self.problem.blocks).at(unknowns_of(materials)).hessian
+        scores, count = [], 7 * len(materials)
+        for system in self.systems:
+            taken_up = cho_solve(cho_factor(system.light_hessian), system.cross_hessian.T)  # by the light
+            information = information + system.material_hessian - system.cross_hessian @ taken_up
+            scores.append(system.scores[:, :count] - system.scores[:, count:] @ taken_up)
+        inverse = np.linalg.inv(information)
+        covariances = inverse, sandwich(inverse, np.vstack(scores), 1.0), sandwich(inverse, np.array([s.sum(0) for s in scores]), 1.0)
+        scale = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(-1)  # ∂k/∂ log k
+        blocks, widths = self.problem.blocks, np.tile(WIDTHS, len(materials))
+        variances = [np.diag(in_gauge(covariance * np.outer(scale, scale), materials, blocks)) for covariance in covariances]
+        errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
+        deviation = residual_deviation(self.problem, self.answer.point)
+        return StandardErrors(Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), deviation)
+
+    def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
+        """By illumination, over the light's mean radiance: a small lat-long map in the frame of the exported ones, at most LARGEST."""
+        lattice = Lattice.of(LOBES)
+        directions = (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
+        overlap = np.exp(-0.5 * lattice.sharpness * squared_distances(directions, lattice.axis))
+        maps = {}
+        for field, system, log_radiance in zip(self.fields, self.systems, self.answer.log_radiance, strict=True):
+            covariance = cho_solve(cho_factor(system.light_hessian), np.eye(3 * LOBES))
+            errors = np.empty((len(directions), 3))
+            for c in range(3):
+                own, slope = slice(c * LOBES, (c + 1) * LOBES), overlap * lattice.weight(log_radiance)[:, c]
+                errors[:, c] = np.sqrt(np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0))
+            mean = np.exp(log_radiance).mean(1)
+            maps[field.block.name] = np.minimum(errors / mean, LARGEST).reshape(ROWS, 2 * ROWS, 3)
+        return maps

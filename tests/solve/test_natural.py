@@ -1,0 +1,188 @@
+"""The joint solve with a prior on lights: laws of its parts, and materials and lights found in lights drawn from the prior."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
+from factorlib.diagnose.posterior import Posterior
+from factorlib.light.prior import MIX, read_light_prior
+from factorlib.model.lights import UnitLobes
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.responses import unit_values
+from factorlib.reflection import reflection_operator
+from factorlib.solve.lattice import NODES, Lattice, Reflections
+from factorlib.solve.marginal import Field, marginal
+from factorlib.solve.natural import LOBES, MaterialPrior, materials_of, naturally, temperature, unknowns_of
+
+OPERATOR, PRIOR, NOBODY = reflection_operator("network"), read_light_prior(), np.zeros(3, bool)
+
+
+def drawn(seed: int, lattice: Lattice) -> np.ndarray:
+    """Log radiance [3, p] drawn from the prior, without the level of its exposure."""
+    rng, fields = np.random.default_rng(seed), []
+    for k in range(3):
+        covariance = PRIOR.covariance(k, lattice.axis) - (PRIOR.level[0] if k == 0 else 0.0)
+        fields.append(np.linalg.cholesky(covariance + 1e-9 * np.eye(len(lattice))) @ rng.normal(size=len(lattice)))
+    return np.linalg.solve(MIX, fields)
+
+
+def photographed(seed: int, lights: int, lobes: int = LOBES, size: int = 20, noise: float = 0.3) -> tuple[JointProblem, list[np.ndarray]]:
+    """Spheres of three materials in lights drawn from the prior, with noise, and the log radiances in the blocks' units."""
+    lattice, blocks, true = Lattice.of(lobes), [], []
+    rng = np.random.default_rng(seed)
+    for k in range(lights):
+        log_radiance = drawn(100 * seed + k, lattice)
+        light = lattice.light(log_radiance, random_light(rng, 1))
+        clean = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=k)
+        noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
+        blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
+        true.append(log_radiance - np.log(clean.unit))
+    return JointProblem(blocks, OPERATOR, Loss()), true
+
+
+def field_of(problem: JointProblem, lobes: int, temperature: float = 2.0) -> Field:
+    """Of the first illumination, without outliers."""
+    lattice, one = Lattice.of(lobes), problem.blocks[0]
+    like = random_light(np.random.default_rng(0), 1, len(one.photos))
+    precision = PRIOR.precision(lattice.axis)
+    return Field(one, like, lattice, Reflections(one, lattice, OPERATOR), np.zeros((3, lobes)), precision, temperature, 1e3)
+
+
+def test_equal_weights_of_a_lattice_are_a_constant_light():
+    for count in (200, LOBES):
+        lattice = Lattice.of(count)
+        light = lattice.light(np.zeros((3, count)), random_light(np.random.default_rng(0), 1))
+        directions = np.random.default_rng(1).normal(size=(2000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        shown = np.exp(light.sharpness * (directions @ light.axis.T - 1)) @ light.weight
+        assert np.abs(shown - 1).max() < 0.05 and abs(shown.mean() - 1) < 0.002
+
+
+def test_responses_between_nodes_are_those_of_the_operator():
+    problem, _ = photographed(0, 1, lobes=60, size=10)
+    lattice, one = Lattice.of(60), problem.blocks[0]
+    table = Reflections(one, lattice, OPERATOR)
+    for roughness in (0.1, 0.28, 0.55, float(NODES[3]), 1.0):
+        found, rows = table.at(1, roughness), table.rows(1)
+        diffuse, specular = unit_values(one, np.arange(rows.start, rows.stop), UnitLobes(lattice.axis, lattice.unit_lobes.sharpness), roughness, OPERATOR)
+        assert np.allclose(found.diffuse, diffuse, rtol=1e-5, atol=1e-7)
+        assert np.abs(found.specular - specular).max() < 0.01 * specular.max()
+    step = 1e-3
+    slope = (table.at(1, 0.28 + step).specular - table.at(1, 0.28 - step).specular) / (2 * step)
+    assert np.allclose(table.at(1, 0.28).by_roughness, slope, rtol=0.02, atol=1e-3 * np.abs(slope).max())
+
+
+def test_gradients_are_finite_differences():
+    problem, true = photographed(1, 1, lobes=50, size=10)
+    field, log_radiance = field_of(problem, 50), true[0]
+    theta, here = unknowns_of(MATERIALS), marginal(field_of(problem, 50), true[0], MATERIALS)
+
+    def at(change, step):
+        return marginal(field, log_radiance, materials_of(theta + step * change)).value
+
+    for place in range(theta.size):
+        change = np.eye(theta.size)[place].reshape(theta.shape)
+        difference = (at(change, 2e-3) - at(change, -2e-3)) / 4e-3 / 2
+        assert here.material_gradient[place] == pytest.approx(difference, rel=0.02, abs=0.02 * np.abs(here.material_gradient).max()), place
+    rng = np.random.default_rng(2)
+
+    def posterior(u):
+        part = marginal(field, u, MATERIALS)
+        off = (u - field.mean).reshape(-1)
+        return part.loss / field.temperature + off @ field.precision @ off
+
+    for _ in range(3):
+        change = rng.normal(size=log_radiance.shape)
+        difference = (posterior(log_radiance + 1e-4 * change) - posterior(log_radiance - 1e-4 * change)) / 2e-4 / 2
+        assert here.light_gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-3)
+
+
+def test_the_determinant_is_needed_for_roughness():
+    """With it the likelihood of a roughness is highest near the true one; the loss and the prior alone prefer smoother materials."""
+    problem, true = photographed(3, 1, lobes=100, size=14, noise=1.0)
+    one = problem.blocks[0].take(problem.blocks[0].material == 1)
+    alone = JointProblem([one], OPERATOR, Loss())
+    field, start = field_of(alone, 100, temperature=1.0), true[0]
+
+    def best(u, roughness):
+        materials = msgspec.structs.replace(MATERIALS, roughness=np.array([0.7, roughness, 0.25]))
+        for _ in range(12):
+            part = marginal(field, u, materials)
+            u = u - np.linalg.solve(part.light_hessian, part.light_gradient).clip(-1, 1).reshape(u.shape)
+        part = marginal(field, u, materials)
+        off = u.reshape(-1)
+        return part.value, part.loss / field.temperature + off @ field.precision @ off
+
+    tried = (0.15, 0.25, 0.4, 0.55)
+    marginals, posteriors = zip(*(best(start, roughness) for roughness in tried), strict=True)
+    assert tried[int(np.argmin(marginals))] == pytest.approx(0.4, abs=0.16)
+    assert np.argmin(posteriors) <= np.argmin(marginals)
+
+
+def test_correlated_residuals_count_less():
+    problem, true = photographed(4, 1, lobes=50, size=16)
+    field, rng = field_of(problem, 50), np.random.default_rng(0)
+    independent = rng.normal(size=problem.blocks[0].radiance.shape)
+    field = msgspec.structs.replace(field, robust_scale=10.0)
+    assert temperature(field, independent) == pytest.approx(1.0, abs=0.35)
+    assert temperature(field, 2 * independent) == pytest.approx(4.0, rel=0.35)
+    assert temperature(field, np.ones_like(independent)) > 5
+
+
+@pytest.fixture(scope="module")
+def solved():
+    problem, true = photographed(5, 3)
+    start = Point(msgspec.structs.replace(MATERIALS, diffuse=np.full((3, 3), 0.3), specular=np.full((3, 3), 0.1), roughness=np.full(3, 0.4)), [])
+    start = Point(start.materials, [random_light(np.random.default_rng(k), 1) for k in range(3)])
+    return problem, true, naturally(problem, start, PRIOR, NOBODY)
+
+
+def test_materials_in_natural_lights(solved):
+    problem, _, found = solved
+    factor = factor_between(found.point.materials, MATERIALS)
+    assert np.abs(found.point.materials.roughness - MATERIALS.roughness).max() < 0.1
+    whole = (found.point.materials.diffuse + found.point.materials.specular) * factor
+    assert np.abs(whole / (MATERIALS.diffuse + MATERIALS.specular) - 1).max() < 0.15
+
+
+def test_lights_lie_within_their_standard_errors(solved):
+    """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
+    problem, true, found = solved
+    posterior = Posterior(problem, found, PRIOR)
+    within = []
+    for system, u, u_true in zip(posterior.systems, found.log_radiance, true, strict=True):
+        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))).reshape(u.shape)
+        off = u - u_true
+        within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)
+    assert 0.5 < np.mean(within) < 0.9
+    maps = posterior.relative_standard_errors()
+    assert set(maps) == {"room0", "room1", "room2"} and all((m > 0).all() and np.isfinite(m).all() for m in maps.values())
+
+
+def test_order_of_lights_changes_nothing(solved):
+    problem, _, found = solved
+    start = Materials(np.full((3, 3), 0.3), np.full((3, 3), 0.1), np.full(3, 0.4))
+    turned = JointProblem(problem.blocks[::-1], OPERATOR, Loss())
+    lights = [random_light(np.random.default_rng(k), 1) for k in (2, 1, 0)]
+    again = naturally(turned, Point(start, lights), PRIOR, NOBODY).point.materials
+    assert np.allclose(again.vector(), found.point.materials.vector(), rtol=0.02, atol=1e-3)
+
+
+def test_the_gauge_is_held_by_the_prior_of_materials():
+    problem, _ = photographed(6, 1, lobes=50, size=10)
+    prior, theta = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS)
+    assert prior.at(theta).value == pytest.approx(0, abs=1e-12)
+    brighter = theta.copy()
+    brighter[:, [0, 3]] += 0.05
+    assert prior.at(brighter).value > 20
+    rng = np.random.default_rng(0)
+    change = rng.normal(size=theta.shape) * 1e-4
+    at = theta + 0.01 * rng.normal(size=theta.shape)
+    difference = (prior.at(at + change).value - prior.at(at - change).value) / 4
+    assert prior.at(at).gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-2)
+
+
