@@ -24,7 +24,7 @@ from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.solve.lattice import Lattice
 from factorlib.solve.marginal import Field, Marginal, marginal
-from factorlib.solve.natural import LOBES, MaterialPrior, Natural, fields_of, unknowns_of
+from factorlib.solve.natural import MaterialPrior, Natural, fields_of, unknowns_of
 
 
 class Posterior:
@@ -32,7 +32,8 @@ class Posterior:
 
     def __init__(self, problem: JointProblem, answer: Natural, prior: LightPrior):
         self.problem, self.answer = problem, answer
-        self.fields = fields_of(problem, answer.point, prior, answer.temperatures)
+        self.lattice = Lattice.of(answer.log_radiance[0].shape[1])
+        self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.temperatures)
 
     @cached_property
     def systems(self) -> list[Marginal]:
@@ -64,15 +65,15 @@ class Posterior:
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """By illumination, over the light's mean radiance: a small lat-long map in the frame of the exported ones, at most LARGEST."""
-        lattice = Lattice.of(LOBES)
+        lattice, p = self.lattice, len(self.lattice)
         directions = (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
         overlap = np.exp(-0.5 * lattice.sharpness * squared_distances(directions, lattice.axis))
         maps = {}
         for field, system, log_radiance in zip(self.fields, self.systems, self.answer.log_radiance, strict=True):
-            covariance = cho_solve(cho_factor(system.light_hessian), np.eye(3 * LOBES))
+            covariance = cho_solve(cho_factor(system.light_hessian), np.eye(3 * p))
             errors = np.empty((len(directions), 3))
             for c in range(3):
-                own, slope = slice(c * LOBES, (c + 1) * LOBES), overlap * lattice.weight(log_radiance)[:, c]
+                own, slope = slice(c * p, (c + 1) * p), overlap * lattice.weight(log_radiance)[:, c]
                 errors[:, c] = np.sqrt(np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0))
             mean = np.exp(log_radiance).mean(1)
             maps[field.block.name] = np.minimum(errors / mean, LARGEST).reshape(ROWS, 2 * ROWS, 3)

@@ -5,7 +5,7 @@
     bounces   Where shadows go on and interreflection = auto, the light that surfaces send to each other is added, if held-out pixels
               are explained better with it after equally many iterations; further rounds follow
     choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
-    prior     lights with the statistics of natural light instead of lobes, where that explains held-out pixels better (natural)
+    prior     lights with the statistics of natural light, where lobes do not explain held-out pixels well (natural)
     polish    if lights are lobes: brings the answer to its optimum, first on many observations, then on all
 """
 
@@ -28,11 +28,11 @@ from factorlib.solve.descent import Descent, descend
 from factorlib.solve.evidence import Evidence, decide
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
-from factorlib.solve.natural import Natural, naturally
+from factorlib.solve.natural import LOBES, Natural, naturally
 from factorlib.solve.options import Choices
 from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
-from factorlib.solve.thresholds import INTERREFLECTION, LIGHT_PRIOR, SHADOWS, WELL_EXPLAINED
+from factorlib.solve.thresholds import INTERREFLECTION, SHADOWS, WELL_EXPLAINED
 
 MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
 
@@ -102,13 +102,13 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     chosen = with_specular_chosen(problem, fit, start, run)
     natural = with_prior_chosen(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
     decided = (shadows, bounces.evidence, chosen.evidence, curves.evidence)
-    if natural and natural.evidence.kept:
+    if natural:
         return Solution(natural.fit.point, fit.history, problem.loss, chosen.lambertian, *decided, natural.fit, natural.evidence)
     end = polished(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
     found = end.point.materials
     materials = Materials(found.diffuse, np.where(chosen.lambertian[:, None], 0.0, found.specular), found.roughness)
     point = Point(materials, end.point.lights)
-    return Solution(point, end.history, fit.loss, chosen.lambertian, *decided, None, natural.evidence if natural else Evidence(False))
+    return Solution(point, end.history, fit.loss, chosen.lambertian, *decided)
 
 
 def models(problem: JointProblem, choices: Choices) -> dict[str, JointProblem]:
@@ -186,20 +186,19 @@ def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run
 
 
 def with_prior_chosen(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Prior | None:
-    """The fit with a prior on lights, and whether it explains held-out observations better than the lobes of `fit`; None if not tried."""
-    choice = run.options.light_prior
-    well = problem.none_held_out or fit.held_out < WELL_EXPLAINED
+    """The fit with a prior on lights; None where the lobes of `fit` explain held-out observations well, or none are held out."""
+    choice, well = run.options.light_prior, problem.none_held_out or fit.held_out < WELL_EXPLAINED
     if choice == "none" or (choice == "auto" and well):
         return None
     if kept := run.journal.kept("light prior", Prior):
         return kept
     sample = problem.sampled(run.options.sample, run.options.seed)
-    number, lobes = fit.history[-1].round, sum(map(len, fit.point.lights))
+    number, lobes = fit.history[-1].round, LOBES * len(problem.blocks)
     found = naturally(
         sample, fit.point, read_light_prior(), lambertian, lambda k, loss: run.report(Event(number, "light prior", k, loss, np.nan, lobes))
     )
-    evidence = decide(sample.held_out_loss(fit.point), sample.held_out_loss(found.point), LIGHT_PRIOR)
-    return run.journal.keep("light prior", Prior(found, msgspec.structs.replace(evidence, kept=evidence.kept or choice == "on")))
+    losses = [sample.held_out_loss(point) for point in (found.point, fit.point)]
+    return run.journal.keep("light prior", Prior(found, Evidence(True, *losses)))
 
 
 def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Polished:

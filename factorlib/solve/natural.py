@@ -114,14 +114,15 @@ def naturally(
     prior: LightPrior,
     lambertian: Bool[np.ndarray, " m"],
     report: Callable[[int, float], None] = lambda iteration, loss: None,
+    lobes: int = LOBES,
 ) -> Natural:
     """Materials and lights from the observations that are not held out, with a prior on lights.
 
     start: its materials are where the descent begins, its exposures and tone curves stay;  lambertian: materials without specular part;
-    report: called with the number of each iteration and the mean robust loss of what is fitted
+    report: called with the number of each iteration and the mean robust loss of what is fitted;  lobes: of the lattice
     """
-    lattice = Lattice.of(LOBES)
-    fields = fields_of(problem, start, prior, [START_TEMPERATURE] * len(problem.blocks))
+    lattice = Lattice.of(lobes)
+    fields = fields_of(problem, start, prior, lattice, [START_TEMPERATURE] * len(problem.blocks))
     theta, free = unknowns_of(start.materials), np.ones((len(start.materials), 7), bool)
     free[lambertian, 3:] = False
     descent = Descent(problem, MaterialPrior(start.materials, problem.blocks), report)
@@ -139,10 +140,9 @@ def naturally(
     return Natural(Point(found, lights), state.log_radiance, temperatures, state.value)
 
 
-def fields_of(problem: JointProblem, point: Point, prior: LightPrior, temperatures: Sequence[float]) -> list[Field]:
+def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, temperatures: Sequence[float]) -> list[Field]:
     """What each illumination's light is asked by; exposures and tone curves are the point's."""
-    lattice = Lattice.of(LOBES)
-    mean, precision = np.zeros((3, LOBES)), prior.precision(lattice.axis)
+    mean, precision = np.zeros((3, len(lattice))), prior.precision(lattice.axis)
     return [
         Field(block, light, lattice, Reflections(block, lattice, problem.operator), mean, precision, one, ROBUST_SCALE)
         for block, light, one in zip(problem.blocks, point.lights, temperatures, strict=True)
