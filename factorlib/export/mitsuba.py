@@ -56,9 +56,7 @@ class Environment(msgspec.Struct, frozen=True):
     camera_from_light: Float[np.ndarray, "3 3"]
 
 
-def scene_xml(
-    view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT
-) -> str:
+def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT) -> str:
     """The scene as XML; `materials` are those that shapes name, by name."""
     scene = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": max_depth}.items():

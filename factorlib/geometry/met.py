@@ -1,7 +1,7 @@
 """Codes of the surfaces that hide directions: which material a ray meets, and about which normal it has there.
 
-    code = number of the material · BINS + number of the direction of `fibonacci_sphere(BINS)` nearest to the normal
-    UNMET  nothing is met, or it is not known what
+code = number of the material · BINS + number of the direction of `fibonacci_sphere(BINS)` nearest to the normal
+UNMET  nothing is met, or it is not known what
 """
 
 from __future__ import annotations

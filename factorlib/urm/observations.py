@@ -59,7 +59,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of surfaces that hide directions (factorlib.geometry.met); only beside `visibility`
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides directions (geometry.met); with `visibility` alone
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
 
     def __len__(self) -> int:

@@ -96,7 +96,9 @@ def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_s
         return msgspec.structs.replace(part, visibility=np.where(hidden, 0, 255).astype(np.uint8), met=met)
 
     seen = {k: lit(v) for k, v in linked.items()}
-    tables = {c: read_json(run(tmp_path / c, seen, self_shadowing="on", interreflection=c) / "materials.json") for c in ("auto", "on", "off")}
+    tables = {
+        c: read_json(run(tmp_path / c, seen, self_shadowing="on", interreflection=c) / "materials.json") for c in ("auto", "on", "off")
+    }
     models = {c: table["model"] for c, table in tables.items()}
     assert models["on"]["interreflection"] and not models["off"]["interreflection"]
     evidence = models["auto"]["interreflection_chosen_by"]
