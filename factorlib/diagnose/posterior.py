@@ -33,7 +33,7 @@ class Posterior:
     def __init__(self, problem: JointProblem, answer: Natural, prior: LightPrior):
         self.problem, self.answer = problem, answer
         self.lattice = Lattice.of(answer.log_radiance[0].shape[1])
-        self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.temperatures)
+        self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.trusts)
 
     @cached_property
     def systems(self) -> list[Marginal]:

@@ -18,6 +18,7 @@ positive definite functions on spheres", 2013). `factorlib.light.prior_fit` find
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -84,9 +85,22 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return np.zeros((3, len(directions)))
         return np.array(self.profile) @ legendre(directions @ up).T
 
-    def precision(self, directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3p 3p"]:
-        """Inverse covariance of u: log R of all `directions`, then log G, then log B: Σ_k A_kᵀ A_k ⊗ K_k⁻¹."""
-        return sum(np.kron(np.outer(row, row), _inverse(self.covariance(k, directions))) for k, row in enumerate(MIX))
+    def precision(self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)) -> Float[np.ndarray, "3p 3p"]:
+        """Inverse covariance of u: log R of all `directions`, then log G, then log B: Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k²; factors: s_k² of (4)."""
+        of_y = enumerate(zip(MIX, factors, strict=True))
+        return sum(np.kron(np.outer(row, row), _inverse(self.covariance(k, directions)) / factor) for k, (row, factor) in of_y)
+
+    def likeliest_factors(
+        self, directions: Float[np.ndarray, "p 3"], log_radiance: Float[np.ndarray, "3 p"], covariance: Float[np.ndarray, "3p 3p"]
+    ) -> list[float]:
+        """The s_k² of a light that is known as a Gaussian, u with its covariance: one step of expectation maximisation of (4)."""
+        p, factors = len(directions), []
+        by_channel = covariance.reshape(3, p, 3, p)
+        for k, row in enumerate(MIX):
+            inverse, y = _inverse(self.covariance(k, directions)), row @ log_radiance
+            spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
+            factors.append(float((self.freedom[k] + y @ inverse @ y + np.sum(inverse * spread)) / (self.freedom[k] + p)))
+        return factors
 
 
 def correlation(angle: Float[np.ndarray, "*n"], decay: float) -> Float[np.ndarray, "*n"]:

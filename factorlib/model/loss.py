@@ -2,14 +2,12 @@
 
     Σ 2k² (√(1 + r²/k²) − 1)            pseudo-Huber of the whitened residuals r: wrong normals and mask borders pull with bounded force
     + n π Σ_c (E_c/Ē − 1)² / 3          the paper's prior, on summed energies E: variance over channels
-    + ρ(light)                          a prior on lights, where there is one
 
 Gradients and Hessians here are half of the true ones, so that those of Σ r² have no factor 2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -28,21 +26,15 @@ class Quadratic(NamedTuple):
     hessian: Float[np.ndarray, "l l"]
 
 
-LightPrior = Callable[[Block, Light], tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]]
-
-
 class Loss(msgspec.Struct, frozen=True):
     """What a point is judged by.
 
     robust_scale  k of the pseudo-Huber loss, in σ
     prior         weight π of the paper's tint prior
-    light_prior   a prior on lights, for example from captured ones; None: no such prior.  It gives ρ(light), half its gradient and
-                  half its Gauss–Newton Hessian by the light's unknowns (`Light.moved`)
     """
 
     robust_scale: float = 10.0
     prior: float = 1e-4
-    light_prior: LightPrior | None = None
 
     def of_residuals(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Pseudo-Huber loss of each whitened residual."""
@@ -57,10 +49,7 @@ class Loss(msgspec.Struct, frozen=True):
         gradient, hessian = np.zeros(light.unknowns), np.zeros((light.unknowns, light.unknowns))
         lobes = slice(2 * len(light), 6 * len(light))
         value, gradient[lobes], hessian[lobes, lobes] = self._tint(block, light)
-        if self.light_prior is None:
-            return Quadratic(value, gradient, hessian)
-        known, by_unknown, curved = self.light_prior(block, light)
-        return Quadratic(value + known, gradient + by_unknown, hessian + curved)
+        return Quadratic(value, gradient, hessian)
 
     def _tint(self, block: Block, light: Light) -> Quadratic:
         """The tint prior by the unknowns [s, e_R, e_G, e_B] × p, the mean Ē taken to be constant."""

@@ -32,7 +32,7 @@ from factorlib.solve.natural import LOBES, Natural, naturally
 from factorlib.solve.options import Choices
 from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
-from factorlib.solve.thresholds import INTERREFLECTION, SHADOWS, WELL_EXPLAINED
+from factorlib.solve.thresholds import HOPEFUL, INTERREFLECTION, SHADOWS, WELL_EXPLAINED
 
 MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
 
@@ -97,7 +97,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     bounces = with_bounces_chosen(problem, fits["with"], run) if shadows.kept else Bounces(fits["without"], Evidence(False))
     problem, fit = _of_model(problem, shadows.kept, bounces.evidence.kept), bounces.fit
     curves = with_tone_chosen(problem, fit, run)
-    if any(of_light.kept for of_light in curves.evidence):  # what the curves explain had stopped the rounds early
+    if any(of_light.kept for of_light in curves.evidence) and lobes_may_do(fit, run):  # what the curves explain had stopped the rounds early
         fit = further_rounds(problem, fit, curves.point, run)
     chosen = with_specular_chosen(problem, fit, start, run)
     natural = with_prior_chosen(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
@@ -142,9 +142,14 @@ def with_bounces_chosen(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
         return Bounces(fit, Evidence(kept, fit.held_out if kept else None))
     if not (decided := run.journal.kept("bounces", Bounces)):
         decided = run.journal.keep("bounces", _bounces_decided(problem, fit, run))
-    if not decided.evidence.kept:
+    if not (decided.evidence.kept and lobes_may_do(decided.fit, run)):
         return decided
     return Bounces(further_rounds(problem, decided.fit, decided.fit.point, run, "rounds bounces"), decided.evidence)
+
+
+def lobes_may_do(fit: Fit, run: Run) -> bool:
+    """Whether lobes may turn out to explain the photos so well that lights need no prior, or must do without one."""
+    return run.options.light_prior == "none" or fit.held_out < HOPEFUL * WELL_EXPLAINED
 
 
 def _bounces_decided(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
@@ -155,7 +160,7 @@ def _bounces_decided(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
         points.append(near_optimum(sample.with_loss(fit.loss), fit.point).point)
         held_out.append(sample.held_out_loss(points[-1]))
     evidence = decide(*held_out, INTERREFLECTION)
-    return Bounces(msgspec.structs.replace(fit, point=points[1]) if evidence.kept else fit, evidence)
+    return Bounces(msgspec.structs.replace(fit, point=points[1], held_out=held_out[1]) if evidence.kept else fit, evidence)
 
 
 def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:

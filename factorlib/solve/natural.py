@@ -11,7 +11,8 @@ the noise model.  The product of both is the temperature T, by which squared res
 
     T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k,         k: clusters of nearby mirror directions                          (1)
 
-Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.
+Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.  So are the
+factors by which the light's contrast and colour differ from those of a typical light (equation (4) of the prior).
 
 The factor per channel that is free between materials and lights is held by the sum of the materials' reflectances, which stays as it was
 at the start.
@@ -53,16 +54,27 @@ DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
 TOLERANCE = 2e-4  # of (1), the share by which a step must lower it to be followed by another
 
 
+class Trust(msgspec.Struct, frozen=True):
+    """How much one light's observations and prior count.
+
+    temperature   T of (1), by which squared residuals are divided
+    factors       s_k² of the prior: contrast of luminance and of colour beside those of a typical light
+    """
+
+    temperature: float = START_TEMPERATURE
+    factors: list[float] = msgspec.field(default_factory=lambda: [1.0, 1.0, 1.0])
+
+
 class Natural(msgspec.Struct, frozen=True):
     """An answer whose lights follow the prior.
 
-    log_radiance   u of each light, in its block's unit;  temperatures: T of each
+    log_radiance   u of each light, in its block's unit;  trusts: how much its observations and its prior count
     value          minus twice the log marginal likelihood, up to a constant
     """
 
     point: Point
     log_radiance: list[Float[np.ndarray, "3 p"]]
-    temperatures: list[float]
+    trusts: list[Trust]
     value: float
 
 
@@ -122,7 +134,7 @@ def naturally(
     report: called with the number of each iteration and the mean robust loss of what is fitted;  lobes: of the lattice
     """
     lattice = Lattice.of(lobes)
-    fields = fields_of(problem, start, prior, lattice, [START_TEMPERATURE] * len(problem.blocks))
+    fields = fields_of(problem, start, prior, lattice, [Trust()] * len(problem.blocks))
     theta, free = unknowns_of(start.materials), np.ones((len(start.materials), 7), bool)
     free[lambertian, 3:] = False
     descent = Descent(problem, MaterialPrior(start.materials, problem.blocks), report)
@@ -130,22 +142,33 @@ def naturally(
     state = descent.run(fields, theta, lights, np.zeros_like(free), LIGHT_ITERATIONS)
     for iterations in ITERATIONS:
         materials = materials_of(state.theta)
-        residuals = [shown(field, u, materials).residual for field, u in zip(fields, state.log_radiance, strict=True)]
-        temperatures = [temperature(field, residual) for field, residual in zip(fields, residuals, strict=True)]
-        fields = [msgspec.structs.replace(field, temperature=one) for field, one in zip(fields, temperatures, strict=True)]
+        trusts = [trust_in(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
+        fields = [
+            msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(lattice.axis, one.factors))
+            for field, one in zip(fields, trusts, strict=True)
+        ]
         state = descent.run(fields, state.theta, state.log_radiance, free, iterations)
     found = materials_of(state.theta)
     found = Materials(found.diffuse, np.where(lambertian[:, None], LEAST_REFLECTANCE, found.specular), found.roughness)
     lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, start.lights, strict=True)]
-    return Natural(Point(found, lights), state.log_radiance, temperatures, state.value)
+    return Natural(Point(found, lights), state.log_radiance, trusts, state.value)
 
 
-def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, temperatures: Sequence[float]) -> list[Field]:
+def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, trusts: Sequence[Trust]) -> list[Field]:
     """What each illumination's light is asked by; exposures and tone curves are the point's."""
-    mean, precision = np.zeros((3, len(lattice))), prior.precision(lattice.axis)
+    mean = np.zeros((3, len(lattice)))
     return [
-        Field(block, light, lattice, Reflections(block, lattice, problem.operator), mean, precision, one, ROBUST_SCALE)
-        for block, light, one in zip(problem.blocks, point.lights, temperatures, strict=True)
+        Field(
+            block,
+            light,
+            lattice,
+            Reflections(block, lattice, problem.operator),
+            mean,
+            prior.precision(lattice.axis, one.factors),
+            one.temperature,
+            ROBUST_SCALE,
+        )
+        for block, light, one in zip(problem.blocks, point.lights, trusts, strict=True)
     ]
 
 
@@ -165,6 +188,13 @@ def constant(block: Block, materials: Materials, lattice: Lattice) -> Float[np.n
     reflectance = (materials.diffuse + materials.specular)[block.material].mean(0)
     level = np.log(np.maximum(block.radiance.mean(0), 1e-6) / np.maximum(reflectance, LEAST_REFLECTANCE))
     return np.repeat(level[:, None], len(lattice), axis=1)
+
+
+def trust_in(field: Field, part: Marginal, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, prior: LightPrior) -> Trust:
+    """By the residuals and the light that a descent ended with; part: its system there."""
+    covariance = cho_solve(cho_factor(part.light_hessian), np.eye(log_radiance.size))
+    factors = prior.likeliest_factors(field.lattice.axis, log_radiance, covariance)
+    return Trust(temperature(field, shown(field, log_radiance, materials).residual), factors)
 
 
 def temperature(field: Field, residual: Float[np.ndarray, "n 3"]) -> float:

@@ -53,7 +53,7 @@ class Choices(Struct, frozen=True):
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
     light_prior: LightPriors = "auto"
     """Whether lights follow the statistics of natural light (`factorlib.light.prior`) instead of being a few lobes; auto: unless
-    lobes explain held-out observations to .4 of the noise model's variance."""
+    lobes explain held-out observations to .7 of the noise model's variance."""
     seed: Seed = 0
     """Seed of the samples, and of what is held out."""
 

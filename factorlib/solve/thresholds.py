@@ -16,10 +16,10 @@ class Threshold(msgspec.Struct, frozen=True):
 SHADOWS = Threshold(gain=0.0)  # both models have as many unknowns: whichever explains more
 
 # σ² of the noise model.  Where lobes explain held-out observations better, the model of the scene is nearly exact, and lobes show its
-# lights better than any lattice; where worse, its errors would become features of lobes, and lights follow the prior.  Which of both
-# explains held-out observations better cannot decide, for those errors are alike in neighbours: on data/eames lobes do, and their
-# lights are wrong by twice as much.  data/synthetic has .18, data/eames .9 (with bounces; 3 without).
-WELL_EXPLAINED = 0.4
+# lights better than any lattice; where worse, its errors would become features of lobes, and lights follow the prior.  Between
+# data/synthetic (.18) and data/eames (2.6 with bounces, 3.1 without).
+WELL_EXPLAINED = 0.7
+HOPEFUL = 2.0  # times WELL_EXPLAINED: lobes that explain less are not brought nearer to their optimum, if lights may follow the prior
 
 # As many unknowns, too; but both are only brought near their optimum, and the scale of reflectances is no longer free.
 INTERREFLECTION = Threshold(gain=0.01)

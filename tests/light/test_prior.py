@@ -159,3 +159,14 @@ def test_a_file_that_is_no_prior_says_so(tmp_path, text):
     (tmp_path / "table.json").write_text(text)
     with pytest.raises(InputError, match="table.json"):
         read_light_prior(tmp_path / "table.json")
+
+
+def test_a_light_of_twice_the_contrast_gets_four_times_the_covariance():
+    directions = fibonacci_sphere(150)
+    rng, fields = np.random.default_rng(3), []
+    for k in range(3):
+        root = np.linalg.cholesky(KNOWN.covariance(k, directions) + 1e-9 * np.eye(150))
+        fields.append((2.0 if k == 0 else 1.0) * root @ rng.normal(size=150))
+    prior = msgspec.structs.replace(KNOWN, freedom=(3.0, 3.0, 3.0))
+    factors = prior.likeliest_factors(directions, np.linalg.solve(MIX, fields), np.zeros((450, 450)))
+    assert factors[0] == pytest.approx(4, rel=0.3) and factors[1:] == pytest.approx([1, 1], rel=0.3)

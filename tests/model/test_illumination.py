@@ -106,22 +106,3 @@ def test_the_prior_pulls_a_tinted_light_toward_grey(given):
     assert (pull[:p] > 0).all()  # less red
     assert (pull[p : 3 * p] < 0).all()  # more green and blue
     np.testing.assert_allclose(pull[: 3 * p].sum(), 0, atol=1e-9 * np.abs(pull).max())
-
-
-def dimmed(block, light):
-    """A prior that knows lights to be dark: ρ = 0.3 Σ e²."""
-    first, last = 3 * len(light), 6 * len(light)
-    gradient, hessian = np.zeros(light.unknowns), np.zeros((light.unknowns, light.unknowns))
-    gradient[first:last] = 0.3 * light.energy.T.reshape(-1)
-    hessian[range(first, last), range(first, last)] = 0.3
-    return 0.3 * float(np.sum(light.energy**2)), gradient, hessian
-
-
-def test_a_prior_on_light_is_part_of_loss_and_gradient(given):
-    loss = msgspec.structs.replace(UNTINTED, light_prior=dimmed)
-    found, without = normal_equations(given, loss), normal_equations(given, UNTINTED)
-    expected = derivative(lambda d: moved_light(given, d).fit_loss(loss), given.light.unknowns) / 2
-    np.testing.assert_allclose(found.light_gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
-    np.testing.assert_allclose(found.loss, given.fit_loss(loss))
-    assert found.loss > without.loss
-    assert (found.light_hessian - without.light_hessian).trace() == pytest.approx(0.9 * len(given.light))

@@ -46,7 +46,7 @@ def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None,
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in seen}
     folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
     inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
-    quick = {"lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0}
+    quick = {"lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0, "light_prior": "none"}
     solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
     return out
 
