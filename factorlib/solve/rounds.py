@@ -5,7 +5,8 @@
             (all on a sample of the observations, which finds the lobes as well as all of them do)
     best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
     stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
-            evidence), at `lobes` lobes per light, or after `rounds`
+            evidence), at `lobes` lobes per light, or after `rounds`; after `ENOUGH` of them, where lights may follow a prior and lobes
+            explain held-out pixels so badly that they will
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from factorlib.solve.iterate import Iterate, evaluate, fit_weights
 from factorlib.solve.options import Bundle
 from factorlib.solve.roughness import materials_of_best_roughness
 from factorlib.solve.start import starting_light, starting_materials
-from factorlib.solve.thresholds import FAR_BEHIND, HALVED, LEAST_DECREASE
+from factorlib.solve.thresholds import ENOUGH, FAR_BEHIND, HALVED, HOPEFUL, LEAST_DECREASE, WELL_EXPLAINED
 
 A_LOBE = 60  # observations for each lobe of a light, so that lobes do not fit noise
 ROBUST = 2.0  # standard deviations: larger residuals are features of the light that few lobes cannot show
@@ -162,7 +163,8 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
-    over = outdone or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
+    hopeless = bundle.light_prior != "none" and number + 1 >= ENOUGH and min(held_out, rounds.held_out) > HOPEFUL * WELL_EXPLAINED
+    over = outdone or hopeless or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
     best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
     return Rounds(current.point, best, least, history[-1].loss, history, without_gain, bool(over))
 

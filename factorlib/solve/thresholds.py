@@ -19,6 +19,7 @@ SHADOWS = Threshold(gain=0.0)  # both models have as many unknowns: whichever ex
 # lights better than any lattice; where worse, its errors would become features of lobes, and lights follow the prior.  Between
 # data/synthetic (.18) and data/eames (2.6 with bounces, 3.1 without).
 WELL_EXPLAINED = 0.7
+ENOUGH = 5  # rounds, after which lobes of data/synthetic explain to .27; further ones gain little
 HOPEFUL = 2.0  # times WELL_EXPLAINED: lobes that explain less are not brought nearer to their optimum, if lights may follow the prior
 
 # As many unknowns, too; but both are only brought near their optimum, and the scale of reflectances is no longer free.
