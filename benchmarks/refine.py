@@ -154,7 +154,7 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
-    bundle = Bundle(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
+    bundle = Bundle(light_prior="none", rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
     return solve(JointProblem(blocks, operator), from_nothing(3), Run(bundle)).point.materials
 
 

@@ -31,7 +31,7 @@ from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
 
 OPERATOR = reflection_operator("network")
-QUICK = Bundle(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
+QUICK = Bundle(light_prior="none", lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
 FIVE = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2], [0.3, 0.3, 0.05], [0.25, 0.2, 0.3]]),
     specular=np.array([[0.12, 0.12, 0.12], [0.2, 0.2, 0.2], [0.4, 0.35, 0.3], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]),

@@ -28,7 +28,7 @@ from factorlib.urm.observations import Observations
 
 PIXELS, LOBES = 12, 6
 SIDES = (3, 5, 10, 20, 40)
-OPTIONS = Bundle(lobes=12, insert=6, rounds=3, tolerance=1e-3)
+OPTIONS = Bundle(light_prior="none", lobes=12, insert=6, rounds=3, tolerance=1e-3)
 
 
 def run(sides=SIDES, limit_s: float = 600.0) -> dict:

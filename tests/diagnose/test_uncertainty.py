@@ -22,7 +22,7 @@ from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
-FEW_LOBES = Bundle(lobes=16, insert=8, rounds=4, specular="on")
+FEW_LOBES = Bundle(light_prior="none", lobes=16, insert=8, rounds=4, specular="on")
 NOISE = 0.5
 
 

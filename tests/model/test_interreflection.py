@@ -156,7 +156,7 @@ def rooms():
     return [blocks_of_observations(lit_bowls(f"room{i}", 20 + i), Noise(0.02, 0.02))[0] for i in range(2)]
 
 
-QUICK = Bundle(lobes=8, insert=4, rounds=3, iterations=6, polish=8, tolerance=1e-3, self_shadowing="on")
+QUICK = Bundle(light_prior="none", lobes=8, insert=4, rounds=3, iterations=6, polish=8, tolerance=1e-3, self_shadowing="on")
 
 
 def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are(rooms):

@@ -137,7 +137,7 @@ def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
 
 
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(rooms):
-    quick, error = Bundle(lobes=8, insert=4, rounds=3, iterations=10, polish=20, tolerance=1e-3), {}
+    quick, error = Bundle(light_prior="none", lobes=8, insert=4, rounds=3, iterations=10, polish=20, tolerance=1e-3), {}
     for choice in ("off", "auto"):
         problem = JointProblem(rooms, reflection_operator("network"))
         solution = solve(problem, from_nothing(3), Run(msgspec.structs.replace(quick, self_shadowing=choice)))

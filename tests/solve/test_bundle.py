@@ -18,7 +18,7 @@ from factorlib.solve.rounds import answer_of, from_nothing
 from factorlib.stage import serial_map
 
 OPERATOR = reflection_operator("network")
-QUICK = Bundle(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)
+QUICK = Bundle(light_prior="none", lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)
 
 
 def rooms(count=2, lobes=4, photos=1, seed=3):
@@ -94,7 +94,7 @@ def test_neither_threads_nor_processes_change_a_bit():
     operator = reflection_operator("network")
     rng = np.random.default_rng(9)
     blocks = [block(f"room{i}", random_light(rng, 3), MATERIALS, [0, 1, 2], operator, size=12, seed=i) for i in range(3)]
-    bundle = Bundle(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
+    bundle = Bundle(light_prior="none", lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
     def answer(map_):
         point = solve(JointProblem(blocks, operator, spread=map_), from_nothing(3), Run(bundle)).point

@@ -36,7 +36,7 @@ def rooms(materials, shown, noise=0.3):
 
 
 def chosen(materials, shown, **options):
-    bundle = Bundle(lobes=16, insert=6, rounds=3, iterations=12, polish=10, **options)
+    bundle = Bundle(light_prior="none", lobes=16, insert=6, rounds=3, iterations=12, polish=10, **options)
     return solve(JointProblem(rooms(materials, shown), OPERATOR), from_nothing(3), Run(bundle))
 
 

@@ -18,7 +18,7 @@ from factorlib.solve.rounds import from_nothing
 from factorlib.stage import serial_map
 
 OPERATOR = reflection_operator("network")
-BUNDLE = Bundle(lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
+BUNDLE = Bundle(light_prior="none", lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
 
 
 class Killed(Exception):

@@ -15,7 +15,7 @@ from factorlib.solve.options import Bundle
 from factorlib.solve.rounds import from_nothing
 
 OPERATOR = reflection_operator("network")
-QUICK = Bundle(lobes=8, insert=4, rounds=3, iterations=8, polish=15, tolerance=1e-4)
+QUICK = Bundle(light_prior="none", lobes=8, insert=4, rounds=3, iterations=8, polish=15, tolerance=1e-4)
 
 
 def rooms(photos=1):

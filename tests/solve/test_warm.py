@@ -26,7 +26,7 @@ from factorlib.solve.rounds import from_nothing
 from factorlib.solve.warm import Propagation, from_earlier, known_of, with_exposures
 
 OPERATOR = reflection_operator("network")
-BUNDLE = Bundle(lobes=16, insert=4, rounds=6, iterations=10, polish=15, tolerance=1e-3)
+BUNDLE = Bundle(light_prior="none", lobes=16, insert=4, rounds=6, iterations=10, polish=15, tolerance=1e-3)
 NAMES = ["red", "green", "blue"]
 REFLECTANCE, ROUGHNESS, RADIANCE = 0.01, 0.02, 0.01  # how near two answers are, after one factor per channel; noise is .02
 
