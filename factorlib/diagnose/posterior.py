@@ -1,6 +1,7 @@
 """Standard errors of materials and lights that were found with a prior on lights (`factorlib.solve.natural`).
 
-Materials   The information is the Schur complement of the marginal likelihood's system.  As in `factorlib.diagnose.uncertainty` its
+Materials   The information is the Schur complement of the marginal likelihood's system, by reflectances instead of their logarithms, of
+            which a nil reflectance would seem to be known for sure.  As in `factorlib.diagnose.uncertainty` its
             inverse and two sandwiches, over clusters of mirror directions and over whole lights, are compared, and the largest counts.
 Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equation (1) of `factorlib.solve.marginal`).  A map's radiance in
             direction d is Σ_p φ_p(d) w_p with w = exp(u), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation tells
@@ -17,14 +18,15 @@ from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.diagnose.coverage import LARGEST, ROWS
-from factorlib.diagnose.uncertainty import WIDTHS, StandardErrors, clusters_of, in_gauge, residual_deviation, sandwich
+from factorlib.diagnose.uncertainty import WIDTHS, StandardErrors, in_gauge, inverse_of, residual_deviation, sandwich
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior
+from factorlib.model.cells import clusters_of
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.solve.lattice import Lattice
 from factorlib.solve.marginal import Field, Marginal, marginal
-from factorlib.solve.natural import MaterialPrior, Natural, fields_of, unknowns_of
+from factorlib.solve.natural import Natural, fields_of, materials_of, unknowns_of
 
 
 class Posterior:
@@ -33,6 +35,7 @@ class Posterior:
     def __init__(self, problem: JointProblem, answer: Natural, prior: LightPrior):
         self.problem, self.answer = problem, answer
         self.lattice = Lattice.of(answer.log_radiance[0].shape[1])
+        self.materials = materials_of(unknowns_of(answer.point.materials))  # none of whose reflectances is nil
         self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.trusts)
 
     @cached_property
@@ -40,25 +43,25 @@ class Posterior:
         """Of each illumination."""
 
         def system(one: tuple[Field, np.ndarray]) -> Marginal:
+            """Of one illumination and its light."""
             field, log_radiance = one
-            return marginal(field, log_radiance, self.answer.point.materials, clusters_of(field.block))
+            return marginal(field, log_radiance, self.materials, clusters_of(field.block))
 
         return list(self.problem.spread(system, list(zip(self.fields, self.answer.log_radiance, strict=True))))
 
     def standard_errors(self) -> StandardErrors:
         """Standard error of every material unknown."""
-        materials = self.answer.point.materials
-        information = MaterialPrior(materials, self.problem.blocks).at(unknowns_of(materials)).hessian
-        scores, count = [], 7 * len(materials)
+        materials, blocks = self.materials, self.problem.blocks
+        count, widths = 7 * len(materials), np.tile(WIDTHS, len(materials))
+        by_log = 1 / np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(-1)  # ∂ log k/∂k
+        information, scores = np.diag(widths**-2.0), []  # nothing is less known than its range says
         for system in self.systems:
             taken_up = cho_solve(cho_factor(system.light_hessian), system.cross_hessian.T)  # by the light
-            information = information + system.material_hessian - system.cross_hessian @ taken_up
-            scores.append(system.scores[:, :count] - system.scores[:, count:] @ taken_up)
-        inverse = np.linalg.inv(information)
+            information = information + (system.material_hessian - system.cross_hessian @ taken_up) * np.outer(by_log, by_log)
+            scores.append((system.scores[:, :count] - system.scores[:, count:] @ taken_up) * by_log)
+        inverse = inverse_of(information)
         covariances = inverse, sandwich(inverse, np.vstack(scores), 1.0), sandwich(inverse, np.array([s.sum(0) for s in scores]), 1.0)
-        scale = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(-1)  # ∂k/∂ log k
-        blocks, widths = self.problem.blocks, np.tile(WIDTHS, len(materials))
-        variances = [np.diag(in_gauge(covariance * np.outer(scale, scale), materials, blocks)) for covariance in covariances]
+        variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in covariances]
         errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
         deviation = residual_deviation(self.problem, self.answer.point)
         return StandardErrors(Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), deviation)

@@ -28,14 +28,14 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
+from factorlib.model.cells import clusters_of
 from factorlib.model.components import connected_components
 from factorlib.model.gauge import is_free
 from factorlib.model.illumination import Illumination
@@ -51,7 +51,6 @@ GAUGE = "standard errors hold the sum of diffuse + specular over a component's m
 ABSOLUTE = "; in components with interreflection nothing is held fixed"
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
 LEAST_DEVIATION = 1e-4  # of the noise model: what a single observation is explained to says nothing
-CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
 class StandardErrors(NamedTuple):
@@ -72,7 +71,7 @@ def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
     loss = msgspec.structs.replace(problem.loss, robust_scale=max(problem.loss.robust_scale, 1.0))
     system = ArrowSystem([clustered_equations(illumination, loss) for illumination in problem.illuminations(point)])
     information, widths = system.schur_complement(point), np.tile(WIDTHS, count)
-    inverse = _inverse(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
+    inverse = inverse_of(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
     by_cell = system.reduced_scores(point)
     covariances = inverse, sandwich(inverse, np.vstack(by_cell), sigma), sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
     variances = [np.diag(in_gauge(covariance, materials, problem.blocks)) for covariance in covariances]
@@ -92,11 +91,6 @@ def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]
         return np.zeros_like(inverse)
     few = float(student_t.ppf(norm.cdf(1), count - 1))
     return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
-
-
-def clusters_of(block: Block) -> Int[np.ndarray, " n"]:
-    """The number of each observation's cluster."""
-    return np.unique(mirror_cells(block.normal, block.view, CLUSTER), return_inverse=True)[1].reshape(-1)
 
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
@@ -121,7 +115,7 @@ def _gauge_projection(materials: Materials, members: Sequence[int], channel: int
     return np.eye(len(direction)) - np.outer(direction, fixed) / (fixed @ direction)
 
 
-def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+def inverse_of(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     """Of a symmetric positive definite matrix whose rows are of unlike units."""
     scale = 1 / np.sqrt(np.diag(matrix))
     return cho_solve(cho_factor(matrix * np.outer(scale, scale)), np.diag(scale)) * scale[:, None]

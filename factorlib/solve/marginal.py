@@ -1,10 +1,10 @@
 """The marginal likelihood of the materials, the lights integrated out: one illumination's part of it, and its normal equations.
 
-A light is u, log radiance on a lattice; its prior is Gaussian with mean μ and precision Q (`factorlib.light.prior`).  Observations are
+A light is u, log radiance on a lattice; its prior is Gaussian with mean 0 and precision Q (`factorlib.light.prior`).  Observations are
 those of the forward model, with residuals r in σ of the noise model.  Neighbours' residuals err alike, so a squared residual counts as
 1/T of one (`factorlib.solve.natural.temperature`).  Minus twice the log posterior of a light is
 
-    φ(u; θ) = Σ ρ(r)/T + (u − μ)ᵀ Q (u − μ),
+    φ(u; θ) = Σ ρ(r)/T + uᵀ Q u,
 
 and with the light integrated out (Laplace's approximation about the minimising u) minus twice the log marginal likelihood of θ is
 
@@ -39,7 +39,7 @@ class Field(msgspec.Struct, frozen=True):
     """What one illumination's light is asked by: its observations, its prior, and how much they count.
 
     light        gives exposures and tone curves, which stay
-    mean         μ;  precision: Q, channel by channel
+    precision    Q, channel by channel
     temperature  T;  robust_scale: of the pseudo-Huber loss ρ, in σ
     """
 
@@ -47,7 +47,6 @@ class Field(msgspec.Struct, frozen=True):
     light: Light
     lattice: Lattice
     reflections: Reflections
-    mean: Float[np.ndarray, "3 p"]
     precision: Float[np.ndarray, "3p 3p"]
     temperature: float
     robust_scale: float
@@ -112,8 +111,8 @@ def marginal(
     clusters: number of each observation's cluster, from 0, for `Marginal.scores`
     """
     seen, p, count = shown(field, log_radiance, materials), len(field.lattice), 7 * len(materials)
-    off = (log_radiance - field.mean).reshape(-1)
-    gradient, hessian = field.precision @ off, field.precision.copy()
+    u = log_radiance.reshape(-1)
+    gradient, hessian = field.precision @ u, field.precision.copy()
     by_material, of_materials, cross = np.zeros(count), np.zeros((count, count)), np.zeros((count, 3 * p))
     scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, count + 3 * p))
     channels = []
@@ -134,7 +133,7 @@ def marginal(
             channels.append((own, part))
     factor, lower = cho_factor(hessian, lower=True, check_finite=False)
     loss = loss_of(field, seen)
-    total = loss / field.temperature + float(off @ field.precision @ off) + 2 * float(np.log(np.diag(factor)).sum())
+    total = loss / field.temperature + float(u @ field.precision @ u) + 2 * float(np.log(np.diag(factor)).sum())
     covariance = cho_solve((factor, lower), np.eye(3 * p), check_finite=False)
     for own, part in channels:
         slopes = (part.diffuse, part.specular, part.by_roughness)

@@ -28,10 +28,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.geometry.sphere import mirror_cells
 from factorlib.light.prior import LightPrior
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
+from factorlib.model.cells import clusters_of
 from factorlib.model.components import connected_components
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -42,8 +42,8 @@ from factorlib.solve.marginal import Field, Marginal, marginal, shown
 
 LOBES = 400  # of the lattice: 10° apart
 ROBUST_SCALE = 3.0  # σ of the noise model, beyond which a residual is an outlier
-CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 LEAST_TEMPERATURE = 1.0
+LEAST_AT_START = 0.01  # of reflectances: by the logarithm of a smaller one nothing changes, and it would stay where it is
 START_TEMPERATURE = 10.0
 SPREADS = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])  # prior standard deviations of log k_d, log k_s, roughness about the start
 GAUGE = 0.01  # standard deviation of a channel's summed reflectance about that of the start
@@ -135,10 +135,11 @@ def naturally(
     """
     lattice = Lattice.of(lobes)
     fields = fields_of(problem, start, prior, lattice, [Trust()] * len(problem.blocks))
-    theta, free = unknowns_of(start.materials), np.ones((len(start.materials), 7), bool)
+    materials = visible(start.materials, lambertian)
+    theta, free = unknowns_of(materials), np.ones((len(materials), 7), bool)
     free[lambertian, 3:] = False
-    descent = Descent(problem, MaterialPrior(start.materials, problem.blocks), report)
-    lights = [constant(block, start.materials, lattice) for block in problem.blocks]
+    descent = Descent(problem, MaterialPrior(materials, problem.blocks), report)
+    lights = [constant(block, materials, lattice) for block in problem.blocks]
     state = descent.run(fields, theta, lights, np.zeros_like(free), LIGHT_ITERATIONS)
     for iterations in ITERATIONS:
         materials = materials_of(state.theta)
@@ -149,27 +150,31 @@ def naturally(
         ]
         state = descent.run(fields, state.theta, state.log_radiance, free, iterations)
     found = materials_of(state.theta)
-    found = Materials(found.diffuse, np.where(lambertian[:, None], LEAST_REFLECTANCE, found.specular), found.roughness)
+    found = Materials(found.diffuse, np.where(lambertian[:, None], 0.0, found.specular), found.roughness)
     lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, start.lights, strict=True)]
     return Natural(Point(found, lights), state.log_radiance, trusts, state.value)
 
 
 def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, trusts: Sequence[Trust]) -> list[Field]:
     """What each illumination's light is asked by; exposures and tone curves are the point's."""
-    mean = np.zeros((3, len(lattice)))
     return [
         Field(
             block,
             light,
             lattice,
             Reflections(block, lattice, problem.operator),
-            mean,
             prior.precision(lattice.axis, one.factors),
             one.temperature,
             ROBUST_SCALE,
         )
         for block, light, one in zip(problem.blocks, point.lights, trusts, strict=True)
     ]
+
+
+def visible(materials: Materials, lambertian: Bool[np.ndarray, " m"]) -> Materials:
+    """The materials, none of whose reflectances is nil but the specular ones of Lambertian materials."""
+    specular = np.where(lambertian[:, None], materials.specular, np.maximum(materials.specular, LEAST_AT_START))
+    return Materials(np.maximum(materials.diffuse, LEAST_AT_START), specular, materials.roughness)
 
 
 def unknowns_of(materials: Materials) -> Float[np.ndarray, "m 7"]:
@@ -199,10 +204,7 @@ def trust_in(field: Field, part: Marginal, log_radiance: Float[np.ndarray, "3 p"
 
 def temperature(field: Field, residual: Float[np.ndarray, "n 3"]) -> float:
     """T of (1), from residuals no larger than the robust scale."""
-    block = field.block
-    cells = np.column_stack([mirror_cells(block.normal, block.view, CLUSTER), block.photo])
-    number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-    bounded = residual.clip(-field.robust_scale, field.robust_scale)
+    number, bounded = clusters_of(field.block), residual.clip(-field.robust_scale, field.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), LEAST_TEMPERATURE)
 

@@ -163,8 +163,8 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
-    hopeless = bundle.light_prior != "none" and number + 1 >= ENOUGH and min(held_out, rounds.held_out) > HOPEFUL * WELL_EXPLAINED
-    over = outdone or hopeless or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
+    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and min(held_out, rounds.held_out) > HOPEFUL * WELL_EXPLAINED
+    over = outdone or needs_prior or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
     best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
     return Rounds(current.point, best, least, history[-1].loss, history, without_gain, bool(over))
 

@@ -50,7 +50,7 @@ def field_of(problem: JointProblem, lobes: int, temperature: float = 2.0) -> Fie
     lattice, one = Lattice.of(lobes), problem.blocks[0]
     like = random_light(np.random.default_rng(0), 1, len(one.photos))
     precision = PRIOR.precision(lattice.axis)
-    return Field(one, like, lattice, Reflections(one, lattice, OPERATOR), np.zeros((3, lobes)), precision, temperature, 1e3)
+    return Field(one, like, lattice, Reflections(one, lattice, OPERATOR), precision, temperature, 1e3)
 
 
 def test_equal_weights_of_a_lattice_are_a_constant_light():
@@ -93,8 +93,7 @@ def test_gradients_are_finite_differences():
 
     def posterior(u):
         part = marginal(field, u, MATERIALS)
-        off = (u - field.mean).reshape(-1)
-        return part.loss / field.temperature + off @ field.precision @ off
+        return part.loss / field.temperature + u.reshape(-1) @ field.precision @ u.reshape(-1)
 
     for _ in range(3):
         change = rng.normal(size=log_radiance.shape)
@@ -148,6 +147,26 @@ def test_materials_in_natural_lights(solved):
     assert np.abs(found.point.materials.roughness - MATERIALS.roughness).max() < 0.1
     whole = (found.point.materials.diffuse + found.point.materials.specular) * factor
     assert np.abs(whole / (MATERIALS.diffuse + MATERIALS.specular) - 1).max() < 0.15
+
+
+def test_what_starts_nil_is_found_too():
+    """By logarithms nothing would move it."""
+    problem, _ = photographed(8, 2, size=12)
+    nil = Materials(np.full((3, 3), 1e-5), np.full((3, 3), 0.1), np.full(3, 0.4))
+    nil.diffuse[0] = 0.5
+    lights = [random_light(np.random.default_rng(k), 1) for k in range(2)]
+    found = naturally(problem, Point(nil, lights), PRIOR, NOBODY, lobes=FEW).point.materials
+    assert (found.diffuse[1] / found.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
+
+
+def test_a_nil_reflectance_is_not_known_for_sure(solved):
+    problem, _, found = solved
+    materials = found.point.materials
+    nil = msgspec.structs.replace(materials, diffuse=np.where([[False], [False], [True]], 0.0, materials.diffuse))
+    there = msgspec.structs.replace(found, point=Point(nil, found.point.lights))
+    errors, at_nil = (Posterior(problem, one, PRIOR).standard_errors().materials for one in (found, there))
+    assert (at_nil.diffuse[2] > 0.3 * errors.diffuse[2]).all()
+    assert (errors.vector() > 0).all()
 
 
 def test_lights_lie_within_their_standard_errors(solved):

@@ -71,6 +71,17 @@ def test_writes_the_fixed_artifacts(tmp_path, linked):
     assert (out / "convergence.parquet").exists() and (out / "uncertainty.json").exists()
 
 
+def test_lights_with_a_prior_are_a_lattice_with_errors_and_coverage(tmp_path, linked):
+    out = run(tmp_path, linked, light_prior="on")
+    found = read_json(out / "materials.json")
+    assert found["model"]["light_prior"] and found["model"]["lobes"] == {"a": 400, "b": 400}
+    assert set(found["model"]["light_prior_chosen_by"]) == {"held_out_loss_with", "held_out_loss_without"}
+    assert min(min(m["stderr"]["diffuse"]) for m in found["materials"].values()) > 0
+    assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
+    again = read_json(run(tmp_path / "again", linked, start=out) / "materials.json")  # a lattice is no start for a few lobes
+    assert max(again["model"]["lobes"].values()) <= 12 and not again["model"]["light_prior"]
+
+
 def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, linked):
     def hidden(part, kind):
         random = np.random.default_rng(0).integers(0, 2, (len(part), 128))
