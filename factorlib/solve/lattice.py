@@ -106,8 +106,8 @@ class Reflections:
 def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Weights of values at `nodes` that give the interpolating polynomial's value at x, and its derivative there.
 
-    >>> [w.round(9).tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 1.0)]
-    [[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5]]
+    >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
+    [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
     value, slope = np.empty(len(nodes)), np.empty(len(nodes))
     for a, node in enumerate(nodes):
