@@ -1,10 +1,19 @@
-"""How far to believe the normal of each pixel, 0 to 1."""
+"""How far to believe the normal of each pixel, 0 to 1.
+
+A coarse mesh does not say how its surface runs within a face, nor a thin part how it turns within a pixel.  The normal's variance then
+is that of everything else times
+
+    1 + (facet / FACET)² + (turn / TURN)²,                                                                       (1)
+
+facet: largest angle between the face's normal and its corners';  turn: by how much normals turn from pixel to pixel.  Confidence is one
+over that, times what contours, depth jumps, slant and sides say.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from factorlib.align.evidence import Evidence
 from factorlib.geometry.raster import Maps
@@ -15,9 +24,13 @@ INSIDE_OF_SHELL = 0.3  # the inside of an open shell is often another surface th
 DEPTH_JUMP = 0.02  # of the object's depth range to the next pixel: one part may hide another,
 STEEPER = 3.0  # and does if the step is this many times that of a pixel beside it; a slanted surface goes on as it came
 
+# where true normals are known (python -m factorlib.generate eames --seed 11), their median error is 1.1° on faces of less than 5°,
+# 2.3° on those of 10° to 16°, 8° beyond, and 20° where normals turn by more than 20° a pixel
+FACET, TURN = np.radians(12.0), np.radians(20.0)
+
 
 def confidence(maps: Maps, evidence: Evidence) -> Float[np.ndarray, "h w"]:
-    """Product of: distance to where mask and mesh disagree, to the contour and to depth jumps; slant; side seen.
+    """Product of: distance to where mask and mesh disagree, to the contour and to depth jumps; slant; side seen; one over (1).
 
     0 where the mask and the mesh name different materials, where there is no mesh, and where the normal was bent.
     """
@@ -28,7 +41,16 @@ def confidence(maps: Maps, evidence: Evidence) -> Float[np.ndarray, "h w"]:
     extent = max(np.ptp(rows), np.ptp(columns)) + 1
     distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
     result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
-    return result * np.where(maps.back, INSIDE_OF_SHELL, 1.0) * ~maps.bent
+    unsure = (maps.facet / FACET) ** 2 + (turns(maps) / TURN) ** 2
+    return result * np.where(maps.back, INSIDE_OF_SHELL, 1.0) * ~maps.bent / (1 + unsure)
+
+
+def turns(maps: Maps) -> Float[np.ndarray, "h w"]:
+    """Root mean square angle, in radians, of the normals of a pixel and the eight around it that see a mesh about their mean."""
+    seen = (maps.label > 0).astype(float)
+    share = np.maximum(uniform_filter(seen, 3, mode="constant"), 1e-12)
+    mean = np.stack([uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)], axis=-1) / share[..., None]
+    return np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=-1), 0)) * seen
 
 
 def depth_jumps(maps: Maps) -> np.ndarray:

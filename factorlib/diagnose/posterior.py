@@ -24,6 +24,7 @@ from factorlib.light.prior import LightPrior
 from factorlib.model.cells import clusters_of
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
+from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice
 from factorlib.solve.marginal import Field, Marginal, marginal
 from factorlib.solve.natural import Natural, fields_of, materials_of, unknowns_of
@@ -73,7 +74,7 @@ class Posterior:
         overlap = np.exp(-0.5 * lattice.sharpness * squared_distances(directions, lattice.axis))
         maps = {}
         for field, system, log_radiance in zip(self.fields, self.systems, self.answer.log_radiance, strict=True):
-            covariance = cho_solve(cho_factor(system.light_hessian), np.eye(3 * p))
+            covariance = positive_definite_inverse(system.light_hessian).matrix
             errors = np.empty((len(directions), 3))
             for c in range(3):
                 own, slope = slice(c * p, (c + 1) * p), overlap * lattice.weight(log_radiance)[:, c]

@@ -32,6 +32,7 @@ class Maps(msgspec.Struct, frozen=True):
     depth   [h, w] z in mesh units      label [h, w] int, mesh's material    object [h, w] int, from 1
     back    seen from behind            bent  the smooth normal faced away and was bent to face the viewer
     edge    cosine between face normal and view, 0..1
+    facet   largest angle, in radians, between the face's normal and those of its corners: 0 on a flat face or a cut edge
     """
 
     normal: Float[np.ndarray, "h w 3"]
@@ -42,6 +43,7 @@ class Maps(msgspec.Struct, frozen=True):
     back: Bool[np.ndarray, "h w"]
     bent: Bool[np.ndarray, "h w"]
     edge: Float[np.ndarray, "h w"]
+    facet: Float[np.ndarray, "h w"]
 
 
 class Hits(msgspec.Struct, frozen=True):
@@ -90,7 +92,7 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
     shape = camera.height, camera.width
     maps = Maps(
         np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, np.int32),
-        np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape),
+        np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape), np.zeros(shape),
     )  # fmt: skip
     nearest, view = np.full(shape, np.inf), -unit(camera.rays())
     for number, (mesh, pose) in enumerate(zip(meshes, poses, strict=True), start=1):
@@ -109,13 +111,25 @@ def _fill(maps: Maps, wins: Bool[np.ndarray, "h w"], hits: Hits, mesh: Mesh, pos
     u, v = hits.uv[wins].T
     weight = np.stack([1 - u - v, u, v], axis=1)
     smooth = np.einsum("nk,nkd->nd", weight, mesh.normals[corners]) @ pose.rotation.T
-    flat = face_normals(mesh, hits.face[wins]) @ pose.rotation.T
+    own = face_normals(mesh, hits.face[wins])
+    flat = own @ pose.rotation.T
     view = maps.view[wins]
     facing = np.sum(flat * view, axis=1)
     side = np.where(facing < 0, -1.0, 1.0)
     maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
     maps.label[wins] = mesh.face_label[hits.face[wins]]
     maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
+    maps.facet[wins] = facets(mesh.normals[corners], own)
+
+
+def facets(corner: Float[np.ndarray, "n 3 3"], face: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """The largest angle, in radians, between unit normals of a face's three corners and its own, whichever way each points.
+
+    >>> facets(np.array([[[0, 0, 1.0], [0, 0, -1], [0, 1, 0]]]), np.array([[0, 0, 1.0]])).round(3).tolist()
+    [1.571]
+    """
+    cosine = np.abs(np.einsum("nkd,nd->nk", corner, face)).min(1)
+    return np.arccos(np.minimum(cosine, 1.0))
 
 
 def toward_viewer(

@@ -26,12 +26,12 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.model.blocks import Block
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.tone import slope_at, toned
+from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice, Reflected, Reflections
 
 
@@ -131,10 +131,9 @@ def marginal(
                 for k in np.unique(of):
                     scores[k, count + c * p : count + (c + 1) * p] += jacobian[of == k].T @ part.residual[of == k]
             channels.append((own, part))
-    factor, lower = cho_factor(hessian, lower=True, check_finite=False)
+    covariance, log_determinant = positive_definite_inverse(hessian)
     loss = loss_of(field, seen)
-    total = loss / field.temperature + float(u @ field.precision @ u) + 2 * float(np.log(np.diag(factor)).sum())
-    covariance = cho_solve((factor, lower), np.eye(3 * p), check_finite=False)
+    total = loss / field.temperature + float(u @ field.precision @ u) + log_determinant
     for own, part in channels:
         slopes = (part.diffuse, part.specular, part.by_roughness)
         spread = [slope @ covariance[own, own].astype(np.float32) for slope in slopes]

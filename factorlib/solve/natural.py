@@ -37,6 +37,7 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.arrow import damped, masked
+from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice, Reflections
 from factorlib.solve.marginal import Field, Marginal, marginal, shown
 
@@ -197,7 +198,7 @@ def constant(block: Block, materials: Materials, lattice: Lattice) -> Float[np.n
 
 def trust_in(field: Field, part: Marginal, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, prior: LightPrior) -> Trust:
     """By the residuals and the light that a descent ended with; part: its system there."""
-    covariance = cho_solve(cho_factor(part.light_hessian), np.eye(log_radiance.size))
+    covariance = positive_definite_inverse(part.light_hessian).matrix
     factors = prior.likeliest_factors(field.lattice.axis, log_radiance, covariance)
     return Trust(temperature(field, shown(field, log_radiance, materials).residual), factors)
 
