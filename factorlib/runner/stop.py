@@ -6,6 +6,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator
+from types import FrameType
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
 _waiting: list[int] | None = None  # signals that came while nothing may be interrupted
@@ -56,7 +57,7 @@ def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-def _stop(number: int, *_) -> None:
+def _stop(number: int, frame: FrameType | None = None) -> None:
     if _waiting is not None:
         _waiting.append(number)
         return
