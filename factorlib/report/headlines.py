@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import msgspec
 
 from factorlib.report.artifacts import Artifacts
+from factorlib.report.nulls import no_better_than_a_guess
 from factorlib.report.text import number, percent
 from factorlib.results.metrics import MaterialErrors, Metrics, Relighting, Resynthesis
 from factorlib.results.poses import ObjectEntry, PhotoPoses
@@ -73,7 +74,7 @@ def _relighting(found: Relighting | None) -> list[Headline]:
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
     """Sentences about what should be distrusted."""
-    return [*_of_photos(run, metrics), *_of_poses(run), *_of_set(run, metrics)]
+    return [*_of_photos(run, metrics), *_of_poses(run), *_of_set(run, metrics), *no_better_than_a_guess(metrics)]
 
 
 def _of_photos(run: Artifacts, metrics: Metrics) -> list[str]:
