@@ -24,6 +24,7 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
+from factorlib.robust import robust_deviation
 from factorlib.solve.descent import Descent, descend
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.insertion import blurred, candidates, lobes_inserted, pruned
@@ -176,8 +177,7 @@ def robust(problem: JointProblem, point: Point) -> Loss:
     A feature of the light that few lobes cannot show is an outlier among the residuals long before it exceeds the noise model.  With
     the noise model's scale it would bias the materials.
     """
-    absolute = np.abs(np.concatenate(problem.residuals(point)))
-    scale = max(ROBUST * 1.4826 * float(np.median(absolute)), LEAST_ROBUST_SCALE)
+    scale = max(ROBUST * robust_deviation(np.concatenate(problem.residuals(point))), LEAST_ROBUST_SCALE)
     return msgspec.structs.replace(problem.loss, robust_scale=scale)
 
 
