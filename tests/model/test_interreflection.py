@@ -109,6 +109,26 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
     np.testing.assert_allclose(albedo * (open_share[:, None] + sent), seen.radiance, rtol=0.03)
 
 
+def test_facing_plates_of_red_and_white_bleed_and_keep_their_colours():
+    """Two plates that hide three quarters of the light from each other, in constant light 1, with all bounces."""
+    albedo, count, each = np.array([[0.8, 0.8, 0.8], [0.8, 0.1, 0.05]]), 1024, 30
+    open_, hidden = 0.25, 0.75  # of the cosine-weighted hemisphere: what lies within 60° of a plate's normal is the other plate
+    radiance = np.stack([np.linalg.solve([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T], axis=1)
+    material, normal = np.repeat([0, 1], each), np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], each, axis=0)
+    facing = normal @ fibonacci_sphere(count).T > 0.5
+    met = np.where(facing, np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None], UNMET)
+    n = len(material)
+    seen = Observations(
+        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance[material], clipped=np.zeros((n, 3), bool),
+        material=material, photo=np.zeros(n, int), illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n),
+        materials=("white", "red"), photos=("plates",), illuminations=("plates",),
+        visibility=np.where(facing, 0, 255).astype(np.uint8), met=met.astype(np.uint16),
+    )  # fmt: skip
+    assert radiance[0, 0] > 1.2 * radiance[0, 1]  # the white plate looks red
+    sent = bounced_light(seen, seen.radiance)[:, :3]
+    np.testing.assert_allclose(seen.radiance / (open_ + sent), albedo[material], rtol=0.05)
+
+
 def test_nothing_hidden_sends_nothing():
     seen = bowl(0.5)
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
