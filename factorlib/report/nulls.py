@@ -1,4 +1,4 @@
-"""Where an answer is no better than a guess, and why: a number of the page that its null beats has a sentence here.
+"""Where an answer is no better than a guess, and why: one sentence for each score that is worse than its null.
 
 What is compared: each light by its spheres and the colour of its map, and each ball in its recovered light, after a factor per channel
 and photo; each material by roughness and colours; each photo's normals.
@@ -28,7 +28,7 @@ def _lights(found: LightErrors | None) -> Iterator[str]:
         for sphere in SPHERES:
             error, null = scored[sphere].estimate.rmse, scored[sphere].null.rmse
             if error > null:
-                beaten.append(f"a {sphere} sphere in it is wrong by {percent(error)} of the truth, in a constant light by {percent(null)}")
+                beaten.append(f"a {sphere} sphere in it is wrong by {percent(error)} of the truth's RMS, in a constant light by {percent(null)}")
         angle, null_angle = scored["map_all"].estimate.rgb_angle_deg, scored["map_all"].null.rgb_angle_deg
         if angle > null_angle:
             beaten.append(f"its colours are wrong by {number(angle, 1)}°, those of a constant light by {number(null_angle, 1)}°")
@@ -67,7 +67,7 @@ def _materials(found: MaterialErrors | None) -> Iterator[str]:
             if error > null:
                 beaten.append(f"its {part} colour is wrong by {percent(error)}, a grey one by {percent(null)}")
         if beaten:
-            yield f"the material '{name}' is in part no better than a guess: {'; '.join(beaten)}. Its standard errors say how well it is known."
+            yield f"the material '{name}' is in part no better than a guess: {'; '.join(beaten)}. Where normals are wrong, its standard errors are too small, too."
 
 
 def _normals(found: dict[str, NormalError]) -> Iterator[str]:

@@ -36,7 +36,7 @@ from factorlib.solve.lattice import Lattice, Reflected, Reflections
 
 
 class Field(msgspec.Struct, frozen=True):
-    """What one illumination's light is asked by: its observations, its prior, and how much they count.
+    """One illumination: its observations, its lattice, its prior, and how much they count.
 
     light        gives exposures and tone curves, which stay
     precision    Q, channel by channel

@@ -6,10 +6,10 @@ like.  Here the prior says it (`factorlib.light.prior`).  Materials maximise the
 (`factorlib.solve.marginal`).
 
 How much the prior counts against the observations is decided by the observations.  If their residuals were independent, the sum of them
-over a cluster of n would have a variance of n σ².  It is larger by Kish's design effect, and by the residuals' own variance in units of
-the noise model.  The product of both is the temperature T, by which squared residuals are divided:
+over a cluster of n would have a variance of n σ².  It is larger, for residuals are alike (the design effect of L. Kish, Survey Sampling,
+1965) and larger than the noise model says.  The factor is the temperature T, by which squared residuals are divided:
 
-    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k,         k: clusters of nearby mirror directions                          (1)
+    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least 1         k: clusters of nearby mirror directions;  r: in σ, clipped at 3   (1)
 
 Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.  So are the
 factors by which the light's contrast and colour differ from those of a typical light (equation (4) of the prior).
@@ -44,7 +44,7 @@ from factorlib.solve.marginal import Field, Marginal, marginal, shown
 LOBES = 400  # of the lattice: 10° apart
 ROBUST_SCALE = 3.0  # σ of the noise model, beyond which a residual is an outlier
 LEAST_TEMPERATURE = 1.0
-LEAST_AT_START = 0.01  # of reflectances: by the logarithm of a smaller one nothing changes, and it would stay where it is
+LEAST_AT_START = 0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
 START_TEMPERATURE = 10.0
 SPREADS = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])  # prior standard deviations of log k_d, log k_s, roughness about the start
 GAUGE = 0.01  # standard deviation of a channel's summed reflectance about that of the start
@@ -52,7 +52,7 @@ MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one st
 MOST_LOG_RADIANCE = 1.5  # change of a cell's log radiance in one step
 LIGHT_ITERATIONS, ITERATIONS = 6, (20, 20, 10)  # with the start's materials, then with each estimate of the temperatures
 DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
-TOLERANCE = 2e-4  # of (1), the share by which a step must lower it to be followed by another
+TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
 
 
 class Trust(msgspec.Struct, frozen=True):
@@ -136,7 +136,7 @@ def naturally(
     """
     lattice = Lattice.of(lobes)
     fields = fields_of(problem, start, prior, lattice, [Trust()] * len(problem.blocks))
-    materials = visible(start.materials, lambertian)
+    materials = above_zero(start.materials, lambertian)
     theta, free = unknowns_of(materials), np.ones((len(materials), 7), bool)
     free[lambertian, 3:] = False
     descent = Descent(problem, MaterialPrior(materials, problem.blocks), report)
@@ -157,7 +157,7 @@ def naturally(
 
 
 def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, trusts: Sequence[Trust]) -> list[Field]:
-    """What each illumination's light is asked by; exposures and tone curves are the point's."""
+    """One field an illumination: its observations, lattice, prior and temperature; exposures and tone curves are the point's."""
     return [
         Field(
             block,
@@ -172,8 +172,8 @@ def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: L
     ]
 
 
-def visible(materials: Materials, lambertian: Bool[np.ndarray, " m"]) -> Materials:
-    """The materials, none of whose reflectances is nil but the specular ones of Lambertian materials."""
+def above_zero(materials: Materials, lambertian: Bool[np.ndarray, " m"]) -> Materials:
+    """The materials, their reflectances raised to at least `LEAST_AT_START`, except the specular ones of Lambertian materials."""
     specular = np.where(lambertian[:, None], materials.specular, np.maximum(materials.specular, LEAST_AT_START))
     return Materials(np.maximum(materials.diffuse, LEAST_AT_START), specular, materials.roughness)
 
