@@ -59,6 +59,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     total = 10 + len(names)
 
     def report(done: float, pixels: float) -> None:
+        """Pixels of the re-synthesis."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
     model = read_materials(inputs["solve"] / "materials.json").model

@@ -108,6 +108,7 @@ def _checkpoint(inputs: Inputs, part: str) -> Checkpoint:
 
 def _report(progress: Progress, part: str, steps: int) -> Callable[[Step], None]:
     def report(point: Step) -> None:
+        """Errors of held-out samples at a step."""
         progress(
             point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)"
         )

@@ -171,6 +171,7 @@ def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     fixed = [(t.caster, t.pose, target_of(t.evidence, t.caster.mesh.labels, 200)) for t in objects if t.pose and t.evidence.inside.any()]
 
     def misfit(log_focal: float) -> float:
+        """Minus the sum of overlaps (IoU) with the focal length exp(log_focal)."""
         trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
         return -sum(labelled_iou(target.evidence, rasterise(caster, target.camera(trial), pose).label) for caster, pose, target in fixed)
 

@@ -79,6 +79,7 @@ def radiance_toward(light: Light, direction: Float[np.ndarray, "*n 3"], solid_an
     flat = np.concatenate([lv.reshape(-1, 3) for lv in light.levels])
 
     def at(lv: Int[np.ndarray, "*n"]) -> np.ndarray:
+        """The texels of level lv that the directions fall in."""
         return flat[offsets[lv] + (row >> lv) * (SIDE >> lv) + (column >> lv)]
 
     return at(below) * (1 - blend) + at(below + 1) * blend

@@ -83,6 +83,7 @@ def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]
     factors = [gauge_factors(pictures, true, whites, below_white=True) for pictures in kinds]
 
     def gauged(i: int, gauge: str) -> Kinds:
+        """The errors of ball i in one gauge."""
         shown = zip(KINDS, kinds, factors)
         return {k: picture_error(_disc(p[i] * f[gauge][i], inside), _disc(true[i], inside), inside, whites[i]) for k, p, f in shown}
 

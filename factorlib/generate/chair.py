@@ -54,6 +54,7 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
     shifts = rng.normal(0, 0.002, (4, 3))
 
     def bent(part: Part) -> Part:
+        """The part, its vertices moved by smooth waves."""
         vertices, faces = part
         return vertices + np.sin(vertices @ axes.T + phases.T) @ shifts, faces
 

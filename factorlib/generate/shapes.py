@@ -33,6 +33,7 @@ def blob() -> Mesh:
     """A smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Distance of the surface from the centre."""
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)

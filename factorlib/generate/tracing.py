@@ -165,6 +165,7 @@ def _texel_means(faces: dict[str, np.ndarray], height: int, finer: int = 8) -> F
     values = looked_up(faces, directions) * weight
 
     def cells(array: np.ndarray) -> np.ndarray:
+        """Sums over the finer texels of each texel."""
         return array.reshape(height, finer, 2 * height, finer, -1).sum(axis=(1, 3))
 
     return cells(values) / cells(weight)

@@ -42,6 +42,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
     cached: list[np.ndarray] = []
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+        """Rows begin … end − 1; the picture is decoded for the first of them."""
         if not cached:
             cached.append(_decoded(picture, path, key))
         return cached[0][begin:end]

@@ -39,6 +39,7 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
     top, left, height, width = _crop(sizes)
 
     def developed() -> dict[str, np.ndarray]:
+        """The picture and where it is saturated; developed for the first call."""
         if not cached:
             with sensor:
                 pixels, saturated = _developed(rawpy, sensor, path, key), _saturated(sensor)

@@ -46,6 +46,7 @@ def _reader(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], p
     first, picked = min(colours), [c - min(colours) for c in colours]
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+        """Rows begin … end − 1."""
         pixels = source.read_scanlines(spec.y + begin, spec.y + end, 0, first, max(colours) + 1, spec.format)
         return _checked(source, pixels, path, key)[..., picked]
 
@@ -57,6 +58,7 @@ def _of_tiles(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int],
     cached: list[np.ndarray] = []
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
+        """Rows begin … end − 1."""
         if not cached:
             cached.append(_checked(source, source.read_image(spec.format), path, key)[..., colours])
         return cached[0][begin:end]

@@ -90,6 +90,7 @@ def turned_map(lat_long: Map, rotation: Float[np.ndarray, "3 3"], finer: int = 4
     fine = sampled(lat_long, directions @ np.asarray(rotation)) * weight[..., None]
 
     def cells(values: np.ndarray) -> np.ndarray:
+        """Sums over the finer texels of each texel."""
         return values.reshape(height, finer, width, finer, -1).sum(axis=(1, 3))
 
     return cells(fine) / cells(weight)

@@ -167,6 +167,7 @@ def rounded(prior: LightPrior) -> LightPrior:
     """To the digits that a table needs."""
 
     def short(value: float) -> float:
+        """To DIGITS digits."""
         return float(f"{value:.{DIGITS}g}")
 
     names = ("variance", "decay_deg", "level", "nugget", "freedom")

@@ -125,12 +125,14 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
 
     def integrand(theta: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        """Lobe, GGX and shadowing at directions in the lobe's frame, times sin θ."""
         cos, sin = torch.cos(theta), torch.sin(theta)
         ni, oi = nz * cos + sz * sin * cos_phi, oz * cos + sin * (ox * cos_phi + oy * sin_phi)
         nh = (no + ni) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
         return torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2) * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
 
     def cos_arc(theta: Tensor) -> Tensor:
+        """Cosine of the azimuth beyond which light comes from below the surface."""
         return -nz * torch.cos(theta) / (sz * torch.sin(theta))
 
     return over_circles(nodes, *full, integrand) + over_arcs(nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc)
@@ -150,6 +152,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     y_least, y_a, y_b = (torch.asinh(t / alpha) for t in (least, (math.pi / 2 - tilt) / 2, (math.pi / 2 + tilt) / 2))
 
     def integrand(y: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        """Lobe, GGX and shadowing at half vectors θ = α sinh y, times the Jacobian of y."""
         theta = alpha * torch.sinh(y)
         cos, sin = torch.cos(theta), torch.sin(theta)
         oh, zh = no * cos + so * sin * cos_phi, nz * cos + sin * (zx * cos_phi + zy * sin_phi)
@@ -157,6 +160,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
         return lobe * ggx(alpha, cos) * smith(alpha, 2 * oh * cos - no) * 4 * oh * sin * alpha * torch.cosh(y)
 
     def cos_arc(y: Tensor) -> Tensor:
+        """Cosine of the azimuth beyond which light comes from below the surface."""
         return -no / (so * torch.tan(2 * alpha * torch.sinh(y)))
 
     return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)

@@ -60,6 +60,7 @@ def photo_sets() -> Provider:
     from factorlib.dataset.slices import SLICES, dataset_slice
 
     def read(path: Path) -> Data:
+        """The data set of a folder, as the runner sees it."""
         dataset = read_dataset(path)
         take_sigterm_back()
         photos = [photo.name for photo in dataset.spec.photos]
@@ -73,6 +74,7 @@ def _looking_at(dataset: Any) -> Callable[..., list[InputError]]:
 
     @cache
     def validation() -> Any:
+        """Made when it is first asked for, for it imports much."""
         return importlib.import_module("factorlib.validation").Validation(dataset)
 
     return lambda *arguments: validation().faults(*arguments)

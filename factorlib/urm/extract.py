@@ -47,6 +47,7 @@ def observations_of_photo(
     y, x = np.nonzero(seen)
 
     def gather(channels: Channels, names: Sequence[str]) -> np.ndarray:
+        """The named channels at the observed pixels."""
         return np.stack([channels[n][seen] for n in names], axis=-1)
 
     return Observations(

@@ -51,9 +51,11 @@ def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int
     total = np.bincount(group, weight)
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
+        """Weighted mean of each group."""
         return np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
 
     def unit(vectors: np.ndarray) -> np.ndarray:
+        """The vectors at length 1, float32."""
         return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype("f4")
 
     kept = observations.take(first)
