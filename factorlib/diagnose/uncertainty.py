@@ -29,7 +29,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
@@ -45,6 +44,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
 from factorlib.solve.arrow import ArrowSystem
+from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.normal_equations import NormalEquations, normal_equations
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
@@ -118,4 +118,4 @@ def _gauge_projection(materials: Materials, members: Sequence[int], channel: int
 def inverse_of(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     """Of a symmetric positive definite matrix whose rows are of unlike units."""
     scale = 1 / np.sqrt(np.diag(matrix))
-    return cho_solve(cho_factor(matrix * np.outer(scale, scale)), np.diag(scale)) * scale[:, None]
+    return positive_definite_inverse(matrix * np.outer(scale, scale)).matrix * np.outer(scale, scale)

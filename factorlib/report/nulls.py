@@ -10,11 +10,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from factorlib.evaluate.lights import SPHERES
+from factorlib.report.errors import VIEWS
 from factorlib.report.text import number, percent
 from factorlib.results.metrics import LightErrors, MaterialErrors, Metrics, NormalError, Relighting
 
 GAUGE = "channel_per_photo"
-SPHERES = ("mirror", "glossy", "matte")
 
 
 def no_better_than_a_guess(metrics: Metrics) -> list[str]:
@@ -28,7 +29,7 @@ def _lights(found: LightErrors | None) -> Iterator[str]:
         for sphere in SPHERES:
             error, null = scored[sphere].estimate.rmse, scored[sphere].null.rmse
             if error > null:
-                beaten.append(f"a {sphere} sphere in it is wrong by {percent(error)} of the truth's RMS, in a constant light by {percent(null)}")
+                beaten.append(f"a {VIEWS[sphere]} in it is wrong by {percent(error)} of the truth's RMS, in a constant light by {percent(null)}")
         angle, null_angle = scored["map_all"].estimate.rgb_angle_deg, scored["map_all"].null.rgb_angle_deg
         if angle > null_angle:
             beaten.append(f"its colours are wrong by {number(angle, 1)}°, those of a constant light by {number(null_angle, 1)}°")
@@ -40,7 +41,7 @@ def _why(mirrored: float | None) -> str:
     where = "Its coverage shows where it is only a guess"
     if mirrored is None:
         return f"{where}."
-    return f"The photos mirror {percent(mirrored)} of its directions; the others are known through what is matte alone. {where}."
+    return f"The photos mirror {percent(mirrored)} of its directions; the others are known through diffuse reflection alone. {where}."
 
 
 def _balls(found: Relighting | None) -> Iterator[str]:

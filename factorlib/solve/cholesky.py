@@ -18,17 +18,17 @@ class Inverse(NamedTuple):
 
 
 def positive_definite_inverse(matrix: Float[np.ndarray, "n n"]) -> Inverse:
-    """Of a symmetric positive definite matrix: n³ multiplications, a third of what solving with the identity takes.
+    """Of a symmetric positive definite matrix, by LAPACK's potrf and potri: half of what solving with the identity takes.
 
-    Raises LinAlgError where it is not positive definite.
+    Raises LinAlgError where it is not positive definite, or not a number.
 
     >>> positive_definite_inverse(np.array([[4.0, 0.0], [0.0, 0.25]])).matrix.tolist()
     [[0.25, 0.0], [0.0, 4.0]]
     """
     factor, failed = dpotrf(matrix, lower=1, clean=1)
-    if failed:
-        raise LinAlgError(f"the matrix is not positive definite: its leading minor of order {failed} is not")
-    logarithm = 2 * float(np.log(np.diag(factor)).sum())
+    logarithm = np.nan if failed else 2 * float(np.log(np.diag(factor)).sum())
+    if not np.isfinite(logarithm):
+        raise LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite, or not finite")
     inverse, _ = dpotri(factor, lower=1)
     lower = np.tril(inverse, -1)
     return Inverse(lower + lower.T + np.diag(np.diag(inverse)), logarithm)

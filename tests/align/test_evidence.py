@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import trimesh
 
 from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import confidence
+from factorlib.align.confidence import FACET, TURN, confidence, turns
 from factorlib.align.evidence import UNKNOWN, Evidence, label_agreement, labelled_iou, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
 from factorlib.align.target import target_of
@@ -115,8 +116,15 @@ def test_normals_of_a_coarse_round_mesh_are_believed_less_than_those_of_a_fine_o
     assert middle_confidence(trimesh.creation.box()) == 1.0
 
 
-def test_normals_that_turn_within_a_pixel_are_believed_less():
-    assert middle_confidence(ball(subdivisions=4), width=14, height=10) < 0.6 < 0.9 < middle_confidence(ball(subdivisions=4))
+@pytest.mark.parametrize("height", [30, 60, 240])
+def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(height):
+    caster, camera, pose = photo_of(mesh_of([ball(subdivisions=5)], crease_deg=180.0), 3, width=2 * height, height=height, focal=40.0)
+    maps = rasterise(caster, camera, pose)
+    middle, radius = (height // 2, height), 0.75 * height / 2  # pixels
+    expected = np.sqrt(4 / 3) / radius  # of n = (x, y) / radius over 3 × 3 pixels
+    assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
+    believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
+    assert confidence(maps, Evidence(maps.label.astype(np.int16)))[middle] == pytest.approx(believed, rel=0.02)
 
 
 def test_a_small_smooth_object_keeps_its_slanted_normals():
