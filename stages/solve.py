@@ -35,8 +35,9 @@ from factorlib.results.materials import write_materials
 from factorlib.results.solution import Earlier, read_earlier
 from factorlib.results.uncertainty import write_uncertainty
 from factorlib.solve import options
-from factorlib.solve.bundle import Solution, models, solve
+from factorlib.solve.bundle import Solution, models, seen_under_prior, solve
 from factorlib.solve.history import Event, Run
+from factorlib.solve.natural import sure_ones
 from factorlib.solve.options import Bundle, Choices
 from factorlib.solve.paper import Paper, Prior, Samplings
 from factorlib.solve.paper import solve as solve_as_the_paper
@@ -152,8 +153,11 @@ def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple
     """Standard errors of the materials, and relative ones of each light."""
     solution = answer.solution
     if solution.natural:
-        posterior = Posterior(problem.sampled(params.sample, params.seed), solution.natural, read_light_prior())
-        return posterior.standard_errors(), posterior.relative_standard_errors()
+        of_materials, of_lights = (
+            Posterior(seen_under_prior(of, params), found, read_light_prior())
+            for of, found in ((sure_ones(problem), solution.sure), (problem, solution.natural))
+        )
+        return of_materials.standard_errors(), of_lights.relative_standard_errors()
     errors = standard_errors(problem, solution.point)
     lit = problem.illuminations(solution.point)
     return errors, {one.block.name: relative_standard_errors(one, problem.loss, errors.deviation) for one in lit}

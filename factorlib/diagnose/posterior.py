@@ -10,8 +10,6 @@ Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equati
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
@@ -39,14 +37,13 @@ class Posterior:
         self.materials = materials_of(unknowns_of(answer.point.materials))  # none of whose reflectances is nil
         self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.trusts)
 
-    @cached_property
-    def systems(self) -> list[Marginal]:
-        """Of each illumination."""
+    def systems(self, with_scores: bool) -> list[Marginal]:
+        """Of each illumination; with_scores: of clusters of observations, too."""
 
         def system(one: tuple[Field, np.ndarray]) -> Marginal:
             """Of one illumination and its light."""
             field, log_radiance = one
-            return marginal(field, log_radiance, self.materials, clusters_of(field.block))
+            return marginal(field, log_radiance, self.materials, clusters_of(field.block) if with_scores else None)
 
         return list(self.problem.spread(system, list(zip(self.fields, self.answer.log_radiance, strict=True))))
 
@@ -56,7 +53,7 @@ class Posterior:
         count, widths = 7 * len(materials), np.tile(WIDTHS, len(materials))
         by_log = 1 / np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(-1)  # ∂ log k/∂k
         information, scores = np.diag(widths**-2.0), []  # nothing is less known than its range says
-        for system in self.systems:
+        for system in self.systems(with_scores=True):
             taken_up = cho_solve(cho_factor(system.light_hessian), system.cross_hessian.T)  # by the light
             information = information + (system.material_hessian - system.cross_hessian @ taken_up) * np.outer(by_log, by_log)
             scores.append((system.scores[:, :count] - system.scores[:, count:] @ taken_up) * by_log)
@@ -73,7 +70,7 @@ class Posterior:
         directions = (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
         overlap = np.exp(-0.5 * lattice.sharpness * squared_distances(directions, lattice.axis))
         maps = {}
-        for field, system, log_radiance in zip(self.fields, self.systems, self.answer.log_radiance, strict=True):
+        for field, system, log_radiance in zip(self.fields, self.systems(with_scores=False), self.answer.log_radiance, strict=True):
             covariance = positive_definite_inverse(system.light_hessian).matrix
             errors = np.empty((len(directions), 3))
             for c in range(3):

@@ -6,6 +6,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from factorlib.model.noise import Noise
+
 ROWS = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
 
 
@@ -17,6 +19,8 @@ class Block(msgspec.Struct, frozen=True):
     held_out    observations that choose between models and are not fitted
     visibility  how much of each of k directions an observation sees, 0 (nothing) to 255 (all); None: all see everything
     directions  the k directions of `visibility`, in the block's frame, for each of the f photos
+    noise       of which `precision` is the reciprocal
+    confidence  how sure normals are, 0 to 1; None: all are as sure
     bounced     what hidden directions send, by the cosine (RGB) and by a highlight (RGB): G_d and G_s of `factorlib.model.interreflection`,
                 in the block's unit; None: nothing
     """
@@ -35,14 +39,16 @@ class Block(msgspec.Struct, frozen=True):
     visibility: UInt8[np.ndarray, "n k"] | None = None
     directions: Float[np.ndarray, "f k 3"] | None = None
     bounced: Float[np.ndarray, "n 6"] | None = None
+    noise: Noise = Noise()
+    confidence: Float[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """The observations `rows` (numbers or a mask) alone."""
-        where_hidden = {name: getattr(self, name) for name in ("visibility", "bounced")}
-        kept = {name: None if values is None else values[rows] for name, values in where_hidden.items()}
+        further = {name: getattr(self, name) for name in ("visibility", "bounced", "confidence")}
+        kept = {name: None if values is None else values[rows] for name, values in further.items()}
         return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, **kept)
 
     def fitted(self) -> Block:
@@ -69,6 +75,10 @@ class Block(msgspec.Struct, frozen=True):
     def without_bounces(self) -> Block:
         """The same observations, as if what hides the light were black."""
         return msgspec.structs.replace(self, bounced=None)
+
+    def with_noise(self, noise: Noise) -> Block:
+        """The same observations, which are expected to be off by as much as another noise model says."""
+        return msgspec.structs.replace(self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""

@@ -17,8 +17,11 @@ class Noise(msgspec.Struct, frozen=True):
     relative: float = 0.05
     most_weight: float = 8.0  # a merged observation counts as this many independent ones at most
 
+    def sigma(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """σ of one pixel."""
+        return np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
+
     def precision(self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """√weight/σ of observations, their weights limited."""
-        sigma = np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
         limited = weight / (1 + weight / self.most_weight)
-        return np.sqrt(limited)[:, None] / sigma
+        return np.sqrt(limited)[:, None] / self.sigma(radiance)

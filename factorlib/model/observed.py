@@ -76,6 +76,7 @@ def _block(seen: Observations, name: str, how: _How) -> Block:
     return Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), how.noise.precision(scaled, seen.weight),
         seen.material.astype(np.int64), local, held_out, *_visibility(seen, photos, how.world_from_camera), _bounced(seen, scaled),
+        how.noise, None if seen.confidence is None else seen.confidence.astype(float),
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from factorlib.solve.descent import Descent, descend
 from factorlib.solve.evidence import Evidence, decide
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
-from factorlib.solve.natural import LOBES, Natural, naturally
+from factorlib.solve.natural import LOBES, OBSERVATIONS, Natural, lights_from_all, naturally, sure_ones
 from factorlib.solve.options import Choices
 from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
@@ -43,7 +43,7 @@ class Solution(msgspec.Struct, frozen=True):
     history     every accepted point on the way;  loss: the loss function that was lowered last
     lambertian  materials without specular part
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
-    natural     the lights with a prior, where they are such;  light_prior: the evidence for that
+    natural     the lights with a prior, where they are such, and sure: those of sure observations alone;  light_prior: the evidence for the prior
     specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
     """
 
@@ -56,6 +56,7 @@ class Solution(msgspec.Struct, frozen=True):
     specular: list[Evidence] = []
     tone: list[Evidence] = []
     natural: Natural | None = None
+    sure: Natural | None = None
     light_prior: Evidence = Evidence(False)
 
     def shown(self, problem: JointProblem) -> JointProblem:
@@ -71,9 +72,10 @@ class Bounces(msgspec.Struct, frozen=True):
 
 
 class Prior(msgspec.Struct, frozen=True):
-    """The fit with a prior on lights, and the evidence for it."""
+    """The fit with a prior on lights, and the evidence for it; sure: the fit to sure observations alone, whose materials it has."""
 
     fit: Natural
+    sure: Natural
     evidence: Evidence
 
 
@@ -103,7 +105,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     natural = with_prior_chosen(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
     decided = (shadows, bounces.evidence, chosen.evidence, curves.evidence)
     if natural:
-        return Solution(natural.fit.point, fit.history, problem.loss, chosen.lambertian, *decided, natural.fit, natural.evidence)
+        return Solution(natural.fit.point, fit.history, problem.loss, chosen.lambertian, *decided, natural.fit, natural.sure, natural.evidence)
     end = polished(problem, msgspec.structs.replace(fit, point=chosen.point), chosen.lambertian, run)
     found = end.point.materials
     materials = Materials(found.diffuse, np.where(chosen.lambertian[:, None], 0.0, found.specular), found.roughness)
@@ -197,13 +199,19 @@ def with_prior_chosen(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarr
         return None
     if kept := run.journal.kept("light prior", Prior):
         return kept
-    sample = problem.sampled(run.options.sample, run.options.seed)
+    sample, sure = (seen_under_prior(of, run.options) for of in (problem, sure_ones(problem)))
     number, lobes = fit.history[-1].round, LOBES * len(problem.blocks)
-    found = naturally(
-        sample, fit.point, read_light_prior(), lambertian, lambda k, loss: run.report(Event(number, "light prior", k, loss, np.nan, lobes))
+    of_sure = naturally(
+        sure, fit.point, read_light_prior(), lambertian, lambda k, loss: run.report(Event(number, "light prior", k, loss, np.nan, lobes))
     )
+    found = lights_from_all(sample, of_sure, read_light_prior())
     losses = [sample.held_out_loss(point) for point in (found.point, fit.point)]
-    return run.journal.keep("light prior", Prior(found, Evidence(True, *losses)))
+    return run.journal.keep("light prior", Prior(found, of_sure, Evidence(True, *losses)))
+
+
+def seen_under_prior(problem: JointProblem, choices: Choices) -> JointProblem:
+    """As many observations as lights with a prior are found from."""
+    return problem.sampled(max(choices.sample, OBSERVATIONS), choices.seed)
 
 
 def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Polished:

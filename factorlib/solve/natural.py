@@ -14,6 +14,10 @@ over a cluster of n would have a variance of n σ².  It is larger, for residual
 Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.  So are the
 factors by which the light's contrast and colour differ from those of a typical light (equation (4) of the prior).
 
+Materials are found from the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
+rougher than it is, however little it weighs.  Lights are found once more from all observations, given those materials (`lights_from_all`):
+rims and thin parts show directions that nothing else shows.
+
 The factor per channel that is free between materials and lights is held by the sum of the materials' reflectances, which stays as it was
 at the start.
 """
@@ -36,12 +40,16 @@ from factorlib.model.components import connected_components
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
+from factorlib.robust import weighted_median
 from factorlib.solve.arrow import damped, masked
 from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice, Reflections
 from factorlib.solve.marginal import Field, Marginal, marginal, shown
 
 LOBES = 400  # of the lattice: 10° apart
+OBSERVATIONS = 5000  # of an illumination: materials follow from those in highlights, which are few
+SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
+DARK = 0.2  # of the noise model's absolute part is left: a lattice leaves out less of the light than a few lobes do
 ROBUST_SCALE = 3.0  # σ of the noise model, beyond which a residual is an outlier
 LEAST_TEMPERATURE = 1.0
 LEAST_AT_START = 0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
@@ -51,6 +59,7 @@ GAUGE = 0.01  # standard deviation of a channel's summed reflectance about that 
 MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
 MOST_LOG_RADIANCE = 1.5  # change of a cell's log radiance in one step
 LIGHT_ITERATIONS, ITERATIONS = 6, (20, 20, 10)  # with the start's materials, then with each estimate of the temperatures
+LIGHTS_AGAIN = (10, 10)  # iterations with each estimate of the temperatures, materials given
 DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
 TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
 
@@ -145,15 +154,54 @@ def naturally(
     for iterations in ITERATIONS:
         materials = materials_of(state.theta)
         trusts = [trust_in(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
-        fields = [
-            msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(lattice.axis, one.factors))
-            for field, one in zip(fields, trusts, strict=True)
-        ]
+        fields = trusted(fields, trusts, prior)
         state = descent.run(fields, state.theta, state.log_radiance, free, iterations)
     found = materials_of(state.theta)
     found = Materials(found.diffuse, np.where(lambertian[:, None], 0.0, found.specular), found.roughness)
     lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, start.lights, strict=True)]
     return Natural(Point(found, lights), state.log_radiance, trusts, state.value)
+
+
+def lights_from_all(problem: JointProblem, found: Natural, prior: LightPrior) -> Natural:
+    """The lights that all observations of `problem` show, given the materials of an answer that began with some of them."""
+    lattice, materials = Lattice.of(found.log_radiance[0].shape[1]), found.point.materials
+    positive = above_zero(materials, (materials.specular == 0).all(1))
+    descent, fixed = Descent(problem, MaterialPrior(positive, problem.blocks), lambda iteration, loss: None), np.zeros((len(materials), 7), bool)
+    fields, lights, trusts = fields_of(problem, found.point, prior, lattice, found.trusts), found.log_radiance, found.trusts
+    for iterations in LIGHTS_AGAIN:
+        state = descent.run(fields, unknowns_of(positive), lights, fixed, iterations)
+        lights = state.log_radiance
+        trusts = [trust_in(*one, positive, prior) for one in zip(fields, state.parts, lights, strict=True)]
+        fields = trusted(fields, trusts, prior)
+    shown_as = [lattice.light(u, light) for u, light in zip(lights, found.point.lights, strict=True)]
+    return Natural(Point(materials, shown_as), lights, trusts, state.value)
+
+
+def trusted(fields: Sequence[Field], trusts: Sequence[Trust], prior: LightPrior) -> list[Field]:
+    """The fields with other temperatures and factors of the prior."""
+    return [
+        msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(field.lattice.axis, one.factors))
+        for field, one in zip(fields, trusts, strict=True)
+    ]
+
+
+def sure_ones(problem: JointProblem) -> JointProblem:
+    """The observations that materials are found from: those whose normals are sure, with less noise in the dark."""
+    blocks = [block.take(sure(block)) for block in problem.blocks]
+    blocks = [block.with_noise(msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute)) for block in blocks]
+    return msgspec.structs.replace(problem, blocks=blocks)
+
+
+def sure(block: Block) -> Bool[np.ndarray, " n"]:
+    """Whether the normal is at least `SURE` times as sure as the typical one of its material, which is the median by weight."""
+    result = np.ones(len(block), bool)
+    if block.confidence is None:
+        return result
+    weight = np.square(block.precision * block.noise.sigma(block.radiance)).max(1)
+    for m in np.unique(block.material):
+        rows = block.material == m
+        result[rows] = block.confidence[rows] >= SURE * weighted_median(block.confidence[rows], weight[rows])
+    return result
 
 
 def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, trusts: Sequence[Trust]) -> list[Field]:

@@ -37,7 +37,7 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
 def observations_of_photo(
     photo: Channels, geometry: Channels, taken: Taken, materials: Sequence[str], least_confidence: float = 0.0
 ) -> Observations:
-    """One observation per observed pixel, in row order; `weight` is the confidence of its normal, 0 to 1.
+    """One observation per observed pixel, in row order; `weight` and `confidence` are the confidence of its normal, 0 to 1.
 
     photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
     geometry:  channels normal.x/y/z, view.x/y/z, label, confidence of the stage `align`
@@ -61,6 +61,7 @@ def observations_of_photo(
         x=x.astype("i4"),
         y=y.astype("i4"),
         weight=geometry["confidence"][seen],
+        confidence=geometry["confidence"][seen],
         materials=tuple(materials),
         photos=(taken.photo,),
         illuminations=(taken.illumination,),

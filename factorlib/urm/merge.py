@@ -2,7 +2,7 @@
 
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
 Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean: normal, view and radiance alike, so that what is lost is second order in the cell's size.
+mean: normal, view, radiance and confidence alike, so that what is lost is second order in the cell's size.
 
 Radiance is linear in visibility, whose mean is thus what the mean radiance shows.  But on a flat seat all points would
 become one, and what their shadows tell of the light be lost: points merge only where what is hidden from them lies
@@ -68,6 +68,7 @@ def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int
         **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
         visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
         met=kept.met,
+        confidence=None if observations.confidence is None else (np.bincount(group, weight * observations.confidence) / total).astype("f4"),
     )
 
 

@@ -4,7 +4,8 @@ The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, ra
 indices and the units in the schema metadata under the key `factorlib`.
 
 `visibility`, where some observation does not see every direction, is a further column of K bytes: the share of each
-direction of `fibonacci_sphere(K)` that is seen, 0 to 255.  `met`, beside it, says which surface hides a direction.
+direction of `fibonacci_sphere(K)` that is seen, 0 to 255.  `met`, beside it, says which surface hides a direction.  `confidence`, which a file
+need not have, says how sure each normal is; `weight` is the same until observations are sampled or merged.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class Observations(msgspec.Struct, frozen=True):
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
     met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides directions (geometry.met); with `visibility` alone
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
+    confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -72,21 +74,23 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        wide = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in WIDE}
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, **wide)
+        further = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in (*WIDE, *OPTIONAL)}
+        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, **further)
 
 
 COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
+OPTIONAL = ("confidence",)  # columns that need not be there
 WIDE = {"visibility": np.dtype("u1"), "met": np.dtype("<u2")}  # K values a row, where there are any
 NOTHING = {"visibility": 255, "met": UNMET}  # of observations that see everything
 DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
-          "x": "i4", "y": "i4", "weight": "f4"}  # fmt: skip
+          "x": "i4", "y": "i4", "weight": "f4", "confidence": "f4"}  # fmt: skip
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns, and `visibility` and `met`, where there is one."""
+    """Write the fixed Parquet columns, and `confidence`, `visibility` and `met`, where there is one."""
     columns = {}
-    for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:]):
+    given = [name for name in OPTIONAL if getattr(observations, name) is not None]
+    for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:], *given):
         dtype = DTYPES.get(name, "f4")
         values = np.ascontiguousarray(getattr(observations, name), dtype=dtype)
         flat = pa.array(values.reshape(-1))
@@ -105,9 +109,9 @@ def write_observations(path: str | Path, observations: Observations) -> None:
 
 def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
-    parts, about = read_columns(path, WHAT, COLUMNS, tuple(WIDE), CURE)
+    parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
-        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in COLUMNS}
+        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in (*COLUMNS, *OPTIONAL) if name in parts}
         columns |= {name: _of_bytes(parts[name], dtype) for name, dtype in WIDE.items() if name in parts}
         named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
@@ -124,6 +128,8 @@ def _check(observations: Observations) -> None:
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
     if observations.exposures and len(observations.exposures) != len(observations.photos):
         raise ValueError("its exposures are not one a photo")
+    if observations.confidence is not None and not ((observations.confidence >= 0) & (observations.confidence <= 1)).all():
+        raise ValueError("column 'confidence' is not between 0 and 1")
     if observations.met is not None:
         if observations.visibility is None or observations.visibility.shape != observations.met.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
@@ -145,6 +151,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         columns[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     columns |= {name: _of_all(parts, name) for name in WIDE}
+    if any(part.confidence is not None for part in parts):
+        columns["confidence"] = np.concatenate([np.ones(len(p), "f4") if p.confidence is None else p.confidence for p in parts])
     return Observations(**columns, materials=materials, **names, exposures=tuple(exposures.get(p) for p in names["photos"]))
 
 
