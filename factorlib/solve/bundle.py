@@ -201,10 +201,16 @@ def with_prior_chosen(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarr
         return kept
     sample, sure = (seen_under_prior(of, run.options) for of in (problem, sure_ones(problem)))
     number, lobes = fit.history[-1].round, LOBES * len(problem.blocks)
-    of_sure = naturally(
-        sure, fit.point, read_light_prior(), lambertian, lambda k, loss: run.report(Event(number, "light prior", k, loss, np.nan, lobes))
-    )
-    found = lights_from_all(sample, of_sure, read_light_prior())
+
+    def report(iteration: int, loss: float) -> None:
+        """Of an iteration with a prior on lights."""
+        run.report(Event(number, "light prior", iteration, loss, np.nan, lobes))
+
+    of_sure = run.journal.kept("materials under the light prior", Natural)
+    if not of_sure:
+        of_sure = naturally(sure, fit.point, read_light_prior(), lambertian, report)
+        of_sure = run.journal.keep("materials under the light prior", of_sure)
+    found = lights_from_all(sample, of_sure, read_light_prior(), report)
     losses = [sample.held_out_loss(point) for point in (found.point, fit.point)]
     return run.journal.keep("light prior", Prior(found, of_sure, Evidence(True, *losses)))
 

@@ -162,11 +162,13 @@ def naturally(
     return Natural(Point(found, lights), state.log_radiance, trusts, state.value)
 
 
-def lights_from_all(problem: JointProblem, found: Natural, prior: LightPrior) -> Natural:
-    """The lights that all observations of `problem` show, given the materials of an answer that began with some of them."""
+def lights_from_all(
+    problem: JointProblem, found: Natural, prior: LightPrior, report: Callable[[int, float], None] = lambda iteration, loss: None
+) -> Natural:
+    """The lights that all observations of `problem` show, given the materials of an answer that was found from some of them; report: as above."""
     lattice, materials = Lattice.of(found.log_radiance[0].shape[1]), found.point.materials
     positive = above_zero(materials, (materials.specular == 0).all(1))
-    descent, fixed = Descent(problem, MaterialPrior(positive, problem.blocks), lambda iteration, loss: None), np.zeros((len(materials), 7), bool)
+    descent, fixed = Descent(problem, MaterialPrior(positive, problem.blocks), report), np.zeros((len(materials), 7), bool)
     fields, lights, trusts = fields_of(problem, found.point, prior, lattice, found.trusts), found.log_radiance, found.trusts
     for iterations in LIGHTS_AGAIN:
         state = descent.run(fields, unknowns_of(positive), lights, fixed, iterations)

@@ -38,7 +38,7 @@ class Choices(Struct, frozen=True):
     settle: Polish = 2
     """Iterations of the descent at the very end, on all observations."""
     sample: Sample = 1500
-    """Least number of observations of an illumination on which lobes are chosen; 60 for each lobe where that is more."""
+    """Least number of observations of an illumination on which lobes are chosen; 60 for each lobe where that is more, and 5,000 under the light prior."""
     tolerance: Tolerance = 1e-3
     """A descent stops after two steps that lower the loss by less than this share of it."""
     least_gain: Share = 0.01
@@ -53,7 +53,7 @@ class Choices(Struct, frozen=True):
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
     light_prior: LightPriors = "auto"
     """Whether lights follow the statistics of natural light (`factorlib.light.prior`) instead of being a few lobes; auto: unless
-    lobes explain held-out observations to .7 of the noise model's variance."""
+    lobes explain held-out observations to .35 of the noise model's variance."""
     seed: Seed = 0
     """Seed of the samples, and of what is held out."""
 

@@ -10,13 +10,24 @@ from factorlib.light.prior import MIX, read_light_prior
 from factorlib.model.lights import UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import unit_values
 from factorlib.reflection import reflection_operator
 from factorlib.solve.lattice import NODES, Lattice, Reflections
 from factorlib.solve.marginal import Field, marginal
-from factorlib.solve.natural import LOBES, MaterialPrior, materials_of, naturally, temperature, unknowns_of
+from factorlib.solve.natural import (
+    DARK,
+    LOBES,
+    MaterialPrior,
+    lights_from_all,
+    materials_of,
+    naturally,
+    sure_ones,
+    temperature,
+    unknowns_of,
+)
 
 FEW = 120  # lobes of a lattice, so that tests are quick
 OPERATOR, PRIOR, NOBODY = reflection_operator("network"), read_light_prior(), np.zeros(3, bool)
@@ -182,6 +193,47 @@ def test_lights_lie_within_their_standard_errors(solved):
     assert 0.5 < np.mean(within) < 0.9
     maps = posterior.relative_standard_errors()
     assert set(maps) == {"room0", "room1", "room2"} and all((m > 0).all() and np.isfinite(m).all() for m in maps.values())
+
+
+def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
+    problem, _ = photographed(9, 1, lobes=40, size=10)
+    one = problem.blocks[0]
+    one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
+    unsure = np.arange(len(one)) % 3 == 0
+    told = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
+    (kept,) = sure_ones(JointProblem([told], OPERATOR, Loss())).blocks
+    assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
+    noise = Noise(DARK * one.noise.absolute, one.noise.relative)
+    assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
+
+
+def test_what_is_alike_unsure_is_used():
+    """Legs of few pixels are all a material has: sure is what is as sure as the rest of the same material."""
+    problem, _ = photographed(9, 1, lobes=40, size=10)
+    one = problem.blocks[0]
+    told = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
+    for given in (told, one):
+        assert len(sure_ones(JointProblem([given], OPERATOR, Loss())).blocks[0]) == len(one)
+
+
+def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
+    problem, _, found = solved
+    again = lights_from_all(problem, found, PRIOR)
+    assert np.array_equal(again.point.materials.vector(), found.point.materials.vector())
+    systems = Posterior(problem, found, PRIOR).systems(with_scores=False)
+    for system, u, u_again in zip(systems, found.log_radiance, again.log_radiance, strict=True):
+        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))).reshape(u.shape)
+        assert np.mean(np.abs(u_again - u) < deviation) > 0.95
+
+
+def test_lights_from_all_show_what_the_others_alone_see(solved):
+    """Found from a half of the observations, given the true materials, lights explain the other half better afterwards."""
+    problem, _, found = solved
+    half = [msgspec.structs.replace(b, confidence=np.where(b.normal[:, 0] > 0, 0.9, 0.1)) for b in problem.blocks]
+    start = Point(found.point.materials, found.point.lights)
+    of_half = naturally(sure_ones(msgspec.structs.replace(problem, blocks=half)), start, PRIOR, NOBODY, lobes=FEW)
+    others = msgspec.structs.replace(problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks])
+    assert others.held_out_loss(lights_from_all(problem, of_half, PRIOR).point) < 0.5 * others.held_out_loss(of_half.point)
 
 
 def test_order_of_lights_changes_nothing():

@@ -1,3 +1,4 @@
+import msgspec
 import numpy as np
 import pytest
 
@@ -5,7 +6,7 @@ from factorlib.conventions import FRONT
 from factorlib.errors import InputError
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
-from factorlib.urm.observations import COLUMNS, concatenate, read_observations, write_observations
+from factorlib.urm.observations import COLUMNS, OPTIONAL, concatenate, read_observations, write_observations
 
 
 def photo_and_geometry(size=64):
@@ -49,11 +50,12 @@ def test_half_of_a_normal_facing_the_viewer_is_the_front():
 
 def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path):
     seen = observations()
+    seen = msgspec.structs.replace(seen, confidence=np.linspace(0, 1, len(seen)).astype("f4"))
     write_observations(tmp_path / "a.parquet", seen)
     write_observations(tmp_path / "b.parquet", read_observations(tmp_path / "a.parquet"))
     again = read_observations(tmp_path / "b.parquet")
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
-    for name in COLUMNS:
+    for name in (*COLUMNS, *OPTIONAL):
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name).astype(getattr(again, name).dtype))
     assert (again.materials, again.photos) == (("red", "white"), ("kitchen",))
 
@@ -62,6 +64,23 @@ def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
     (tmp_path / "x.parquet").write_bytes(b"PAR1 nonsense")
     with pytest.raises(InputError, match="not readable as a reflectance map"):
         read_observations(tmp_path / "x.parquet")
+
+
+def test_a_map_need_not_say_how_sure_normals_are(tmp_path):
+    seen = observations()
+    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, confidence=None))
+    assert read_observations(tmp_path / "a.parquet").confidence is None
+    half = msgspec.structs.replace(observations("hall", "hall"), confidence=np.full(len(seen), 0.5, "f4"))
+    both = concatenate([half, read_observations(tmp_path / "a.parquet")])
+    assert {float(both.confidence[both.photo == k].mean()) for k in range(2)} == {0.5, 1.0}
+
+
+@pytest.mark.parametrize("confidence", [1.5, -0.1, np.nan])
+def test_a_confidence_that_is_none_is_refused(tmp_path, confidence):
+    seen = observations()
+    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, confidence=np.full(len(seen), confidence)))
+    with pytest.raises(InputError, match="'confidence' is not between 0 and 1"):
+        read_observations(tmp_path / "a.parquet")
 
 
 def test_the_order_of_photos_changes_nothing():
@@ -86,6 +105,14 @@ def test_merging_keeps_weight_and_mean_and_moves_normals_by_less_than_a_cell(deg
     nearest = np.arccos(np.clip((seen.normal @ merged.normal.T).max(1), -1, 1))
     assert np.degrees(nearest.max()) < 1.5 * degrees
     np.testing.assert_allclose(np.linalg.norm(merged.normal, axis=1), 1, atol=1e-5)
+
+
+def test_merging_takes_the_weighted_mean_of_confidence():
+    seen = observations()
+    sure = np.random.default_rng(0).uniform(0.1, 1, len(seen)).astype("f4")
+    merged = merge(msgspec.structs.replace(seen, weight=sure, confidence=sure), 10.0)
+    np.testing.assert_allclose((merged.weight * merged.confidence).sum(), np.square(sure).sum(), rtol=1e-5)
+    assert 0.1 <= merged.confidence.min() and merged.confidence.max() <= 1
 
 
 def test_merging_never_mixes_clipped_with_unclipped():
