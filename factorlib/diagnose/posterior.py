@@ -25,7 +25,8 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice
 from factorlib.solve.marginal import Field, Marginal, marginal
-from factorlib.solve.natural import Natural, fields_of, materials_of, unknowns_of
+from factorlib.solve.marginal_descent import materials_of, unknowns_of
+from factorlib.solve.natural import Natural, fields_of
 
 
 class Posterior:
@@ -35,7 +36,7 @@ class Posterior:
         self.problem, self.answer = problem, answer
         self.lattice = Lattice.of(answer.log_radiance[0].shape[1])
         self.materials = materials_of(unknowns_of(answer.point.materials))  # none of whose reflectances is nil
-        self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.trusts)
+        self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.hyperparameters)
 
     def systems(self, with_scores: bool) -> list[Marginal]:
         """Of each illumination; with_scores: of clusters of observations, too."""

@@ -17,34 +17,28 @@ factors by which the light's contrast and colour differ from those of a typical 
 Materials are found from the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
 rougher than it is, however little it weighs.  Lights are found once more from all observations, given those materials (`lights_from_all`):
 rims and thin parts show directions that nothing else shows.
-
-The factor per channel that is free between materials and lights is held by the sum of the materials' reflectances, which stays as it was
-at the start.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.light.prior import LightPrior
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
+from factorlib.model.bounds import LEAST_REFLECTANCE
 from factorlib.model.cells import clusters_of
-from factorlib.model.components import connected_components
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.robust import weighted_median
-from factorlib.solve.arrow import damped, masked
 from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice, Reflections
-from factorlib.solve.marginal import Field, Marginal, marginal, shown
+from factorlib.solve.marginal import Field, Marginal, shown
+from factorlib.solve.marginal_descent import MarginalDescent, MaterialPrior, materials_of, unknowns_of
 
 LOBES = 400  # of the lattice: 10° apart
 OBSERVATIONS = 5000  # of an illumination: materials follow from those in highlights, which are few
@@ -54,17 +48,11 @@ ROBUST_SCALE = 3.0  # σ of the noise model, beyond which a residual is an outli
 LEAST_TEMPERATURE = 1.0
 LEAST_AT_START = 0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
 START_TEMPERATURE = 10.0
-SPREADS = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 1.0, 1.0])  # prior standard deviations of log k_d, log k_s, roughness about the start
-GAUGE = 0.01  # standard deviation of a channel's summed reflectance about that of the start
-MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
-MOST_LOG_RADIANCE = 1.5  # change of a cell's log radiance in one step
 LIGHT_ITERATIONS, ITERATIONS = 6, (20, 20, 10)  # with the start's materials, then with each estimate of the temperatures
 LIGHTS_AGAIN = (10, 10)  # iterations with each estimate of the temperatures, materials given
-DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
-TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
 
 
-class Trust(msgspec.Struct, frozen=True):
+class Hyperparameters(msgspec.Struct, frozen=True):
     """How much one light's observations and prior count.
 
     temperature   T of (1), by which squared residuals are divided
@@ -78,56 +66,14 @@ class Trust(msgspec.Struct, frozen=True):
 class Natural(msgspec.Struct, frozen=True):
     """An answer whose lights follow the prior.
 
-    log_radiance   u of each light, in its block's unit;  trusts: how much its observations and its prior count
+    log_radiance   u of each light, in its block's unit;  hyperparameters: how much its observations and its prior count
     value          minus twice the log marginal likelihood, up to a constant
     """
 
     point: Point
     log_radiance: list[Float[np.ndarray, "3 p"]]
-    trusts: list[Trust]
+    hyperparameters: list[Hyperparameters]
     value: float
-
-
-class _State(NamedTuple):
-    """Unknowns, and the systems there; theta: log k_d, log k_s, roughness."""
-
-    theta: Float[np.ndarray, "m 7"]
-    log_radiance: list[Float[np.ndarray, "3 p"]]
-    value: float
-    parts: list[Marginal]
-    prior: Gaussian
-
-
-class Gaussian(NamedTuple):
-    """Minus twice a log density, half its gradient and half its Gauss–Newton Hessian by the materials' unknowns."""
-
-    value: float
-    gradient: Float[np.ndarray, " 7m"]
-    hessian: Float[np.ndarray, "7m 7m"]
-
-
-class MaterialPrior:
-    """A wide Gaussian about the start, and the gauge: the sum of reflectances of each component and channel."""
-
-    def __init__(self, start: Materials, blocks: Sequence[Block]):
-        self.start = unknowns_of(start)
-        self.members = [list(members) for members, _ in connected_components(blocks, len(start))]
-        self.whole = [_sums(start, members) for members in self.members]
-
-    def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
-        """At the materials' unknowns."""
-        off = (theta - self.start) / SPREADS
-        value, gradient = float((off**2).sum()), (off / SPREADS).reshape(-1)
-        hessian = np.diag(np.tile(SPREADS**-2.0, len(theta)))
-        materials = materials_of(theta)
-        for members, whole in zip(self.members, self.whole, strict=True):
-            for c in range(3):
-                slope = np.zeros_like(theta)
-                slope[members, c], slope[members, 3 + c] = materials.diffuse[members, c], materials.specular[members, c]
-                slope = slope.reshape(-1) / (GAUGE * whole[c])
-                residual = (_sums(materials, members)[c] / whole[c] - 1) / GAUGE
-                value, gradient, hessian = value + residual**2, gradient + residual * slope, hessian + np.outer(slope, slope)
-        return Gaussian(float(value), gradient, hessian)
 
 
 def naturally(
@@ -144,22 +90,22 @@ def naturally(
     report: called with the number of each iteration and the mean robust loss of what is fitted;  lobes: of the lattice
     """
     lattice = Lattice.of(lobes)
-    fields = fields_of(problem, start, prior, lattice, [Trust()] * len(problem.blocks))
+    fields = fields_of(problem, start, prior, lattice, [Hyperparameters()] * len(problem.blocks))
     materials = above_zero(start.materials, lambertian)
     theta, free = unknowns_of(materials), np.ones((len(materials), 7), bool)
     free[lambertian, 3:] = False
-    descent = Descent(problem, MaterialPrior(materials, problem.blocks), report)
+    descent = MarginalDescent(problem, MaterialPrior(materials, problem.blocks), report)
     lights = [constant(block, materials, lattice) for block in problem.blocks]
     state = descent.run(fields, theta, lights, np.zeros_like(free), LIGHT_ITERATIONS)
     for iterations in ITERATIONS:
         materials = materials_of(state.theta)
-        trusts = [trust_in(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
-        fields = trusted(fields, trusts, prior)
+        hyperparameters = [hyperparameters_of(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
+        fields = with_hyperparameters(fields, hyperparameters, prior)
         state = descent.run(fields, state.theta, state.log_radiance, free, iterations)
     found = materials_of(state.theta)
     found = Materials(found.diffuse, np.where(lambertian[:, None], 0.0, found.specular), found.roughness)
     lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, start.lights, strict=True)]
-    return Natural(Point(found, lights), state.log_radiance, trusts, state.value)
+    return Natural(Point(found, lights), state.log_radiance, hyperparameters, state.value)
 
 
 def lights_from_all(
@@ -167,23 +113,24 @@ def lights_from_all(
 ) -> Natural:
     """The lights that all observations of `problem` show, given the materials of an answer that was found from some of them; report: as above."""
     lattice, materials = Lattice.of(found.log_radiance[0].shape[1]), found.point.materials
-    positive = above_zero(materials, (materials.specular == 0).all(1))
-    descent, fixed = Descent(problem, MaterialPrior(positive, problem.blocks), report), np.zeros((len(materials), 7), bool)
-    fields, lights, trusts = fields_of(problem, found.point, prior, lattice, found.trusts), found.log_radiance, found.trusts
+    theta, hyperparameters, lights = unknowns_of(materials), found.hyperparameters, found.log_radiance
+    fixed, positive = np.zeros_like(theta, bool), materials_of(theta)
+    descent = MarginalDescent(problem, MaterialPrior(positive, problem.blocks), report)
+    fields = fields_of(problem, found.point, prior, lattice, hyperparameters)
     for iterations in LIGHTS_AGAIN:
-        state = descent.run(fields, unknowns_of(positive), lights, fixed, iterations)
+        state = descent.run(fields, theta, lights, fixed, iterations)
         lights = state.log_radiance
-        trusts = [trust_in(*one, positive, prior) for one in zip(fields, state.parts, lights, strict=True)]
-        fields = trusted(fields, trusts, prior)
+        hyperparameters = [hyperparameters_of(*one, positive, prior) for one in zip(fields, state.parts, lights, strict=True)]
+        fields = with_hyperparameters(fields, hyperparameters, prior)
     shown_as = [lattice.light(u, light) for u, light in zip(lights, found.point.lights, strict=True)]
-    return Natural(Point(materials, shown_as), lights, trusts, state.value)
+    return Natural(Point(materials, shown_as), lights, hyperparameters, state.value)
 
 
-def trusted(fields: Sequence[Field], trusts: Sequence[Trust], prior: LightPrior) -> list[Field]:
+def with_hyperparameters(fields: Sequence[Field], hyperparameters: Sequence[Hyperparameters], prior: LightPrior) -> list[Field]:
     """The fields with other temperatures and factors of the prior."""
     return [
         msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(field.lattice.axis, one.factors))
-        for field, one in zip(fields, trusts, strict=True)
+        for field, one in zip(fields, hyperparameters, strict=True)
     ]
 
 
@@ -206,7 +153,7 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
     return result
 
 
-def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, trusts: Sequence[Trust]) -> list[Field]:
+def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: Lattice, hyperparameters: Sequence[Hyperparameters]) -> list[Field]:
     """One field an illumination: its observations, lattice, prior and temperature; exposures and tone curves are the point's."""
     return [
         Field(
@@ -218,7 +165,7 @@ def fields_of(problem: JointProblem, point: Point, prior: LightPrior, lattice: L
             one.temperature,
             ROBUST_SCALE,
         )
-        for block, light, one in zip(problem.blocks, point.lights, trusts, strict=True)
+        for block, light, one in zip(problem.blocks, point.lights, hyperparameters, strict=True)
     ]
 
 
@@ -228,17 +175,6 @@ def above_zero(materials: Materials, lambertian: Bool[np.ndarray, " m"]) -> Mate
     return Materials(np.maximum(materials.diffuse, LEAST_AT_START), specular, materials.roughness)
 
 
-def unknowns_of(materials: Materials) -> Float[np.ndarray, "m 7"]:
-    """log k_d, log k_s and roughness."""
-    reflectance = np.maximum(np.column_stack([materials.diffuse, materials.specular]), LEAST_REFLECTANCE)
-    return np.column_stack([np.log(reflectance), np.clip(materials.roughness, *ROUGHNESS)])
-
-
-def materials_of(theta: Float[np.ndarray, "m 7"]) -> Materials:
-    """The inverse of `unknowns_of`."""
-    return Materials(np.exp(theta[:, :3]), np.exp(theta[:, 3:6]), theta[:, 6])
-
-
 def constant(block: Block, materials: Materials, lattice: Lattice) -> Float[np.ndarray, "3 p"]:
     """The constant light that explains a block's mean radiance."""
     reflectance = (materials.diffuse + materials.specular)[block.material].mean(0)
@@ -246,11 +182,11 @@ def constant(block: Block, materials: Materials, lattice: Lattice) -> Float[np.n
     return np.repeat(level[:, None], len(lattice), axis=1)
 
 
-def trust_in(field: Field, part: Marginal, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, prior: LightPrior) -> Trust:
+def hyperparameters_of(field: Field, part: Marginal, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, prior: LightPrior) -> Hyperparameters:
     """By the residuals and the light that a descent ended with; part: its system there."""
     covariance = positive_definite_inverse(part.light_hessian).matrix
     factors = prior.likeliest_factors(field.lattice.axis, log_radiance, covariance)
-    return Trust(temperature(field, shown(field, log_radiance, materials).residual), factors)
+    return Hyperparameters(temperature(field, shown(field, log_radiance, materials).residual), factors)
 
 
 def temperature(field: Field, residual: Float[np.ndarray, "n 3"]) -> float:
@@ -258,68 +194,3 @@ def temperature(field: Field, residual: Float[np.ndarray, "n 3"]) -> float:
     number, bounded = clusters_of(field.block), residual.clip(-field.robust_scale, field.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), LEAST_TEMPERATURE)
-
-
-class Descent:
-    """Levenberg–Marquardt on materials and lights."""
-
-    def __init__(self, problem: JointProblem, material_prior: MaterialPrior, report: Callable[[int, float], None]):
-        self.spread, self.material_prior, self.report = problem.spread, material_prior, report
-        self.values, self.iteration = max(problem.fitted_values, 1), 0
-
-    def run(
-        self,
-        fields: Sequence[Field],
-        theta: Float[np.ndarray, "m 7"],
-        lights: list[Float[np.ndarray, "3 p"]],
-        free: Bool[np.ndarray, "m 7"],
-        iterations: int,
-    ) -> _State:
-        """The state after at most so many steps; only the materials' unknowns that are `free` change."""
-        state, damping = self._at(fields, theta, lights), DAMPING
-        for _ in range(iterations):
-            trial = self._at(fields, *_step(state, free, damping))
-            if trial.value < state.value:
-                small = state.value - trial.value < TOLERANCE * abs(state.value)
-                state, damping = trial, damping * LOWER
-                if small:
-                    break
-            elif damping > MOST_DAMPING:
-                break
-            else:
-                damping = max(damping * HIGHER, DAMPING)
-        return state
-
-    def _at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], lights: list[Float[np.ndarray, "3 p"]]) -> _State:
-        materials = materials_of(theta)
-        parts = list(self.spread(lambda one: marginal(*one, materials), list(zip(fields, lights, strict=True))))
-        prior = self.material_prior.at(theta)
-        self.report(self.iteration, sum(part.loss for part in parts) / self.values)
-        self.iteration += 1
-        return _State(theta, lights, sum(part.value for part in parts) + prior.value, parts, prior)
-
-
-def _step(state: _State, free: Bool[np.ndarray, "m 7"], damping: float) -> tuple[Float[np.ndarray, "m 7"], list[Float[np.ndarray, "3 p"]]]:
-    """The unknowns after a damped step: lights eliminated, materials within bounds, lights given the materials' step."""
-    hessian = state.prior.hessian + np.sum([part.material_hessian for part in state.parts], axis=0)
-    gradient = state.prior.gradient + np.sum([part.material_gradient for part in state.parts], axis=0)
-    reduced, solutions = damped(hessian, damping), []
-    for part in state.parts:
-        factor = cho_factor(damped(part.light_hessian, damping), check_finite=False)
-        solution = cho_solve(factor, np.column_stack([part.cross_hessian.T, part.light_gradient]), check_finite=False)
-        reduced -= part.cross_hessian @ solution[:, :-1]
-        gradient = gradient - part.cross_hessian @ solution[:, -1]
-        solutions.append(solution)
-    change = np.linalg.solve(masked(reduced, free.reshape(-1)), np.where(free.reshape(-1), -gradient, 0.0)).reshape(-1, 7)
-    theta = state.theta + change.clip(-MOST_CHANGE, MOST_CHANGE)
-    theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
-    theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
-    moved = (theta - state.theta).reshape(-1)
-    steps = [-(solution[:, -1] + solution[:, :-1] @ moved) for solution in solutions]
-    return theta, [
-        u + step.clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).reshape(u.shape) for u, step in zip(state.log_radiance, steps, strict=True)
-    ]
-
-
-def _sums(materials: Materials, members: Sequence[int]) -> Float[np.ndarray, "3"]:
-    return (materials.diffuse + materials.specular)[members].sum(0)

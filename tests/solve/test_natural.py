@@ -17,17 +17,8 @@ from factorlib.model.responses import unit_values
 from factorlib.reflection import reflection_operator
 from factorlib.solve.lattice import NODES, Lattice, Reflections
 from factorlib.solve.marginal import Field, marginal
-from factorlib.solve.natural import (
-    DARK,
-    LOBES,
-    MaterialPrior,
-    lights_from_all,
-    materials_of,
-    naturally,
-    sure_ones,
-    temperature,
-    unknowns_of,
-)
+from factorlib.solve.marginal_descent import MaterialPrior, materials_of, unknowns_of
+from factorlib.solve.natural import DARK, LOBES, lights_from_all, naturally, sure_ones, temperature
 
 FEW = 120  # lobes of a lattice, so that tests are quick
 OPERATOR, PRIOR, NOBODY = reflection_operator("network"), read_light_prior(), np.zeros(3, bool)
