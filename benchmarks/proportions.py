@@ -15,9 +15,9 @@ import typer
 
 from benchmarks.align import shapes
 from benchmarks.align.cases import FILLS, photographed
-from factorlib.align.evidence import Evidence
 from factorlib.align.proportions import Sighting, proportions
 from factorlib.align.search import find, focal_prior
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import target_of
 from factorlib.geometry.camera import Camera, Pose
@@ -36,9 +36,9 @@ def measured(shape: str, axis: int, off: float, photos: int, rough: bool = False
     caster, sightings, truth = Caster(given), [], []
     for _ in range(photos):
         camera, pose, label = photographed(true, rng, rng.uniform(*FILLS))
-        evidence, prior = Evidence(label.astype(np.int16)), focal_prior(None, None, camera.width, camera.height)
-        found = find(caster, evidence, camera, prior)
-        sightings.append(Sighting(given, target_of(evidence, given.labels, 200, 0.15), found.state.camera(camera), prior, found.state))
+        silhouette, prior = Silhouette(label.astype(np.int16)), focal_prior(None, None, camera.width, camera.height)
+        found = find(caster, silhouette, camera, prior)
+        sightings.append(Sighting(given, target_of(silhouette, given.labels, 200, 0.15), found.state.camera(camera), prior, found.state))
         truth.append((camera, pose))
     start = time.perf_counter()
     verdict = proportions(sightings)

@@ -20,8 +20,8 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from benchmarks.align import shapes
-from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior, refined
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
 from factorlib.generate.chair import chair, labelled
@@ -103,15 +103,15 @@ def photographed(kind: str, number: int, rng: np.random.Generator, operator: Ope
     middle = np.array([0, 0, 2 * camera.focal * caster.radius / (0.9 * HEIGHT)])
     truth = Pose(rotation, middle - rotation @ caster.centre)
     channels = rendered(caster, camera, truth, random_light(rng), rng, operator)
-    evidence = Evidence(channels["label"].astype(np.int16))
+    silhouette = Silhouette(channels["label"].astype(np.int16))
     if flipped:
         mirrored = np.diag([1.0, 1, -1]) @ rotation @ np.diag([-1.0, 1, 1])  # x is the chair's left and right
-        wrong = by_contours(given, evidence, camera, state_of(Pose(mirrored, middle - mirrored @ given.centre), camera, given))
+        wrong = by_contours(given, silhouette, camera, state_of(Pose(mirrored, middle - mirrored @ given.centre), camera, given))
         return Photo(shape, camera, truth, caster, given, channels, wrong.pose(given), truth)
     by = np.deg2rad(rng.uniform(2, 8)) if kind == "turned" else 0.0
     turned = rotation_of_vector(by * unit(rng.normal(size=3))) @ rotation
     start = state_of(Pose(turned, middle - turned @ given.centre), camera, given)
-    pose = (start if kind == "turned" else by_contours(given, evidence, camera, start)).pose(given)
+    pose = (start if kind == "turned" else by_contours(given, silhouette, camera, start)).pose(given)
     return Photo(shape, camera, truth, caster, given, channels, pose, None)
 
 
@@ -119,8 +119,8 @@ def unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def by_contours(caster: Caster, evidence: Evidence, camera: Camera, start: State) -> State:
-    target = target_of(evidence, caster.mesh.labels, 200, 0.1)
+def by_contours(caster: Caster, silhouette: Silhouette, camera: Camera, start: State) -> State:
+    target = target_of(silhouette, caster.mesh.labels, 200, 0.1)
     return refined(caster, target, camera, start, FocalPrior(camera.focal, 0.0), 12).state
 
 
@@ -178,7 +178,7 @@ def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> 
 
 def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
-    own = PosedObject(photo.given, Evidence(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
+    own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
     return refined_photo(Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator))[0]
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from factorlib.align.confidence import confidence
 from factorlib.align.doubts import Standards, doubts
 from factorlib.align.earlier import earlier_focal, earlier_pose
-from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.external_camera import focal_and_centre
 from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import KnownFocal, ObjectToPlace, Placed, placed
 from factorlib.align.search import Found, Search
+from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.align.trust import trust_in
 from factorlib.dataset import schema
 from factorlib.errors import InputError
@@ -63,7 +63,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     before = earlier_focal(earlier.camera, facts.factor) if earlier else None
     result = placed(objects, camera, known, name, params.search, before)
     maps = rasterise([each.caster for each in objects], result.camera, result.poses)
-    whole = whole_evidence(channels)
+    whole = silhouette_of_photo(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     external = slice_.external.source if slice_.external else None
     sources = {obj.name: "given" if obj.pose else external for obj in slice_.objects}
@@ -88,9 +88,9 @@ def objects_of(
         before = earlier.objects.get(obj.name) if earlier and pose is None else None
         scale = before.scale if before else AS_IT_IS
         caster = Caster(scaled(_mesh(file, mesh, obj, materials, params), scale))
-        evidence = object_evidence(channels, number, caster.mesh.labels, obj.mask is not None)
+        silhouette = silhouette_of_object(channels, number, caster.mesh.labels, obj.mask is not None)
         found = earlier_pose(before) if before else None
-        objects.append(ObjectToPlace(obj.name, caster, evidence, pose, keypoints_of(obj, factor), found, scale))
+        objects.append(ObjectToPlace(obj.name, caster, silhouette, pose, keypoints_of(obj, factor), found, scale))
     return objects
 
 
@@ -147,7 +147,7 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
     source: where the pose is from, if it was not searched.
     """
     seen = np.where(maps.object == k + 1, maps.label, 0)
-    iou, agreement = silhouette_iou(obj.evidence, seen), label_agreement(obj.evidence, seen)
+    iou, agreement = silhouette_iou(obj.silhouette, seen), label_agreement(obj.silhouette, seen)
     found, pose, trust = result.found[k], result.poses[k], trust_in(obj, result, k)
     reasons = doubts(iou, agreement, trust, found, params)
     return ObjectEntry(

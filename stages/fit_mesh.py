@@ -12,10 +12,10 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.proportions import Sighting, Standards, Verdict, proportions
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import prior_before
+from factorlib.align.silhouette import silhouette_iou, silhouette_of_object
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
@@ -43,12 +43,12 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 
 class Found(msgspec.Struct, frozen=True):
-    """A sighting and where it stands: photo, object, and the evidence that its overlap is measured by."""
+    """A sighting and where it stands: photo, object, and the silhouette that its overlap is measured by."""
 
     photo: str
     object: str
     sighting: Sighting
-    evidence: object
+    silhouette: object
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
@@ -83,10 +83,10 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: In
         if found.source not in SEARCHED or (found.silhouette_iou or 0.0) < params.least_iou:
             continue
         read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, obj.materials, limits=NO_LIMITS)
-        evidence = object_evidence(channels, number, read.labels, obj.mask is not None)
+        silhouette = silhouette_of_object(channels, number, read.labels, obj.mask is not None)
         state = state_of(found.pose, camera, scaled(read, found.scale))
-        target = target_of(evidence, read.labels, params.resolution, MARGIN)
-        yield obj.mesh, Found(photo, obj.name, Sighting(read, target, camera, alone, state), evidence)
+        target = target_of(silhouette, read.labels, params.resolution, MARGIN)
+        yield obj.mesh, Found(photo, obj.name, Sighting(read, target, camera, alone, state), silhouette)
 
 
 def fitted(verdict: Verdict, sightings: list[Found]) -> dict:
@@ -105,6 +105,6 @@ def placed(entry: PhotoPoses, one: Found, state: State, factors: np.ndarray) -> 
     caster = Caster(scaled(one.sighting.mesh, factors))
     pose, seen = state.pose(caster), state.camera(one.sighting.camera)
     camera = msgspec.structs.replace(entry.camera, focal_px=float(seen.focal)) if one.sighting.prior.sigma > 0 else entry.camera
-    iou = silhouette_iou(one.evidence, rasterise(caster, seen, pose).label)
+    iou = silhouette_iou(one.silhouette, rasterise(caster, seen, pose).label)
     changed = {**entry_of(pose), "scale": tuple(factors.tolist()), "silhouette_iou": iou, "runner_up": None}
     return PhotoPoses(camera, entry.objects | {one.object: msgspec.structs.replace(entry.objects[one.object], **changed)})

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.align.evidence import object_evidence, silhouette_iou
 from factorlib.align.search import normal_difference, prior_before
+from factorlib.align.silhouette import silhouette_iou, silhouette_of_object
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.camera import Camera, angle_between
@@ -87,9 +87,9 @@ def scene_of(inputs: Inputs, photo: dict, entry: PhotoPoses, shadows: int) -> Sc
         file = inputs.file(mesh.file)
         read = read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, own.materials, limits=NO_LIMITS)
         caster = Caster(scaled(read, found.scale))
-        evidence, other = object_evidence(photo, number, caster.mesh.labels, own.mask is not None), found.runner_up
+        silhouette, other = silhouette_of_object(photo, number, caster.mesh.labels, own.mask is not None), found.runner_up
         moves = found.source in SEARCHED
-        objects.append(PosedObject(caster, evidence, found.pose, other.pose if other else None, moves, not found.left_out))
+        objects.append(PosedObject(caster, silhouette, found.pose, other.pose if other else None, moves, not found.left_out))
     height, width = photo["label"].shape
     camera, facts = entry.camera.camera(width, height), read_photo_facts(inputs["masks"] / f"{inputs.photo}.json")
     return Scene(camera, objects, prior_before(camera.focal, entry.camera.focal_source, facts.focal_px, width, height), shadows)
@@ -104,9 +104,9 @@ def decided(entry: ObjectEntry, own: PosedObject, result: Refined, camera: Camer
         entry = msgspec.structs.replace(entry, runner_up=None)  # shading has decided between the two
     if result.moved:
         pose, seen = result.after.pose(own.caster), result.after.camera(camera)
-        iou = silhouette_iou(own.evidence, rasterise(own.caster, seen, pose).label)
+        iou = silhouette_iou(own.silhouette, rasterise(own.caster, seen, pose).label)
         entry = msgspec.structs.replace(entry, **entry_of(pose), silhouette_iou=iou)
-    target = target_of(own.evidence, own.caster.mesh.labels, 200, 0.1)
+    target = target_of(own.silhouette, own.caster.mesh.labels, 200, 0.1)
     turned = angle_between(result.after.rotation, result.before.rotation)
     moved = Moved(turned, normal_difference(own.caster, target, camera, result.before, result.after))
     found = verdict.candidates["found"]

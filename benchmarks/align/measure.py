@@ -10,9 +10,9 @@ import numpy as np
 from benchmarks.align.cases import Case, case
 from benchmarks.solve.clock import Clock
 from factorlib.align.doubts import doubts
-from factorlib.align.evidence import label_agreement, object_evidence, silhouette_iou
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import Found, RunnerUp, Search
+from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
 from factorlib.align.trust import Trust, trust_in
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Maps, rasterise
@@ -33,16 +33,16 @@ def measured(given: Case, search: Search = Search()) -> dict:
     caster = Caster(given.given_mesh())
     truth, blind = given.truth(), Camera(given.camera.width, given.camera.height, 1.0, given.camera.centre)
     clock = Clock()
-    evidence = object_evidence({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
-    obj = ObjectToPlace("object", caster, evidence)
+    silhouette = silhouette_of_object({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
+    obj = ObjectToPlace("object", caster, silhouette)
     result = placed([obj], blind, KnownFocal(), given.name, search)
     seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(obj, result, 0)
     taken, found = clock.taken(), result.found[0]
-    iou, agreement = silhouette_iou(evidence, seen.label), label_agreement(evidence, seen.label)
+    iou, agreement = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
     other = found.runner_up
     row = {
         "name": given.name, "kind": given.kind, "shape": given.shape, "wall_s": taken.wall, "processor_s": taken.processor,
-        "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024), "pixels": int(evidence.inside.sum()),
+        "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024), "pixels": int(silhouette.inside.sum()),
         "silhouette_iou": iou, "label_agreement": agreement, "score": found.score,
         "runner_up_score": other.score if other else None, "runner_up_normals_deg": other.normal_difference_deg if other else None,
         **msgspec.to_builtins(trust),

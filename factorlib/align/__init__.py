@@ -2,7 +2,7 @@
 
     place      all objects of a photo: given poses, searched ones, one focal length
     search     the pose of one object: guesses (coarse), refined on contours (refine), and the runner-up
-    evidence   what masks say about an object;  target: the same at the resolution of the search
+    silhouette   what masks say about an object;  target: the same at the resolution of the search
     trust      what speaks for and against a pose that was found;  doubts: which of it is too little
 
 >>> from factorlib.align.place import KnownFocal, ObjectToPlace, placed

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.fft import irfft2, rfft2
 
-from factorlib.align.evidence import Evidence
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import extent_of
 from factorlib.geometry.camera import Camera, rotation_of_vector
@@ -62,26 +62,26 @@ def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]
     return np.stack([x, np.cross(direction, x), direction])
 
 
-def is_cut(evidence: Evidence) -> bool:
+def is_cut(silhouette: Silhouette) -> bool:
     """Whether the frame, left-out pixels or other objects hide a real part of the mask's contour."""
-    reach = max(int(BROAD * extent_of(evidence)[2] / 2), 1)
+    reach = max(int(BROAD * extent_of(silhouette)[2] / 2), 1)
     pad = 2 * reach + 2  # beyond the frame nothing is known
-    unknown = np.pad(~evidence.known, pad, constant_values=True)
+    unknown = np.pad(~silhouette.known, pad, constant_values=True)
     unknown = ndimage.distance_transform_edt(~(ndimage.distance_transform_edt(unknown) > reach)) <= reach + 1  # opened
-    inside = np.pad(evidence.inside, pad)
+    inside = np.pad(silhouette.inside, pad)
     border = inside & ~ndimage.binary_erosion(inside)
     return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
 
 
-def candidates(caster: Caster, evidence: Evidence, camera: Camera, density: Density) -> list[Candidate]:
-    """The best guesses that differ in rotation, best first; the evidence must show some pixel of the object."""
+def candidates(caster: Caster, silhouette: Silhouette, camera: Camera, density: Density) -> list[Candidate]:
+    """The best guesses that differ in rotation, best first; the photo must show some pixel of the object."""
     labels = caster.mesh.labels
-    low, high, extent = extent_of(evidence)
-    cut = is_cut(evidence)
+    low, high, extent = extent_of(silhouette)
+    cut = is_cut(silhouette)
     pixel = extent / (CUT if cut else WHOLE)
     middle = (low + high) / 2
     angles = np.arange(density.rolls) * 2 * np.pi / density.rolls
-    costs, area = _cost_images(evidence, labels, middle, pixel, angles)
+    costs, area = _cost_images(silhouette, labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
     found = []
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
@@ -100,11 +100,11 @@ def candidates(caster: Caster, evidence: Evidence, camera: Camera, density: Dens
 
 
 def _cost_images(
-    evidence: Evidence, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, " rolls"]
+    silhouette: Silhouette, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, " rolls"]
 ) -> tuple[np.ndarray, float]:
     """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
-    sums = [_block_means(np.where(evidence.label == 0, 1.0, np.where(evidence.label == label, -1.0, 0.0)), step) for label in labels]
+    sums = [_block_means(np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)), step) for label in labels]
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
@@ -113,7 +113,7 @@ def _cost_images(
         column, row = middle[0] + cos * x + sin * y, middle[1] - sin * x + cos * y
         for n, image in enumerate(sums):
             images[k, n] = ndimage.map_coordinates(image, [row / step - 0.5, column / step - 0.5], order=1, cval=0.0)
-    area = np.count_nonzero(evidence.inside) / pixel**2
+    area = np.count_nonzero(silhouette.inside) / pixel**2
     return images, area
 
 

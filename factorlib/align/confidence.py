@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from factorlib.align.evidence import Evidence
+from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.raster import Maps
 
 FULL_DISTANCE = 0.01  # of the mask's extent: nearer to a contour, a small error of pose or mesh shows another place
@@ -29,12 +29,12 @@ STEEPER = 3.0  # and does if the step is this many times the next one beside it,
 FACET, TURN = np.radians(12.0), np.radians(20.0)
 
 
-def confidence(maps: Maps, evidence: Evidence) -> Float[np.ndarray, "h w"]:
+def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
     """Product of: distance to where mask and mesh disagree, to the contour and to depth jumps; slant; side seen; one over (1).
 
     0 where the mask and the mesh name different materials, where there is no mesh, and where the normal was bent.
     """
-    agree = (maps.label > 0) & (evidence.label == maps.label) & ~depth_jumps(maps)
+    agree = (maps.label > 0) & (silhouette.label == maps.label) & ~depth_jumps(maps)
     if not agree.any():
         return np.zeros(agree.shape)
     rows, columns = np.nonzero(agree)

@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 
-from factorlib.align.evidence import Evidence
+from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.raster import Maps
 from factorlib.images.picture import picture as shown_picture
 
 MESH, MASK = np.array([1.0, 0.15, 0.75]), np.array([0.2, 1.0, 0.2])  # contour colours
 
 
-def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, evidence: Evidence) -> UInt8[np.ndarray, "h w 3"]:
+def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhouette) -> UInt8[np.ndarray, "h w 3"]:
     """sRGB picture; magenta: contour of the mesh and of its parts, green: of the mask; grey-blue: left out."""
     picture = 0.55 / 255 * shown_picture(radiance).astype(float)
     seen = maps.label > 0
     tint = (maps.normal * (1, -1, -1) + 1) / 2  # the usual colours: x red right, y green up, z blue to the viewer
     picture[seen] = 0.6 * picture[seen] + 0.4 * tint[seen]
-    picture[~evidence.known] = 0.7 * picture[~evidence.known] + 0.3 * np.array([0.4, 0.5, 0.7])
+    picture[~silhouette.known] = 0.7 * picture[~silhouette.known] + 0.3 * np.array([0.4, 0.5, 0.7])
     width = max(1, round(max(seen.shape) / 600))
-    for contour, colour in ((outline(np.maximum(evidence.label, 0)), MASK), (outline(maps.label + 1000 * maps.object), MESH)):
+    for contour, colour in ((outline(np.maximum(silhouette.label, 0)), MASK), (outline(maps.label + 1000 * maps.object), MESH)):
         picture[binary_dilation(contour, iterations=width) if width > 1 else contour] = colour
     return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 

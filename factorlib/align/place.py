@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import (
@@ -25,6 +24,7 @@ from factorlib.align.search import (
     found_near,
     with_focal_free,
 )  # fmt: skip
+from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
@@ -66,7 +66,7 @@ class ObjectToPlace(msgspec.Struct, frozen=True):
 
     name: str
     caster: Caster
-    evidence: Evidence
+    silhouette: Silhouette
     pose: Pose | None = None
     keypoints: Keypoints | None = None
     earlier: Earlier | None = None
@@ -106,11 +106,11 @@ def placed(
     if prior.sigma > 0 and any(each.pose is not None for each in objects):
         camera, source = _focal_of_given(objects, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
-    for k in sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k)):
+    for k in sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k)):
         obj = objects[k]
         if obj.pose is not None:
             continue
-        if not obj.evidence.inside.any():
+        if not obj.silhouette.inside.any():
             raise InputError(
                 f"no pixel of the mask shows object {obj.name!r}", file="dataset.yaml", key=photo,
                 cure="remove the object from this photo, or check its mask and materials",
@@ -118,10 +118,10 @@ def placed(
         if obj.earlier is not None:
             found[k] = _found_before(obj, camera, sigma, search)
         elif obj.keypoints is None:
-            found[k] = find(obj.caster, obj.evidence, camera, prior, search)
+            found[k] = find(obj.caster, obj.silhouette, camera, prior, search)
         else:
             start = state_of_keypoints(obj.keypoints, obj.caster, camera, prior, photo, obj.name)
-            found[k] = found_near(obj.caster, obj.evidence, camera, start, prior, search)
+            found[k] = found_near(obj.caster, obj.silhouette, camera, start, prior, search)
         if prior.sigma > 0:
             found[k], source = _judged(obj, camera, found[k], source, photo, search)
             sigma = found[k].log_focal_sigma
@@ -140,7 +140,7 @@ def _pose(obj: ObjectToPlace, found: Found | None) -> Pose:
 
 def _found_before(obj: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
     earlier = obj.earlier
-    found = found_before(obj.caster, obj.evidence, camera, state_of(earlier.pose, camera, obj.caster), sigma, search)
+    found = found_before(obj.caster, obj.silhouette, camera, state_of(earlier.pose, camera, obj.caster), sigma, search)
     if earlier.runner_up is None:
         return found
     state = state_of(earlier.runner_up, camera, obj.caster)
@@ -154,9 +154,9 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, source: str | None
         return found, "estimated"
     broad = FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
     if found.score >= WELL_FOUND:
-        free = with_focal_free(obj.caster, obj.evidence, camera, found, broad, search)
+        free = with_focal_free(obj.caster, obj.silhouette, camera, found, broad, search)
     else:
-        free = find(obj.caster, obj.evidence, camera, broad, search)
+        free = find(obj.caster, obj.silhouette, camera, broad, search)
     if free.score < found.score + CLEARLY_BETTER:
         return found, "exif"
     log.warning(
@@ -168,12 +168,12 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, source: str | None
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    fixed = [(t.caster, t.pose, target_of(t.evidence, t.caster.mesh.labels, 200)) for t in objects if t.pose and t.evidence.inside.any()]
+    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in objects if t.pose and t.silhouette.inside.any()]
 
     def misfit(log_focal: float) -> float:
         """Minus the sum of overlaps (IoU) with the focal length exp(log_focal)."""
         trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
-        return -sum(labelled_iou(target.evidence, rasterise(caster, target.camera(trial), pose).label) for caster, pose, target in fixed)
+        return -sum(labelled_iou(target.silhouette, rasterise(caster, target.camera(trial), pose).label) for caster, pose, target in fixed)
 
     grid = np.log(camera.focal) + np.linspace(-1.6, 1.6, 33)
     best = grid[int(np.argmin([misfit(g) for g in grid]))]

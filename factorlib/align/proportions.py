@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.evidence import labelled_iou
 from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined, rendered
+from factorlib.align.silhouette import labelled_iou
 from factorlib.align.state import State
 from factorlib.align.target import Target
 from factorlib.geometry.camera import Camera
@@ -139,7 +139,7 @@ def factors_of(shape: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
 def _equations(one: Sighting, caster: Caster, state: State) -> tuple[Equations, float]:
     seen = rendered(caster, one.target, one.camera, state)
     equations = normal_equations(seen, one.target, one.prior, jacobian_with_shape)
-    return equations, labelled_iou(one.target.evidence, caster.labels(seen.hits))
+    return equations, labelled_iou(one.target.silhouette, caster.labels(seen.hits))
 
 
 def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:

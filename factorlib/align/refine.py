@@ -24,7 +24,7 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from factorlib.align.evidence import labelled_iou
+from factorlib.align.silhouette import labelled_iou
 from factorlib.align.state import State
 from factorlib.align.target import Region, Target, border_pairs
 from factorlib.geometry.camera import Camera
@@ -78,7 +78,7 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
     failures = 0
     for k in range(steps + 1):
         seen = rendered(caster, target, camera, state)
-        score = labelled_iou(target.evidence, caster.labels(seen.hits))
+        score = labelled_iou(target.silhouette, caster.labels(seen.hits))
         equations = normal_equations(seen, target, prior)
         if best is None or score > best.score:
             best, failures = Refined(state, score, equations.scale, equations.information), 0

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.coarse import Density, candidates, is_cut
-from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior, Refined, refined
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, angle_between
@@ -88,20 +88,20 @@ def prior_before(found: float, source: str, exif: float | None, width: int, heig
     return focal_prior(known, source, width, height)
 
 
-def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
-    """The pose whose labelled silhouette agrees best with the evidence.
+def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
+    """The pose whose labelled silhouette agrees best with the photo's.
 
-    camera: the photo's; its focal length is replaced by the prior's.  The evidence must show some pixels of the object.
+    camera: the photo's; its focal length is replaced by the prior's.  It must show some pixels of the object.
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
-    effort = search.cut_effort if is_cut(evidence) else 1
+    effort = search.cut_effort if is_cut(silhouette) else 1
     density = Density(effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
-    guesses = candidates(caster, evidence, camera, density)
+    guesses = candidates(caster, silhouette, camera, density)
     states = [guess.state for guess in guesses]
     others: list[Refined] = []
     for keep, steps, resolution, margin in zip(search.keep, search.steps, search.resolution, search.margin):
         kept = states[: keep if others else effort * keep]
-        target = target_of(evidence, caster.mesh.labels, resolution, margin)
+        target = target_of(silhouette, caster.mesh.labels, resolution, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
         states = [result.state for result in ranked if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)]
         others = ranked + others
@@ -111,11 +111,11 @@ def find(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, 
     return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
 
 
-def found_near(caster: Caster, evidence: Evidence, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()) -> Found:
+def found_near(caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()) -> Found:
     """The pose refined from `start`, at the two finest resolutions; `start` itself where that leads far off."""
     camera, state = msgspec.structs.replace(camera, focal=prior.focal), start
     for steps, resolution, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
-        target = target_of(evidence, caster.mesh.labels, resolution, margin)
+        target = target_of(silhouette, caster.mesh.labels, resolution, margin)
         result = refined(caster, target, camera, state, prior, steps)
         if angle_between(result.state.rotation, start.rotation) > DISTINCT_DEG:
             result = refined(caster, target, camera, start, prior, 0)
@@ -123,16 +123,16 @@ def found_near(caster: Caster, evidence: Evidence, camera: Camera, start: State,
     return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
 
 
-def found_before(caster: Caster, evidence: Evidence, camera: Camera, state: State, log_focal_sigma: float, search: Search) -> Found:
+def found_before(caster: Caster, silhouette: Silhouette, camera: Camera, state: State, log_focal_sigma: float, search: Search) -> Found:
     """An earlier answer as it is, without a runner-up, scored anew at the finest resolution."""
-    target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     score = refined(caster, target, camera, state, FocalPrior(camera.focal, 0.0), 0).score
     return Found(state, score, log_focal_sigma, None, earlier=True)
 
 
-def with_focal_free(caster: Caster, evidence: Evidence, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
+def with_focal_free(caster: Caster, silhouette: Silhouette, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
     """The pose found, refined once more under another `prior` of the focal length."""
-    target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     result = refined(caster, target, camera, found.state, prior, 2 * search.steps[-1])
     return Found(result.state, result.score, result.log_focal_sigma(), found.runner_up, found.by_keypoints)
 

@@ -1,4 +1,4 @@
-"""The evidence of a photo about one object, at a resolution that a pose can be compared with quickly.
+"""What the silhouette of one object is in a photo, at a resolution that a pose can be compared with quickly.
 
 For each material, the signed distance to the border of its region says how far, and which way, a contour of the mesh
 is off.  Unknown pixels are a dead zone: a contour may lie there at no cost, so an occluder or the frame of the photo
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.evidence import UNKNOWN, Evidence
+from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.geometry.camera import Camera
 
 
@@ -37,42 +37,42 @@ class Target(msgspec.Struct, frozen=True):
     left: float
     top: float
     pixel: float  # photo pixels per window pixel
-    evidence: Evidence
+    silhouette: Silhouette
     regions: dict[int, Region]
 
     def camera(self, photo_camera: Camera) -> Camera:
         """The photo's camera seen through the window, in the window's pixels."""
-        height, width = self.evidence.label.shape
+        height, width = self.silhouette.label.shape
         return photo_camera.window(self.left, self.top, self.pixel, width, height)
 
     @property
     def extent(self) -> float:
         """Longer side of the mask's bounding box, window pixels."""
-        return extent_of(self.evidence)[2]
+        return extent_of(self.silhouette)[2]
 
 
-def extent_of(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, float]:
+def extent_of(silhouette: Silhouette) -> tuple[np.ndarray, np.ndarray, float]:
     """Lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
-    rows, columns = np.nonzero(evidence.inside)
+    rows, columns = np.nonzero(silhouette.inside)
     low = np.array([columns.min(), rows.min()], float)
     high = np.array([columns.max(), rows.max()], float) + 1
     return low, high, float((high - low).max())
 
 
-def target_of(evidence: Evidence, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
-    """The evidence about its mask and `margin` of its extent around it.
+def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
+    """The silhouette, cut out with `margin` of its extent around it.
 
     resolution: pixels of the mask's longer side in the window, fewer if the photo has fewer
     """
-    low, high, extent = extent_of(evidence)
+    low, high, extent = extent_of(silhouette)
     pixel = max(extent / resolution, 1.0)
-    height, width = evidence.label.shape
+    height, width = silhouette.label.shape
     low = np.maximum(np.floor(low - margin * extent), 0)
     high = np.minimum(np.ceil(high + margin * extent), (width, height))
     columns, rows = (np.arange(int(np.ceil((high[k] - low[k]) / pixel))) for k in (0, 1))
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
-    window = Evidence(evidence.label[np.ix_(y, x)])
+    window = Silhouette(silhouette.label[np.ix_(y, x)])
     at_frame = tuple(bool(x) for x in (low[1] == 0, high[1] == height, low[0] == 0, high[0] == width))
     regions = {label: region_of(window.label, label, at_frame) for label in labels}
     return Target(float(low[0]), float(low[1]), pixel, window, regions)

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from factorlib.align.evidence import Evidence
 from factorlib.align.place import ObjectToPlace, Placed
 from factorlib.align.refine import FocalPrior, contour_of, normal_equations, rendered
 from factorlib.align.search import Search, find, normal_difference
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera
@@ -42,16 +42,16 @@ class Trust(msgspec.Struct, frozen=True):
 
 def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
     """Of the pose of `obj`, the photo's `number`-th; of a pose that was given only the contours are compared."""
-    found, caster, evidence = placed.found[number], obj.caster, obj.evidence
-    if not evidence.inside.any():
+    found, caster, silhouette = placed.found[number], obj.caster, obj.silhouette
+    if not silhouette.inside.any():
         return Trust(1.0)
-    target = target_of(evidence, caster.mesh.labels, RESOLUTION, MARGIN)
+    target = target_of(silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
     if found is None:
         return Trust(contour_error(caster, target, placed.camera, state_of(placed.poses[number], placed.camera, caster)))
     return Trust(
         contour_error(caster, target, placed.camera, found.state),
         normal_stderr_deg(caster, target, placed.camera, found.state, placed.prior),
-        mirrored_score(caster, evidence, placed.camera, placed.prior) if found.score < FITS_TO_A_PIXEL and not found.by_keypoints else None,
+        mirrored_score(caster, silhouette, placed.camera, placed.prior) if found.score < FITS_TO_A_PIXEL and not found.by_keypoints else None,
     )
 
 
@@ -86,8 +86,8 @@ def _move(direction: Float[np.ndarray, " n"], precision: float) -> Float[np.ndar
     return np.append(length * direction, np.zeros(7 - len(direction)))
 
 
-def mirrored_score(caster: Caster, evidence: Evidence, camera: Camera, prior: FocalPrior, search: Search = QUICK) -> float:
+def mirrored_score(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = QUICK) -> float:
     """The best score for the photo with left and right exchanged."""
     centre = (camera.width - camera.centre[0], camera.centre[1])
-    mirror = Evidence(np.ascontiguousarray(evidence.label[:, ::-1]))
+    mirror = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
     return find(caster, mirror, msgspec.structs.replace(camera, centre=centre), prior, search).score

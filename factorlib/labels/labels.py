@@ -21,7 +21,6 @@ from factorlib.labels.size import check_size
 
 LEFT_OUT = 255
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
-Masks = str | Mapping[str, str]
 log = logging.getLogger("factorlib.labels")
 
 
@@ -33,7 +32,7 @@ class Labels(msgspec.Struct, frozen=True):
 
 
 def read_labels(
-    masks: Masks, file: Callable[[str], Path], materials: list[str], size: tuple[int, int], image: str, key: str = "masks"
+    masks: str | Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], image: str, key: str = "masks"
 ) -> Labels:
     """The labels of one photo.
 

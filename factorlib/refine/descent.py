@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations, rendered
+from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, Pose
@@ -54,7 +54,7 @@ class Moving(msgspec.Struct, frozen=True):
     def score(self, state: State) -> float:
         """Labelled IoU."""
         hits = self.caster.cast(self.target.camera(state.camera(self.camera)), state.pose(self.caster))
-        return labelled_iou(self.target.evidence, self.caster.labels(hits))
+        return labelled_iou(self.target.silhouette, self.caster.labels(hits))
 
 
 class Photographed(msgspec.Struct, frozen=True):
@@ -63,7 +63,7 @@ class Photographed(msgspec.Struct, frozen=True):
     view: View
     number: int
     camera: Camera
-    evidence: Evidence
+    silhouette: Silhouette
     prior: FocalPrior
 
 
@@ -78,7 +78,7 @@ def moving_object(photographed: Photographed, poses: Sequence[Pose], surfaces: S
         seen = view.seen(own, posed)
         return view.block(own, seen, like, posed), seen.agrees
 
-    target = target_of(photographed.evidence, caster.mesh.labels, RESOLUTION, MARGIN)
+    target = target_of(photographed.silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
     return Moving(caster, target, camera, photographed.prior, surfaces, block)
 
 

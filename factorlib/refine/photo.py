@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
@@ -26,7 +26,7 @@ class PosedObject(msgspec.Struct, frozen=True):
     """
 
     caster: Caster
-    evidence: Evidence
+    silhouette: Silhouette
     pose: Pose
     runner_up: Pose | None = None
     moves: bool = True
@@ -71,10 +71,10 @@ def refined_photo(
     for done, k in enumerate(by_pixels(objects)):
         report(done, len(objects))
         own = objects[k]
-        if pixels is None or not own.moves or not own.evidence.inside.any():
+        if pixels is None or not own.moves or not own.silhouette.inside.any():
             continue
         view = View(pixels, [one.caster for one in objects], [j == k or one.trusted for j, one in enumerate(objects)], scene.shadows)
-        moving = moving_object(Photographed(view, k, camera, own.evidence, prior), poses, surfaces)
+        moving = moving_object(Photographed(view, k, camera, own.silhouette, prior), poses, surfaces)
         rival = state_of(own.runner_up, camera, own.caster) if own.runner_up else None
         verdict = settled(moving, before[k], rival, pixels.cell, standards)
         if verdict is not None:
@@ -86,4 +86,4 @@ def refined_photo(
 
 def by_pixels(objects: Sequence[PosedObject]) -> list[int]:
     """Numbers of the objects, the one with most pixels in its mask first."""
-    return sorted(range(len(objects)), key=lambda k: (-int(objects[k].evidence.inside.sum()), k))
+    return sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.evidence import Evidence
+from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
@@ -64,8 +64,8 @@ def photo_of(mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5,
     return caster, camera, Pose(rotation, middle - rotation @ caster.centre)
 
 
-def evidence_of(caster: Caster, camera: Camera, pose: Pose) -> Evidence:
-    return Evidence(rasterise(caster, camera, pose).label.astype(np.int16))
+def evidence_of(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
+    return Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
 
 
 def normal_error_deg(caster: Caster, camera: Camera, pose: Pose, found_camera: Camera, found_pose: Pose) -> float:

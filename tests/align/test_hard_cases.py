@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from factorlib.align.doubts import Standards, doubts
-from factorlib.align.evidence import Evidence, label_agreement, silhouette_iou
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import Search
+from factorlib.align.silhouette import Silhouette, label_agreement, silhouette_iou
 from factorlib.align.trust import trust_in
 from factorlib.errors import InputError
 from factorlib.generate.shapes import closed_grid
@@ -23,12 +23,12 @@ from tests.align.scenes import at, ball, blob, chair, evidence_of, mesh_of, phot
 QUICK = Search(views=120, rolls=12, keep=(14, 6, 3, 2), steps=(5, 6, 8, 6))
 
 
-def answered(given: Caster, camera: Camera, evidence: Evidence, focal: float | None = None):
+def answered(given: Caster, camera: Camera, silhouette: Silhouette, focal: float | None = None):
     """What the mesh shows at the pose found, and the doubts about it."""
-    obj = ObjectToPlace("chair", given, evidence)
+    obj = ObjectToPlace("chair", given, silhouette)
     result = placed([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo", QUICK)
     seen = rasterise(given, result.camera, result.poses[0])
-    iou, agreement = silhouette_iou(evidence, seen.label), label_agreement(evidence, seen.label)
+    iou, agreement = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
     return seen, doubts(iou, agreement, trust_in(obj, result, 0), result.found[0])
 
 
@@ -87,8 +87,8 @@ def z_up(vertices, faces):
 
 @pytest.mark.parametrize("how", [flipped, holed, duplicated, non_manifold, with_slivers, in_millimetres_far_off, z_up])
 def test_a_damaged_or_strange_mesh_shows_the_same_normals(how):
-    caster, camera, truth, evidence = case(blob())
-    seen, reasons = answered(damaged(caster.mesh, how), camera, evidence, camera.focal)
+    caster, camera, truth, silhouette = case(blob())
+    seen, reasons = answered(damaged(caster.mesh, how), camera, silhouette, camera.focal)
     assert error_deg(truth, seen) < 2 and not reasons
 
 
@@ -106,49 +106,49 @@ def test_a_million_triangles():
     radius = 1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3
     mesh = closed_grid(direction * radius[..., None], np.array([0, 1.0, 0]), np.array([0, -1.0, 0]))
     assert len(mesh.faces) > 1_000_000
-    caster, camera, truth, evidence = case(mesh)
-    seen, reasons = answered(caster, camera, evidence, camera.focal)
+    caster, camera, truth, silhouette = case(mesh)
+    seen, reasons = answered(caster, camera, silhouette, camera.focal)
     assert error_deg(truth, seen) < 2 and not reasons
 
 
 def test_a_sphere_is_believed_though_its_turn_is_unknown():
-    caster, camera, truth, evidence = case(mesh_of([ball()]))
-    seen, reasons = answered(caster, camera, evidence)
+    caster, camera, truth, silhouette = case(mesh_of([ball()]))
+    seen, reasons = answered(caster, camera, silhouette)
     assert error_deg(truth, seen) < 2 and not reasons
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_flat_plate_is_right_or_doubted(seed):
     """From far away its outline does not tell whether it is tilted this way or that."""
-    caster, camera, truth, evidence = case(mesh_of([trimesh.creation.box((1.0, 0.7, 0.01))]), seed)
-    seen, reasons = answered(caster, camera, evidence)
+    caster, camera, truth, silhouette = case(mesh_of([trimesh.creation.box((1.0, 0.7, 0.01))]), seed)
+    seen, reasons = answered(caster, camera, silhouette)
     assert error_deg(truth, seen) < 2 or reasons
 
 
 def test_twenty_pixels_are_too_few_and_it_is_said():
-    caster, camera, truth, evidence = case(chair(), fill=0.04)
-    assert 10 <= evidence.inside.sum() <= 40
-    assert any("tells normals" in reason for reason in answered(caster, camera, evidence)[1])
+    caster, camera, truth, silhouette = case(chair(), fill=0.04)
+    assert 10 <= silhouette.inside.sum() <= 40
+    assert any("tells normals" in reason for reason in answered(caster, camera, silhouette)[1])
 
 
 def test_a_mask_that_touches_all_four_edges_is_right_or_doubted():
-    caster, camera, truth, evidence = case(blob(), fill=2.6)
-    rim = (evidence.inside[0], evidence.inside[-1], evidence.inside[:, 0], evidence.inside[:, -1])
+    caster, camera, truth, silhouette = case(blob(), fill=2.6)
+    rim = (silhouette.inside[0], silhouette.inside[-1], silhouette.inside[:, 0], silhouette.inside[:, -1])
     assert all(edge.any() for edge in rim)
-    seen, reasons = answered(caster, camera, evidence, camera.focal)
+    seen, reasons = answered(caster, camera, silhouette, camera.focal)
     assert error_deg(truth, seen) < 2 or reasons
 
 
 def test_a_mask_of_the_whole_photo_is_doubted():
     caster, camera, *_ = case(chair())
-    assert answered(caster, camera, Evidence(np.ones((240, 320), np.int16)))[1]
+    assert answered(caster, camera, Silhouette(np.ones((240, 320), np.int16)))[1]
 
 
 def test_the_mirror_image_of_a_mask_is_found_out():
-    caster, camera, _, evidence = case(chair())
-    mirrored = Evidence(np.ascontiguousarray(evidence.label[:, ::-1]))
+    caster, camera, _, silhouette = case(chair())
+    mirrored = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
     assert any("mirror" in reason for reason in answered(caster, camera, mirrored)[1])
-    assert not answered(caster, camera, evidence)[1]
+    assert not answered(caster, camera, silhouette)[1]
 
 
 def test_standards_are_what_doubts_are_measured_by():

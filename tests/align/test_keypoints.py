@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factorlib.align.evidence import Evidence
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import focal_prior
+from factorlib.align.silhouette import Silhouette
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster
 from tests.align.scenes import ball, chair, evidence_of, mesh_of, normal_error_deg, photo_of
@@ -73,7 +73,7 @@ def test_units_and_origin_of_the_mesh_do_not_matter():
 def test_keypoints_that_do_not_agree_are_refused():
     caster, camera, pose = photo_of(chair(), 6)
     pixel = np.random.default_rng(0).uniform(0, 240, (8, 2))
-    obj = ObjectToPlace("chair", caster, Evidence(np.ones((240, 320), np.int16)), keypoints=Keypoints(pixel, TIPS))
+    obj = ObjectToPlace("chair", caster, Silhouette(np.ones((240, 320), np.int16)), keypoints=Keypoints(pixel, TIPS))
     with pytest.raises(InputError, match=r"of the 8 keypoints of 'chair' agree") as caught:
         answered(obj, camera, camera.focal)
     assert caught.value.key == "photo.chair.keypoints" and caught.value.cure

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from factorlib.align import proportions as module
-from factorlib.align.evidence import Evidence
 from factorlib.align.proportions import SHAPES, Sighting, jacobian_with_shape, proportions
 from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import Caster, rasterise
@@ -21,9 +21,9 @@ def sightings(true, given, count=4, focal_sigma=0.0, seed=20):
     made, truth = [], []
     for k in range(count):
         caster, camera, pose = photo_of(true, seed + k)
-        evidence = Evidence(rasterise(caster, camera, pose).label.astype(np.int16))
+        silhouette = Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
         start = state_of(pose, camera, given)
-        made.append(Sighting(given, target_of(evidence, given.labels, 200, 0.15), camera, FocalPrior(camera.focal, focal_sigma), start))
+        made.append(Sighting(given, target_of(silhouette, given.labels, 200, 0.15), camera, FocalPrior(camera.focal, focal_sigma), start))
         truth.append((caster, camera, pose))
     return made, truth
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from factorlib.align.coarse import is_cut
-from factorlib.align.evidence import UNKNOWN, Evidence
 from factorlib.align.search import Search, find, focal_prior
+from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import usable
@@ -19,12 +19,12 @@ KNOWN = "dataset"
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
 
 
-def found_in(caster, camera, pose, evidence=None, known_focal=False, mesh_given=None, search=QUICK):
+def found_in(caster, camera, pose, silhouette=None, known_focal=False, mesh_given=None, search=QUICK):
     """What the search finds, and the median normal error in degrees."""
-    evidence = evidence or evidence_of(caster, camera, pose)
+    silhouette = silhouette or evidence_of(caster, camera, pose)
     prior = focal_prior(camera.focal if known_focal else None, KNOWN if known_focal else None, camera.width, camera.height)
     given = mesh_given or caster
-    found = find(given, evidence, camera, prior, search)
+    found = find(given, silhouette, camera, prior, search)
     return found, normal_error_deg(caster, camera, pose, found.state.camera(camera), found.state.pose(given))
 
 
@@ -43,9 +43,9 @@ def test_symmetric_shape_has_a_runner_up_that_looks_the_same():
 
 def test_mask_cut_by_the_frame():
     caster, camera, pose = photo_of(chair(), 8, fill=1.0, shift=(0.28, 0.15))
-    evidence = evidence_of(caster, camera, pose)
-    assert is_cut(evidence)
-    assert found_in(caster, camera, pose, evidence, known_focal=True)[1] < 2
+    silhouette = evidence_of(caster, camera, pose)
+    assert is_cut(silhouette)
+    assert found_in(caster, camera, pose, silhouette, known_focal=True)[1] < 2
 
 
 def test_what_is_left_out_is_unknown_not_background():
@@ -53,24 +53,24 @@ def test_what_is_left_out_is_unknown_not_background():
     label = evidence_of(caster, camera, pose).label.copy()
     rows, columns = np.nonzero(label)
     label[:, int(np.quantile(columns, 0.7)) :] = UNKNOWN  # an occluder over nearly a third of it
-    assert found_in(caster, camera, pose, Evidence(label), known_focal=True)[1] < 2
+    assert found_in(caster, camera, pose, Silhouette(label), known_focal=True)[1] < 2
 
 
 def test_labels_settle_what_the_shape_cannot():
     """The photo shows the ends the other way round than the first mesh: the pose turns by half a turn."""
     caster, camera, pose = photo_of(dumbbell((1, 2)), 10)
     swapped = Caster(dumbbell((2, 1)))
-    evidence = evidence_of(caster, camera, pose)
-    found, error = found_in(caster, camera, pose, evidence, known_focal=True)
-    other, _ = found_in(caster, camera, pose, evidence, known_focal=True, mesh_given=swapped)
+    silhouette = evidence_of(caster, camera, pose)
+    found, error = found_in(caster, camera, pose, silhouette, known_focal=True)
+    other, _ = found_in(caster, camera, pose, silhouette, known_focal=True, mesh_given=swapped)
     assert error < 2 and found.score > 0.97
     assert angle_between(found.state.rotation, other.state.rotation) > 60
 
 
 def test_a_wrong_mesh_scores_lower():
     caster, camera, pose = photo_of(chair(), 11)
-    evidence, prior = evidence_of(caster, camera, pose), focal_prior(camera.focal, KNOWN, 320, 240)
-    assert find(Caster(blob()), evidence, camera, prior, QUICK).score < 0.8 < 0.95 < find(caster, evidence, camera, prior, QUICK).score
+    silhouette, prior = evidence_of(caster, camera, pose), focal_prior(camera.focal, KNOWN, 320, 240)
+    assert find(Caster(blob()), silhouette, camera, prior, QUICK).score < 0.8 < 0.95 < find(caster, silhouette, camera, prior, QUICK).score
 
 
 def test_millimetres_far_off_and_faces_flipped():
@@ -89,7 +89,7 @@ def test_a_tiny_mask_does_not_break_it():
     caster, camera, pose = photo_of(chair(), 13)
     label = np.zeros((240, 320), np.int16)
     label[100:104, 50:55] = 1
-    found = find(caster, Evidence(label), camera, focal_prior(None, None, 320, 240), QUICK)
+    found = find(caster, Silhouette(label), camera, focal_prior(None, None, 320, 240), QUICK)
     maps = rasterise(caster, found.state.camera(camera), found.state.pose(caster))
     rows, columns = np.nonzero(maps.label)
     assert 90 < rows.mean() < 114 and 40 < columns.mean() < 65

@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.evidence import Evidence, labelled_iou
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import Search, find, focal_prior
+from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.align.trust import contour_error, mirrored_score, normal_stderr_deg
@@ -61,20 +61,20 @@ def test_the_turn_of_a_ball_costs_nothing():
 def test_the_mirror_image_of_a_photo_off_centre_scores_as_the_photo_did():
     caster, camera, pose = photo_of(chair(), 21, focal=1.0, shift=(0.1, 0.05))
     camera = msgspec.structs.replace(camera, centre=(camera.centre[0] - 12.0, camera.centre[1] + 3.0))
-    evidence = evidence_of(caster, camera, pose)
-    flipped = Evidence(np.ascontiguousarray(evidence.label[:, ::-1]))
+    silhouette = evidence_of(caster, camera, pose)
+    flipped = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
     centre = (camera.width - camera.centre[0], camera.centre[1])
     mirrored = msgspec.structs.replace(camera, centre=centre)
     prior = focal_prior(camera.focal, "dataset", camera.width, camera.height)
-    right, wrong = mirrored_score(caster, flipped, mirrored, prior), mirrored_score(caster, evidence, camera, prior)
+    right, wrong = mirrored_score(caster, flipped, mirrored, prior), mirrored_score(caster, silhouette, camera, prior)
     assert right > 0.98 and 1 - right < (1 - wrong) / 2
 
 
 def test_winner_and_runner_up_are_scored_in_the_same_window():
     caster, camera, pose = photo_of(chair(), 3, width=640, height=480)
-    evidence, search = evidence_of(caster, camera, pose), Search(views=120, rolls=12, keep=(14, 6, 3, 1))
-    found = find(caster, evidence, camera, focal_prior(camera.focal, "dataset", 640, 480), search)
-    target = target_of(evidence, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    silhouette, search = evidence_of(caster, camera, pose), Search(views=120, rolls=12, keep=(14, 6, 3, 1))
+    found = find(caster, silhouette, camera, focal_prior(camera.focal, "dataset", 640, 480), search)
+    target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     for one in (found, found.runner_up):
         hits = caster.cast(target.camera(one.state.camera(camera)), one.state.pose(caster))
-        assert one.score == labelled_iou(target.evidence, caster.labels(hits))
+        assert one.score == labelled_iou(target.silhouette, caster.labels(hits))

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from benchmarks.refine import KINDS, TRUE, normal_error, photographed
-from factorlib.align.evidence import UNKNOWN, Evidence
 from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.align.state import state_of
 from factorlib.refine import descent
 from factorlib.refine.light import Surfaces, pursued_light
@@ -22,10 +22,10 @@ def moved_by_shading(seed, monkeypatch):
     photo = photographed("turned", 3, np.random.default_rng([5, seed, KINDS.index("turned"), 3]), OPERATOR)
     label = photo.channels["label"].astype(np.int16)
     about = binary_dilation(label > 0, iterations=20) & ~(label > 0)
-    evidence, prior = Evidence(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
+    silhouette, prior = Silhouette(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
     view = View(pixels_of(photo.channels, [True] * 3, 2400), [photo.given], [True])
     surfaces = Surfaces(TRUE, OPERATOR)
-    moving = descent.moving_object(descent.Photographed(view, 0, photo.camera, evidence, prior), [photo.pose], surfaces)
+    moving = descent.moving_object(descent.Photographed(view, 0, photo.camera, silhouette, prior), [photo.pose], surfaces)
     start, true = (state_of(pose, photo.camera, photo.given) for pose in (photo.pose, photo.truth))
     block, agrees = moving.block(true, None)
     light = pursued_light(block.take(agrees), surfaces)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.refine import KINDS, TRUE, normal_error, photographed, refined_of
-from factorlib.align.evidence import Evidence
 from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import Silhouette
 from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Scene, refined_photo
 from factorlib.refine.pixels import View, pixels_of
@@ -48,7 +48,7 @@ def test_shading_tells_front_from_back_where_outlines_are_one(wrong_first):
 
 def test_what_does_not_move_is_not_tried_and_no_pixels_change_nothing():
     photo = photo_of("turned", 1)
-    own = PosedObject(photo.given, Evidence(photo.channels["label"].astype(np.int16)), photo.pose, moves=False)
+    own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, moves=False)
     scene = Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0))
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
     for each in (refined_photo(scene, given, Surfaces(TRUE, OPERATOR)) for given in (pixels, None)):

@@ -8,8 +8,16 @@ import trimesh
 
 from factorlib.align.coarse import is_cut
 from factorlib.align.confidence import FACET, TURN, confidence, turns
-from factorlib.align.evidence import UNKNOWN, Evidence, label_agreement, labelled_iou, object_evidence, silhouette_iou, whole_evidence
 from factorlib.align.overlay import overlay
+from factorlib.align.silhouette import (
+    UNKNOWN,
+    Silhouette,
+    label_agreement,
+    labelled_iou,
+    silhouette_iou,
+    silhouette_of_object,
+    silhouette_of_photo,
+)
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import rasterise
 from tests.align.scenes import at, ball, chair, dumbbell, evidence_of, mesh_of, photo_of
@@ -26,29 +34,29 @@ def channels(label, left_out=None, owner=None):
 
 
 def test_left_out_is_unknown():
-    assert whole_evidence(channels([[0, 1, 0]], left_out=[[0, 0, 1]])).label.tolist() == [[0, 1, UNKNOWN]]
+    assert silhouette_of_photo(channels([[0, 1, 0]], left_out=[[0, 0, 1]])).label.tolist() == [[0, 1, UNKNOWN]]
 
 
 def test_foreign_materials_may_hide_an_object():
-    assert object_evidence(channels([[0, 1, 2, 3]]), 1, (1, 3), False).label.tolist() == [[0, 1, UNKNOWN, 3]]
+    assert silhouette_of_object(channels([[0, 1, 2, 3]]), 1, (1, 3), False).label.tolist() == [[0, 1, UNKNOWN, 3]]
 
 
 def test_own_masks_part_objects_of_one_material():
     given = channels([[0, 1, 1, 1]], owner=[[0, 1, 2, 0]])
-    assert object_evidence(given, 1, (1,), True).label.tolist() == [[0, 1, UNKNOWN, UNKNOWN]]
-    assert object_evidence(given, 2, (1,), False).label.tolist() == [[0, UNKNOWN, 1, 1]]
+    assert silhouette_of_object(given, 1, (1,), True).label.tolist() == [[0, 1, UNKNOWN, UNKNOWN]]
+    assert silhouette_of_object(given, 2, (1,), False).label.tolist() == [[0, UNKNOWN, 1, 1]]
 
 
 def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
     caster, camera, pose = photo_of(dumbbell(), 3)
-    evidence = evidence_of(caster, camera, pose)
+    silhouette = evidence_of(caster, camera, pose)
     mesh_label = rasterise(caster, camera, pose).label
-    label = evidence.label.copy()
+    label = silhouette.label.copy()
     label[:, 150:] = UNKNOWN
-    for known in (evidence, Evidence(label)):
+    for known in (silhouette, Silhouette(label)):
         assert silhouette_iou(known, mesh_label) == label_agreement(known, mesh_label) == labelled_iou(known, mesh_label) == 1
     swapped = np.where(mesh_label > 0, 3 - mesh_label, 0)
-    assert silhouette_iou(evidence, swapped) == 1 and label_agreement(evidence, swapped) == labelled_iou(evidence, swapped) == 0
+    assert silhouette_iou(silhouette, swapped) == 1 and label_agreement(silhouette, swapped) == labelled_iou(silhouette, swapped) == 0
 
 
 def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
@@ -59,13 +67,13 @@ def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
     rim = (label == 0) & (np.roll(label, 1, 1) | np.roll(label, -1, 1) > 0)
     thin[rim] = UNKNOWN
     broad[100:140] = UNKNOWN
-    assert [is_cut(Evidence(x)) for x in (label, thin, broad, label[:, 160:])] == [False, False, True, True]
+    assert [is_cut(Silhouette(x)) for x in (label, thin, broad, label[:, 160:])] == [False, False, True, True]
 
 
 def test_distance_to_a_straight_border_is_exact():
     label = np.zeros((20, 30), np.int16)
     label[5:15, 8:22] = 1
-    target = target_of(Evidence(label), (1,), 1000, margin=0.35)
+    target = target_of(Silhouette(label), (1,), 1000, margin=0.35)
     region = target.regions[1]
     row, column = int(10 - target.top), int(8 - target.left)
     assert target.pixel == 1 and region.distance[row, column - 1 : column + 2].tolist() == [0.5, -0.5, -1.5]
@@ -75,7 +83,7 @@ def test_distance_to_a_straight_border_is_exact():
 
 def test_beyond_the_frame_nothing_is_known():
     label = np.ones((10, 10), np.int16)
-    region = target_of(Evidence(label), (1,), 1000).regions[1]
+    region = target_of(Silhouette(label), (1,), 1000).regions[1]
     assert len(region.contour) == 0 and region.distance[5, 0] == -0.5
 
 
@@ -83,13 +91,13 @@ def test_confidence_grows_from_contour_inward_and_is_zero_where_labels_differ():
     caster, camera, pose = photo_of(mesh_of([ball(), at(ball(0.6), 1.2, 0, 0)], [1, 2]), 6)
     maps = rasterise(caster, camera, pose)
     label = maps.label.astype(np.int16)
-    sure = confidence(maps, Evidence(label))
+    sure = confidence(maps, Silhouette(label))
     assert sure.min() == 0 and 0.8 < sure.max() <= 1 and not sure[label == 0].any()
     row, column = (int(np.mean(k)) for k in np.nonzero(label == 1))
     assert sure[row, column] > 0.8
     wrong = label.copy()
     wrong[row - 3 : row + 3, column - 3 : column + 3] = 2
-    assert confidence(maps, Evidence(wrong))[row, column] == 0
+    assert confidence(maps, Silhouette(wrong))[row, column] == 0
 
 
 def test_confidence_falls_at_depth_jumps():
@@ -97,7 +105,7 @@ def test_confidence_falls_at_depth_jumps():
     caster, camera, pose = photo_of(mesh_of([front, behind]), 6)
     pose = type(pose)(np.eye(3), np.array([0, 0, pose.translation[2]]))
     maps = rasterise(caster, camera, pose)
-    sure = confidence(maps, Evidence(maps.label.astype(np.int16)))
+    sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
     jump = np.abs(np.diff(maps.depth, axis=1))[:, :] > 0.3
     inner = jump & (maps.label[:, 1:] > 0) & (maps.label[:, :-1] > 0)
     assert inner.sum() > 20 and sure[:, 1:][inner].max() == 0
@@ -106,7 +114,7 @@ def test_confidence_falls_at_depth_jumps():
 def middle_confidence(part, **photo):
     caster, camera, pose = photo_of(mesh_of([part], crease_deg=photo.pop("crease_deg", 40.0)), 3, **photo)
     maps = rasterise(caster, camera, pose)
-    sure = confidence(maps, Evidence(maps.label.astype(np.int16)))
+    sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
     return float(np.median(sure[maps.edge > 0.7]))
 
 
@@ -124,21 +132,21 @@ def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(heig
     expected = np.sqrt(4 / 3) / radius  # of n = (x, y) / radius over 3 × 3 pixels
     assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
     believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
-    assert confidence(maps, Evidence(maps.label.astype(np.int16)))[middle] == pytest.approx(believed, rel=0.02)
+    assert confidence(maps, Silhouette(maps.label.astype(np.int16)))[middle] == pytest.approx(believed, rel=0.02)
 
 
 def test_a_small_smooth_object_keeps_its_slanted_normals():
     caster, camera, pose = photo_of(mesh_of([ball()]), 6, width=80, height=60)
     maps = rasterise(caster, camera, pose)
-    sure = confidence(maps, Evidence(maps.label.astype(np.int16)))
+    sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
     slanted = (maps.edge > 0.35) & (maps.edge < 0.7)
     assert slanted.sum() > 50 and (sure[slanted] > 0).mean() > 0.95
 
 
 def test_overlay_draws_both_contours():
     caster, camera, pose = photo_of(chair(), 7, width=80, height=60)
-    maps, evidence = rasterise(caster, camera, pose), evidence_of(caster, camera, pose)
-    picture = overlay(np.full((60, 80, 3), 0.2), maps, Evidence(np.roll(evidence.label, 5, axis=1)))
+    maps, silhouette = rasterise(caster, camera, pose), evidence_of(caster, camera, pose)
+    picture = overlay(np.full((60, 80, 3), 0.2), maps, Silhouette(np.roll(silhouette.label, 5, axis=1)))
     assert picture.dtype == np.uint8 and picture.shape == (60, 80, 3)
     for colour in ([255, 38, 191], [51, 255, 51]):  # mesh, mask
         assert (picture == colour).all(axis=-1).sum() > 50

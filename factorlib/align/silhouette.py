@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 UNKNOWN = -1
 
 
-class Evidence(msgspec.Struct, frozen=True):
-    """What one photo says about one object, or about all of them together.
+class Silhouette(msgspec.Struct, frozen=True):
+    """Which pixels of a photo show an object (or all of them together), by material.
 
     label  [h, w] int16: material k, 0 background, UNKNOWN where the photo does not say: left out by the user,
            or covered by something that may stand in front of the object
@@ -31,56 +31,56 @@ class Evidence(msgspec.Struct, frozen=True):
         return self.label != UNKNOWN
 
 
-def whole_evidence(channels: Mapping[str, Float[np.ndarray, "h w"]]) -> Evidence:
+def silhouette_of_photo(channels: Mapping[str, Float[np.ndarray, "h w"]]) -> Silhouette:
     """Of the whole photo, from the channels that the masks stage wrote."""
     label = np.round(channels["label"]).astype(np.int16)
     if "left_out" in channels:
         label[channels["left_out"] > 0.5] = UNKNOWN
-    return Evidence(label)
+    return Silhouette(label)
 
 
-def object_evidence(channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool) -> Evidence:
+def silhouette_of_object(channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool) -> Silhouette:
     """Of object `number` (from 1), whose mesh carries `labels`.
 
     With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object
     claims.  Pixels of other objects and of foreign materials may hide it: UNKNOWN.
     """
-    label = whole_evidence(channels).label.copy()
+    label = silhouette_of_photo(channels).label.copy()
     owner = np.round(channels["object"]).astype(int) if "object" in channels else np.zeros(label.shape, int)
     mine = owner == number if own_mask else np.isin(label, labels) & ((owner == 0) | (owner == number))
     foreign = ~mine & ((label > 0) | ((owner > 0) & (owner != number)))
     label[foreign] = UNKNOWN
-    return Evidence(label)
+    return Silhouette(label)
 
 
-def silhouette_iou(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+def silhouette_iou(silhouette: Silhouette, mesh_label: Int[np.ndarray, "h w"]) -> float:
     """Intersection over union of mask and mesh over the pixels that are known; 0 where there is neither.
 
-    >>> silhouette_iou(Evidence(np.array([[0, 1, 1, UNKNOWN]])), np.array([[1, 1, 0, 1]]))
+    >>> silhouette_iou(Silhouette(np.array([[0, 1, 1, UNKNOWN]])), np.array([[1, 1, 0, 1]]))
     0.3333333333333333
     """
-    mask, mesh = evidence.inside & evidence.known, (mesh_label > 0) & evidence.known
+    mask, mesh = silhouette.inside & silhouette.known, (mesh_label > 0) & silhouette.known
     union = np.count_nonzero(mask | mesh)
     return float(np.count_nonzero(mask & mesh) / union) if union else 0.0
 
 
-def label_agreement(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+def label_agreement(silhouette: Silhouette, mesh_label: Int[np.ndarray, "h w"]) -> float:
     """Share of the pixels in both mask and mesh whose material is the same in both; 0 where there are none.
 
-    >>> label_agreement(Evidence(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
+    >>> label_agreement(Silhouette(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
     0.5
     """
-    both = evidence.inside & (mesh_label > 0)
+    both = silhouette.inside & (mesh_label > 0)
     total = np.count_nonzero(both)
-    return float(np.count_nonzero(both & (evidence.label == mesh_label)) / total) if total else 0.0
+    return float(np.count_nonzero(both & (silhouette.label == mesh_label)) / total) if total else 0.0
 
 
-def labelled_iou(evidence: Evidence, mesh_label: Int[np.ndarray, "h w"]) -> float:
+def labelled_iou(silhouette: Silhouette, mesh_label: Int[np.ndarray, "h w"]) -> float:
     """IoU that counts a pixel as shared only if its material is the same too: what the search maximises.
 
-    >>> labelled_iou(Evidence(np.array([[0, 1, 2, 1]])), np.array([[1, 1, 1, 1]]))
+    >>> labelled_iou(Silhouette(np.array([[0, 1, 2, 1]])), np.array([[1, 1, 1, 1]]))
     0.5
     """
-    known = evidence.known
-    union = np.count_nonzero(known & (evidence.inside | (mesh_label > 0)))
-    return float(np.count_nonzero(evidence.inside & (evidence.label == mesh_label)) / union) if union else 0.0
+    known = silhouette.known
+    union = np.count_nonzero(known & (silhouette.inside | (mesh_label > 0)))
+    return float(np.count_nonzero(silhouette.inside & (silhouette.label == mesh_label)) / union) if union else 0.0
