@@ -18,14 +18,3 @@ def robust_deviation(residual: Float[np.ndarray, "*n"]) -> float:
     2.9652
     """
     return PER_MEDIAN * float(np.median(np.abs(residual)))
-
-
-def weighted_median(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:
-    """The least of the values for which those up to it have half of the weight.
-
-    >>> weighted_median(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 5.0]))
-    2.0
-    """
-    order = np.argsort(values, kind="stable")
-    below = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(below, below[-1] / 2)])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.visibility import Occluders, sight
@@ -66,7 +67,7 @@ def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, 
     """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
     found = read_photo_poses(inputs["align"] / f"{inputs.photo}.json")
     camera, occluders = found.camera.camera(shape[1], shape[0]), occluders_of(inputs, found.objects)
-    past = sight(occluders, camera, seen.x, seen.y, seen.normal, params.directions, params.cast_points)
+    past = sight(occluders, camera, np.column_stack([seen.x, seen.y]), seen.normal, params.directions, params.cast_points)
     return msgspec.structs.replace(seen, visibility=past.visibility, met=past.met) if past else seen
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.generate import lights
-from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, traced
+from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rigid, traced
 from factorlib.geometry.camera import Camera
 from factorlib.urm.observations import Observations
 
@@ -175,7 +175,7 @@ def made_light(number: int) -> Float[np.ndarray, "h w 3"]:
         forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
         azimuth = forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70)
         scene = lights.daylight(rng, rng.uniform(30, 50), azimuth, rows=2 * LIGHT_ROWS)
-    return lights.map_of(scene, world_from_camera @ YUP_FROM_CAMERA, LIGHT_ROWS, LIGHT_SPP, 1000 + number)
+    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), LIGHT_ROWS, LIGHT_SPP, 1000 + number)
 
 
 def _digest(*parts) -> str:

@@ -22,7 +22,7 @@ from factorlib.generate.chair import Part, chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, SceneDict
 from factorlib.generate.shapes import smooth
 from factorlib.generate.synthetic import drawn_materials
-from factorlib.generate.tracing import Material, bsdf, envmap, look, rigid, shape, traced, transform
+from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
@@ -196,7 +196,7 @@ def light_at_chairs(scene: Scene, parameters: Parameters, seed: int) -> Float[np
     """The surroundings' light at the chairs' middle, without the chairs; where light is direct but not distant, what shines by itself."""
     depth = 1 if parameters.direct and not parameters.distant else -1
     place = (0, SET.middle - EYE, 0)
-    return lights.map_of(scene.things, world_from_light(scene), parameters.light_rows, parameters.light_spp, seed, place, depth)
+    return light_seen(scene.things, rigid(world_from_light(scene), place), parameters.light_rows, parameters.light_spp, seed, depth)
 
 
 def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material]) -> dict[str, Any]:

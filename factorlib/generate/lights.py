@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.generate.mitsuba_variant import mitsuba
-from factorlib.generate.tracing import envmap, light_seen, rgb, rigid, transform
+from factorlib.generate.tracing import envmap, light_seen, rgb, transform
 from factorlib.images.photo import read_photo
 
 EYE = 1.2  # height of the origin over the ground
@@ -130,22 +130,6 @@ def block(
     """A box of half sizes `half` about `place`, turned about y."""
     to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
-
-
-def map_of(
-    scene: SceneDict,
-    world_from_light: Float[np.ndarray, "3 3"],
-    height: int,
-    spp: int,
-    seed: int,
-    place: Sequence[float] = (0, 0, 0),
-    max_depth: int = -1,
-) -> Float[np.ndarray, "h w 3"]:
-    """The light of a surrounding at a place of the world, a lat-long map of `height` rows in a turned y-up frame.
-
-    max_depth: as in `tracing.rendered`; 1 is what shines by itself
-    """
-    return light_seen(scene, rigid(world_from_light, place), height, spp, seed, max_depth)
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:

@@ -19,7 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.lights import SceneDict
 from factorlib.generate.shapes import SHAPES
-from factorlib.generate.tracing import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
+from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
@@ -137,9 +137,8 @@ def light_of(
         return lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
     seed = int(rng.integers(1 << 24))
     turn = world_from_camera @ YUP_FROM_CAMERA
-    return lights.map_of(
-        surroundings(number, world_from_camera, rng, 2 * parameters.light_rows), turn, parameters.light_rows, parameters.light_spp, seed
-    )
+    scene = surroundings(number, world_from_camera, rng, 2 * parameters.light_rows)
+    return light_seen(scene, rigid(turn, (0, 0, 0)), parameters.light_rows, parameters.light_spp, seed)
 
 
 def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> SceneDict:

@@ -119,13 +119,13 @@ class Occluders:
 def sight(
     occluders: Occluders,
     camera: Camera,
-    x: Int[np.ndarray, " n"],
-    y: Int[np.ndarray, " n"],
+    pixels: Int[np.ndarray, "n 2"],
     shading_normal: Float[np.ndarray, "n 3"],
     directions: int,
     most_points: int,
 ) -> Sight | None:
     """What the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all."""
+    x, y = pixels.T
     points = occluders.points_under(camera, x, y)
     cast = spread_subset(x, y, most_points)
     some = Points(*(getattr(points, name)[cast] for name in points.__struct_fields__))

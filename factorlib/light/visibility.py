@@ -15,6 +15,7 @@ L, that by roughness is a further f.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import msgspec
 import torch
@@ -84,16 +85,23 @@ def seen_share(visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], 
     return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
 
 
+class MovingLobes(NamedTuple):
+    """p lobes, and the two tangents along which each can turn: unit, at right angles to its axis and to each other."""
+
+    axis: Float[Tensor, "p 3"]
+    sharpness: Float[Tensor, " p"]
+    tangents: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]
+
+
 def seen(
     visibility: Float[Tensor, "n k"],
     weights: Float[Tensor, "n k"],
     directions: Float[Tensor, "k 3"],
-    axis: Float[Tensor, "p 3"],
-    sharpness: Float[Tensor, " p"],
-    tangents: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]],
+    moving: MovingLobes,
     by_roughness: Float[Tensor, "n k"] | None = None,
 ) -> Seen:
-    """v with its derivatives; by_roughness: of the `weights`, where v is to be differentiated by it too."""
+    """v with its derivatives by turns and sharpness of the lobes; by_roughness: of the `weights`, where v is to be differentiated by it too."""
+    axis, sharpness, tangents = moving
     p, kappa = len(sharpness), widened(sharpness, len(directions))
     lobes = kernel(directions, axis, sharpness)
     turned = [kappa * product(directions, t.T) * lobes for t in tangents]

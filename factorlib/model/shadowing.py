@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from factorlib.light.visibility import Seen, cosine_weights, highlight_weights, kernel, seen, seen_share
+from factorlib.light.visibility import MovingLobes, Seen, cosine_weights, highlight_weights, kernel, seen, seen_share
 from factorlib.model.blocks import Block
 from factorlib.model.lights import Light, UnitLobes
 
@@ -74,13 +74,13 @@ def shadowed_response(
         return r, None
     r = {name: value.clone() for name, value in r.items()}
     turning = Turning(*(tuple(torch.zeros_like(r["diffuse"]) for _ in range(2)) for _ in range(2)))
-    lobes = [torch.from_numpy(v).float() for v in (light.axis, light.sharpness)]
-    tangents = tuple(torch.from_numpy(t).float() for t in light.tangents())
+    axis, sharpness, *tangents = (torch.from_numpy(v).float() for v in (light.axis, light.sharpness, *light.tangents()))
+    lobes = MovingLobes(axis, sharpness, tuple(tangents))
     for some in shadowed_rows(block, rows):
         glossy, by_roughness = highlight_weights(some.normal, some.view, some.directions, float(roughness))
         cosine = cosine_weights(some.normal, some.directions)
         for part, weights, rough in (("diffuse", cosine, None), ("specular", glossy, by_roughness)):
-            share = seen(some.visibility, weights, some.directions, *lobes, tangents, rough)
+            share = seen(some.visibility, weights, some.directions, lobes, rough)
             _multiply(r, getattr(turning, part), part, some.places, share)
     return r, turning
 

@@ -121,7 +121,8 @@ class View:
 
     def _shadowed(self, block: Block, camera: Camera, seen: Seen, poses: Sequence[Pose]) -> Block:
         meshes, directions = [caster.mesh for caster in self.casters], fibonacci_sphere(self.shadows)
-        found = sight(Occluders(meshes, poses), camera, self.pixels.x, self.pixels.y, seen.normal, self.shadows, len(self.pixels))
+        pixels = np.column_stack([self.pixels.x, self.pixels.y])
+        found = sight(Occluders(meshes, poses), camera, pixels, seen.normal, self.shadows, len(pixels))
         return block if found is None else msgspec.structs.replace(block, visibility=found.visibility, directions=directions[None])
 
 

@@ -34,11 +34,10 @@ from factorlib.model.cells import clusters_of
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
-from factorlib.robust import weighted_median
 from factorlib.solve.cholesky import positive_definite_inverse
 from factorlib.solve.lattice import Lattice, Reflections
 from factorlib.solve.marginal import Field, Marginal, shown
-from factorlib.solve.marginal_descent import MarginalDescent, MaterialPrior, materials_of, unknowns_of
+from factorlib.solve.marginal_descent import MarginalDescent, MaterialPrior, State, materials_of, unknowns_of
 
 LOBES = 400  # of the lattice: 10° apart
 OBSERVATIONS = 5000  # of an illumination: materials follow from those in highlights, which are few
@@ -97,11 +96,7 @@ def naturally(
     descent = MarginalDescent(problem, MaterialPrior(materials, problem.blocks), report)
     lights = [constant(block, materials, lattice) for block in problem.blocks]
     state = descent.run(fields, theta, lights, np.zeros_like(free), LIGHT_ITERATIONS)
-    for iterations in ITERATIONS:
-        materials = materials_of(state.theta)
-        hyperparameters = [hyperparameters_of(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
-        fields = with_hyperparameters(fields, hyperparameters, prior)
-        state = descent.run(fields, state.theta, state.log_radiance, free, iterations)
+    state, hyperparameters = alternated(descent, fields, state, free, prior, ITERATIONS)
     found = materials_of(state.theta)
     found = Materials(found.diffuse, np.where(lambertian[:, None], 0.0, found.specular), found.roughness)
     lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, start.lights, strict=True)]
@@ -111,27 +106,34 @@ def naturally(
 def lights_from_all(
     problem: JointProblem, found: Natural, prior: LightPrior, report: Callable[[int, float], None] = lambda iteration, loss: None
 ) -> Natural:
-    """The lights that all observations of `problem` show, given the materials of an answer that was found from some of them; report: as above."""
+    """The lights that all observations of `problem` show, given the materials of an answer that was found from some of them.
+
+    report: as of `naturally`
+    """
     lattice, materials = Lattice.of(found.log_radiance[0].shape[1]), found.point.materials
-    theta, hyperparameters, lights = unknowns_of(materials), found.hyperparameters, found.log_radiance
-    fixed, positive = np.zeros_like(theta, bool), materials_of(theta)
-    descent = MarginalDescent(problem, MaterialPrior(positive, problem.blocks), report)
-    fields = fields_of(problem, found.point, prior, lattice, hyperparameters)
-    for iterations in LIGHTS_AGAIN:
-        state = descent.run(fields, theta, lights, fixed, iterations)
-        lights = state.log_radiance
-        hyperparameters = [hyperparameters_of(*one, positive, prior) for one in zip(fields, state.parts, lights, strict=True)]
-        fields = with_hyperparameters(fields, hyperparameters, prior)
-    shown_as = [lattice.light(u, light) for u, light in zip(lights, found.point.lights, strict=True)]
-    return Natural(Point(materials, shown_as), lights, hyperparameters, state.value)
+    theta = unknowns_of(materials)
+    fixed = np.zeros_like(theta, bool)
+    fields = fields_of(problem, found.point, prior, lattice, found.hyperparameters)
+    descent = MarginalDescent(problem, MaterialPrior(materials, problem.blocks), report)
+    state = descent.run(fields, theta, found.log_radiance, fixed, 0)
+    state, hyperparameters = alternated(descent, fields, state, fixed, prior, LIGHTS_AGAIN)
+    lights = [lattice.light(u, light) for u, light in zip(state.log_radiance, found.point.lights, strict=True)]
+    return Natural(Point(materials, lights), state.log_radiance, hyperparameters, state.value)
 
 
-def with_hyperparameters(fields: Sequence[Field], hyperparameters: Sequence[Hyperparameters], prior: LightPrior) -> list[Field]:
-    """The fields with other temperatures and factors of the prior."""
-    return [
-        msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(field.lattice.axis, one.factors))
-        for field, one in zip(fields, hyperparameters, strict=True)
-    ]
+def alternated(
+    descent: MarginalDescent, fields: list[Field], state: State, free: Bool[np.ndarray, "m 7"], prior: LightPrior, iterations: Sequence[int]
+) -> tuple[State, list[Hyperparameters]]:
+    """Hyperparameters estimated at the state, then a descent with them, as often as there are `iterations`; the state, and the last estimate."""
+    for most in iterations:
+        materials = materials_of(state.theta)
+        found = [hyperparameters_of(*one, materials, prior) for one in zip(fields, state.parts, state.log_radiance, strict=True)]
+        fields = [
+            msgspec.structs.replace(field, temperature=one.temperature, precision=prior.precision(field.lattice.axis, one.factors))
+            for field, one in zip(fields, found, strict=True)
+        ]
+        state = descent.run(fields, state.theta, state.log_radiance, free, most)
+    return state, found
 
 
 def sure_ones(problem: JointProblem) -> JointProblem:
@@ -142,14 +144,15 @@ def sure_ones(problem: JointProblem) -> JointProblem:
 
 
 def sure(block: Block) -> Bool[np.ndarray, " n"]:
-    """Whether the normal is at least `SURE` times as sure as the typical one of its material, which is the median by weight."""
+    """Whether each normal's confidence is at least `SURE` times the median of its material in this light, by weight."""
     result = np.ones(len(block), bool)
     if block.confidence is None:
         return result
     weight = np.square(block.precision * block.noise.sigma(block.radiance)).max(1)
     for m in np.unique(block.material):
         rows = block.material == m
-        result[rows] = block.confidence[rows] >= SURE * weighted_median(block.confidence[rows], weight[rows])
+        typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
+        result[rows] = block.confidence[rows] >= SURE * typical
     return result
 
 

@@ -30,7 +30,7 @@ def pixels(meshes, poses, camera=CAMERA):
 
 def seen_by(meshes, poses, count=256, most=10_000, camera=CAMERA):
     x, y, normal, thing = pixels(meshes, poses, camera)
-    found = sight(Occluders(meshes, poses), camera, x, y, normal, count, most)
+    found = sight(Occluders(meshes, poses), camera, np.column_stack([x, y]), normal, count, most)
     return found and found.visibility, normal, thing
 
 

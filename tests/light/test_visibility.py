@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen, seen_share
+from factorlib.light.visibility import MovingLobes, cosine_weights, highlight_weights, kernel, seen, seen_share
 
 RNG = np.random.default_rng(4)
 
@@ -91,7 +91,7 @@ def test_derivatives_are_differences(part):
         return moved / moved.norm(dim=1, keepdim=True)
 
     weights, by_roughness = weights_of(part, normals, views, d)
-    found = seen(visibility, weights, d, axis, log_sharpness.exp(), turn, by_roughness)
+    found = seen(visibility, weights, d, MovingLobes(axis, log_sharpness.exp(), turn), by_roughness)
     expected = {
         "by_first": (share(turned(step * turn[0]), log_sharpness, 0.4) - share(turned(-step * turn[0]), log_sharpness, 0.4)) / (2 * step),
         "by_second": (share(turned(step * turn[1]), log_sharpness, 0.4) - share(turned(-step * turn[1]), log_sharpness, 0.4)) / (2 * step),

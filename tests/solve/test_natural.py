@@ -191,8 +191,8 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     one = problem.blocks[0]
     one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
     unsure = np.arange(len(one)) % 3 == 0
-    told = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
-    (kept,) = sure_ones(JointProblem([told], OPERATOR, Loss())).blocks
+    rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
+    (kept,) = sure_ones(JointProblem([rated], OPERATOR, Loss())).blocks
     assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
     noise = Noise(DARK * one.noise.absolute, one.noise.relative)
     assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
@@ -202,8 +202,8 @@ def test_what_is_alike_unsure_is_used():
     """Legs of few pixels are all a material has: sure is what is as sure as the rest of the same material."""
     problem, _ = photographed(9, 1, lobes=40, size=10)
     one = problem.blocks[0]
-    told = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
-    for given in (told, one):
+    rated = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
+    for given in (rated, one):
         assert len(sure_ones(JointProblem([given], OPERATOR, Loss())).blocks[0]) == len(one)
 
 
