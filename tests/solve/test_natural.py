@@ -17,7 +17,7 @@ from factorlib.model.responses import unit_values
 from factorlib.reflection import reflection_operator
 from factorlib.solve.lattice import NODES, Lattice, Reflections
 from factorlib.solve.marginal import Field, marginal
-from factorlib.solve.marginal_descent import MaterialPrior, materials_of, unknowns_of
+from factorlib.solve.marginal_descent import LEVEL, TINT, MaterialPrior, materials_of, unknowns_of
 from factorlib.solve.natural import DARK, LOBES, lights_from_all, naturally, sure_ones, temperature
 
 FEW = 120  # lobes of a lattice, so that tests are quick
@@ -33,14 +33,16 @@ def drawn(seed: int, lattice: Lattice) -> np.ndarray:
     return np.linalg.solve(MIX, fields)
 
 
-def photographed(seed: int, lights: int, lobes: int = FEW, size: int = 16, noise: float = 0.3) -> tuple[JointProblem, list[np.ndarray]]:
+def photographed(
+    seed: int, lights: int, lobes: int = FEW, size: int = 16, noise: float = 0.3, materials: Materials = MATERIALS
+) -> tuple[JointProblem, list[np.ndarray]]:
     """Spheres of three materials in lights drawn from the prior, with noise, and the log radiances in the blocks' units."""
     lattice, blocks, true = Lattice.of(lobes), [], []
     rng = np.random.default_rng(seed)
     for k in range(lights):
         log_radiance = drawn(100 * seed + k, lattice)
         light = lattice.light(log_radiance, random_light(rng, 1))
-        clean = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=k)
+        clean = block(f"room{k}", light, materials, [0, 1, 2], OPERATOR, size=size, seed=k)
         noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
         blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
         true.append(log_radiance - np.log(clean.unit))
@@ -240,10 +242,9 @@ def test_order_of_lights_changes_nothing():
 def test_the_gauge_is_held_by_the_prior_of_materials():
     problem, _ = photographed(6, 1, lobes=50, size=10)
     prior, theta = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS)
-    assert prior.at(theta).value == pytest.approx(0, abs=1e-12)
     brighter = theta.copy()
     brighter[:, [0, 3]] += 0.05
-    assert prior.at(brighter).value > 20
+    assert prior.at(brighter).value - prior.at(theta).value > 20
     rng = np.random.default_rng(0)
     change = rng.normal(size=theta.shape) * 1e-4
     at = theta + 0.01 * rng.normal(size=theta.shape)
@@ -251,3 +252,27 @@ def test_the_gauge_is_held_by_the_prior_of_materials():
     assert prior.at(at).gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-2)
 
 
+def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
+    """A dielectric costs nothing, twice its reflectance little, gold less than a few hundred observations say; a Lambertian material nothing."""
+
+    def costs(specular):
+        materials = Materials(np.full((1, 3), 0.4), np.array([specular]), np.array([0.3]))
+        return MaterialPrior(materials, []).at(unknowns_of(materials)).value
+
+    assert costs([0.05] * 3) == pytest.approx(0, abs=1e-12) and costs([0.0] * 3) == pytest.approx(0, abs=1e-3)
+    assert costs([0.1] * 3) == pytest.approx((np.log(2) / LEVEL) ** 2)
+    assert costs([0.05 * np.exp(0.1), 0.05, 0.05 * np.exp(-0.1)]) == pytest.approx(2 * (0.1 / TINT) ** 2)
+    assert 30 < costs([1, 0.8, 0.3]) < 60
+
+
+def test_gold_among_paints_keeps_its_colour():
+    gold = Materials(
+        np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]),
+        np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]),
+        MATERIALS.roughness,
+    )
+    problem, _ = photographed(10, 2, materials=gold)
+    start = Materials(np.full((3, 3), 0.3), np.full((3, 3), 0.1), np.full(3, 0.4))
+    lights = [random_light(np.random.default_rng(k), 1) for k in range(2)]
+    found = naturally(problem, Point(start, lights), PRIOR, NOBODY, lobes=FEW).point.materials
+    assert found.specular[2] * factor_between(found, gold) == pytest.approx(gold.specular[2], rel=0.15)
