@@ -104,11 +104,16 @@ def loss_of(field: Field, seen: Shown) -> float:
 
 
 def marginal(
-    field: Field, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, clusters: Int[np.ndarray, " n"] | None = None
+    field: Field,
+    log_radiance: Float[np.ndarray, "3 p"],
+    materials: Materials,
+    clusters: Int[np.ndarray, " n"] | None = None,
+    materials_given: bool = False,
 ) -> Marginal:
     """The system of one illumination.
 
-    clusters: number of each observation's cluster, from 0, for `Marginal.scores`
+    clusters: number of each observation's cluster, from 0, for `Marginal.scores`;  materials_given: only the light is asked for, and
+    equation (2), which takes most of the time, is left out of the gradient and the Hessian by materials
     """
     seen, p, count = shown(field, log_radiance, materials), len(field.lattice), 7 * len(materials)
     u = log_radiance.reshape(-1)
@@ -134,7 +139,7 @@ def marginal(
     covariance, log_determinant = positive_definite_inverse(hessian)
     loss = loss_of(field, seen)
     total = loss / field.temperature + float(u @ field.precision @ u) + log_determinant
-    for own, part in channels:
+    for own, part in () if materials_given else channels:
         slopes = (part.diffuse, part.specular, part.by_roughness)
         spread = [slope @ covariance[own, own].astype(np.float32) for slope in slopes]
         by_material[part.places] += [float(np.vdot(spread[0] + spread[1], slope)) for slope in slopes]

@@ -114,9 +114,10 @@ class MarginalDescent:
         iterations: int,
     ) -> State:
         """The state after at most so many steps; only the materials' unknowns that are `free` change."""
-        state, damping = self._at(fields, theta, lights), DAMPING
+        given, damping = not free.any(), DAMPING
+        state = self._at(fields, theta, lights, given)
         for _ in range(iterations):
-            trial = self._at(fields, *_step(state, free, damping))
+            trial = self._at(fields, *_step(state, free, damping), given)
             if trial.value < state.value:
                 small = state.value - trial.value < TOLERANCE * abs(state.value)
                 state, damping = trial, damping * LOWER
@@ -128,9 +129,9 @@ class MarginalDescent:
                 damping = max(damping * HIGHER, DAMPING)
         return state
 
-    def _at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], lights: list[Float[np.ndarray, "3 p"]]) -> State:
+    def _at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], lights: list[Float[np.ndarray, "3 p"]], given: bool) -> State:
         materials = materials_of(theta)
-        parts = list(self.spread(lambda one: marginal(*one, materials), list(zip(fields, lights, strict=True))))
+        parts = list(self.spread(lambda one: marginal(*one, materials, materials_given=given), list(zip(fields, lights, strict=True))))
         prior = self.material_prior.at(theta)
         self.report(self.iteration, sum(part.loss for part in parts) / self.values)
         self.iteration += 1

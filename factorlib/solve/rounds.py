@@ -5,8 +5,8 @@
             (all on a sample of the observations, which finds the lobes as well as all of them do)
     best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
     stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
-            evidence), at `lobes` lobes per light, or after `rounds`; after `ENOUGH` of them, where lights may follow a prior and lobes
-            explain held-out pixels so badly that they will
+            evidence), at `lobes` lobes per light, or after `rounds`; after `ENOUGH` of them, where lights may follow a prior and a
+            further round is not expected to explain held-out pixels so well that they need none
 """
 
 from __future__ import annotations
@@ -164,10 +164,12 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
-    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and min(held_out, rounds.held_out) > HOPEFUL * WELL_EXPLAINED
+    least = min(held_out, rounds.held_out)
+    hopeless = least * least > HOPEFUL * WELL_EXPLAINED * rounds.held_out  # it would be too high after as great a decrease again
+    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and hopeless
     over = outdone or needs_prior or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
-    best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
-    return Rounds(current.point, best, least, history[-1].loss, history, without_gain, bool(over))
+    best, of_best = (current.point, held_out) if better else (rounds.best, rounds.held_out)
+    return Rounds(current.point, best, of_best, history[-1].loss, history, without_gain, bool(over))
 
 
 def robust(problem: JointProblem, point: Point) -> Loss:

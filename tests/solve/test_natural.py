@@ -106,6 +106,14 @@ def test_gradients_are_finite_differences():
         assert here.light_gradient @ change.reshape(-1) == pytest.approx(difference, rel=0.02, abs=0.02 * np.abs(here.light_gradient).max())
 
 
+def test_given_materials_the_system_of_the_light_is_the_same():
+    problem, true = photographed(1, 1, lobes=50, size=10)
+    field = field_of(problem, 50)
+    one, other = (marginal(field, true[0], MATERIALS, materials_given=given) for given in (False, True))
+    for name in ("value", "loss", "light_gradient", "light_hessian"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_the_determinant_is_needed_for_roughness():
     """With it the likelihood of a roughness is highest near the true one; the loss and the prior alone prefer smoother materials."""
     problem, true = photographed(3, 1, lobes=100, size=14, noise=1.0)
