@@ -1,0 +1,92 @@
+"""Whether standard errors say how wrong results are: `python -m benchmarks.standard_errors build/eames [build/…]`.
+
+For each folder of results, which `make evaluate` made of a data set with a truth: the share of k_d, k_s, roughnesses and of the light
+maps' log radiances, in `CELLS` cells and after the factor per channel that is free, that lie within one standard error of the truth.
+Of a normal distribution it is 68 %.  With `--other FOLDER`, the results of another run of the same data set, such as one with another
+`solve.seed`, stand in for the truth: both runs see the same photographs, so that less than one standard error should lie between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from jaxtyping import Float
+
+from factorlib.conventions import lat_long_directions
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.exr import read_rgb_exr
+from factorlib.results.materials import Reflectance, Solved, read_materials, reflectances
+from factorlib.results.metrics import read_metrics
+
+CELLS = 500  # of equal area, 9° apart
+PARTS = ("diffuse", "specular", "roughness")
+Deviations = dict[str, Float[np.ndarray, " n"]]
+
+
+def material_deviations(build: Path, other: Path | None) -> Deviations:
+    """|estimate − truth| over the standard error, of all materials, after the factor per channel that is free."""
+    table = read_materials(build / "export/materials.json").materials
+    if other:
+        true = reflectances(read_materials(other / "export/materials.json"))
+        factor = sums_of(true.values()) / sums_of([table[n] for n in true])  # of data sets of one connected component
+        factors = dict.fromkeys(true, factor)
+    else:
+        compared = read_metrics(build / "evaluate/metrics.json").materials
+        if compared is None:
+            raise SystemExit(f"{build}: its data set has no truth; name another run by --other")
+        true = {n: one.truth for n, one in compared.materials.items()}
+        factors = {n: np.array(compared.factor[str(one.component)]) for n, one in compared.materials.items()}
+    return {part: np.concatenate([_off(table[n], true[n], part, factors[n]) for n in true]) for part in PARTS}
+
+
+def sums_of(materials: Iterable[Reflectance]) -> Float[np.ndarray, "3"]:
+    """Of k_d + k_s, by channel."""
+    return np.sum([[one.diffuse, one.specular] for one in materials], axis=(0, 1))
+
+
+def _off(found: Solved, true: Reflectance, part: str, factor: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+    value, expected, error = (np.atleast_1d(np.array(getattr(one, part), float)) for one in (found, true, found.stderr))
+    by = 1.0 if part == "roughness" else factor
+    return np.abs(by * value - expected) / np.maximum(by * error, 1e-12)
+
+
+def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]:
+    """|Δ log radiance| over its standard error, of all lights, cells and channels, each channel's median taken out."""
+    against, off = (other / "export/illumination") if other else (build / "evaluate/illumination"), []
+    for path in sorted((build / "export/illumination").glob("*.exr")):
+        found, true, error = (cells_of(read_rgb_exr(folder / path.name)) for folder in (path.parent, against, build / "export/coverage"))
+        deviation = error * found.mean(0) / found  # coverage is relative to the light's mean radiance
+        difference = np.log(found / np.maximum(true, 1e-6 * true.mean()))
+        off.append((np.abs(difference - np.median(difference, axis=0)) / deviation).reshape(-1))
+    return np.concatenate(off)
+
+
+def cells_of(lat_long: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "c 3"]:
+    """Means over cells of equal area."""
+    height, width = lat_long.shape[:2]
+    directions = lat_long_directions(height, width).reshape(-1, 3)
+    cell = np.argmax(directions @ fibonacci_sphere(CELLS).T, axis=1)
+    area = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi), width)
+    whole = np.bincount(cell, area, CELLS)
+    sums = np.stack([np.bincount(cell, area * c, CELLS) for c in lat_long.reshape(-1, 3).T], axis=1)
+    known = whole > 0
+    return sums[known] / whole[known, None]
+
+
+def main(
+    builds: Annotated[list[Path], typer.Argument(help="folders of results, such as build/eames")],
+    other: Annotated[Path | None, typer.Option(help="folder of another run of the same data set, instead of the truth")] = None,
+) -> None:
+    """Print the shares within one standard error, and the median deviation in standard errors."""
+    print(f"{'within one standard error (median deviation)':46} {'k_d':>12} {'k_s':>12} {'roughness':>12} {'light':>12}")
+    for build in builds:
+        deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
+        print(f"{build!s:46} " + " ".join(f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})".rjust(12) for d in deviations))
+
+
+if __name__ == "__main__":
+    typer.run(main)
