@@ -3,6 +3,7 @@
 Materials   The information is the Schur complement of the marginal likelihood's system, by reflectances instead of their logarithms, of
             which a nil reflectance would seem to be known for sure.  As in `factorlib.diagnose.uncertainty` its
             inverse and two sandwiches, over clusters of mirror directions and over whole lights, are compared, and the largest counts.
+            It is the observations' alone: what the prior on k_s adds is left out, for the rest of the model's errors is not in it either.
 Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equation (1) of `factorlib.solve.marginal`).  A map's radiance in
             direction d is Σ_p φ_p(d) w_p with w = exp(u), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation tells
             anything, Σ is the prior's covariance.
@@ -39,12 +40,12 @@ class Posterior:
         self.fields = fields_of(problem, answer.point, prior, self.lattice, answer.hyperparameters)
 
     def systems(self, with_scores: bool) -> list[Marginal]:
-        """Of each illumination; with_scores: of clusters of observations, too."""
+        """Of each illumination; with_scores: of clusters of observations, too; without, materials are given."""
 
         def system(one: tuple[Field, np.ndarray]) -> Marginal:
             """Of one illumination and its light."""
             field, log_radiance = one
-            return marginal(field, log_radiance, self.materials, clusters_of(field.block) if with_scores else None)
+            return marginal(field, log_radiance, self.materials, clusters_of(field.block) if with_scores else None, not with_scores)
 
         return list(self.problem.spread(system, list(zip(self.fields, self.answer.log_radiance, strict=True))))
 

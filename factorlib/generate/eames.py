@@ -120,7 +120,7 @@ class Scene(msgspec.Struct, frozen=True):
     """A photo before it is taken: surroundings, camera and chairs in the world (y up, floor at −EYE, chairs about x = z = 0)."""
 
     shot: Shot
-    things: SceneDict
+    surroundings: SceneDict
     camera: Camera
     world_from_camera: Float[np.ndarray, "4 4"]
     chairs: dict[str, Float[np.ndarray, "4 4"]]  # world_from_object
@@ -146,8 +146,8 @@ def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     focal = folder.focal_px_of_35mm(shot.focal_35mm, parameters.width, parameters.height)
     camera = Camera(parameters.width, parameters.height, focal, (parameters.width / 2, parameters.height / 2))
-    things = surroundings(shot, yaw, number, lat_longs, rng, parameters)
-    return Scene(shot, things, camera, rigid(look(-down, yaw), place), chairs)
+    around = surroundings(shot, yaw, number, lat_longs, rng, parameters)
+    return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
 def surroundings(
@@ -169,7 +169,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     meshes = [labelled(chair(), {"shell": order.index(colour) + 1, "legs": order.index("wood") + 1}) for colour in shot.chairs]
     labels = folder.labels_of(meshes, scene.camera, poses)
     light = light_at_chairs(scene, parameters, seed)
-    around = distant(light, scene) if parameters.distant else scene.things
+    around = distant(light, scene) if parameters.distant else scene.surroundings
     depth = 2 if parameters.direct else -1
     radiance = traced(around | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, depth)
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT))
@@ -196,7 +196,7 @@ def light_at_chairs(scene: Scene, parameters: Parameters, seed: int) -> Float[np
     """The surroundings' light at the chairs' middle, without the chairs; where light is direct but not distant, what shines by itself."""
     depth = 1 if parameters.direct and not parameters.distant else -1
     place = (0, SET.middle - EYE, 0)
-    return light_seen(scene.things, rigid(world_from_light(scene), place), parameters.light_rows, parameters.light_spp, seed, depth)
+    return light_seen(scene.surroundings, rigid(world_from_light(scene), place), parameters.light_rows, parameters.light_spp, seed, depth)
 
 
 def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ computer color vision").  The prior on k_s says so, with l = log k_s of a materi
 A metal, such as gold with k_s = (1, .8, .3), costs some 50, a small part of what a few hundred observations say.  Where they say nothing
 of k_s, as of a bright and nearly Lambertian surface, it stays plausible.
 
-The factor per channel that is free between materials and lights is held by the sum of the materials' reflectances, which stays as it was
+The factor per channel that is free between materials and lights is fixed by the sum of the materials' reflectances, which stays as it was
 at the start.
 """
 

@@ -165,8 +165,8 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
     least = min(held_out, rounds.held_out)
-    hopeless = least * least > HOPEFUL * WELL_EXPLAINED * rounds.held_out  # it would be too high after as great a decrease again
-    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and hopeless
+    far = least * least > HOPEFUL * WELL_EXPLAINED * rounds.held_out  # its held-out loss is too high after as great a decrease again
+    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and far
     over = outdone or needs_prior or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
     best, of_best = (current.point, held_out) if better else (rounds.best, rounds.held_out)
     return Rounds(current.point, best, of_best, history[-1].loss, history, without_gain, bool(over))
