@@ -17,6 +17,7 @@ import typer
 from jaxtyping import Float
 
 from factorlib.conventions import lat_long_directions
+from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import Reflectance, Solved, read_materials, reflectances
@@ -84,7 +85,10 @@ def main(
     """Print the shares within one standard error, and the median deviation in standard errors."""
     print(f"{'within one standard error (median deviation)':46} {'k_d':>12} {'k_s':>12} {'roughness':>12} {'light':>12}")
     for build in builds:
-        deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
+        try:
+            deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
+        except InputError as error:
+            raise SystemExit(f"{error}\nrun `make evaluate` first: {build} holds no whole results") from None
         print(f"{build!s:46} " + " ".join(f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})".rjust(12) for d in deviations))
 
 
