@@ -5,7 +5,8 @@
     bounces   Where shadows go on and interreflection = auto, the light that surfaces send to each other is added, if held-out pixels
               are explained better with it after equally many iterations; further rounds follow
     choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
-    prior     lights with the statistics of natural light, where lobes do not explain held-out pixels well (natural)
+    prior     lights with the statistics of natural light, where lobes do not explain held-out pixels well (natural).  Materials then keep
+              their specular parts, which have a prior of their own: lobes that explain badly are no witness against them
     polish    if lights are lobes: brings the answer to its optimum, first on many observations, then on all
 """
 
@@ -178,24 +179,31 @@ def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:
 
 
 def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run) -> Specular:
-    """The fit without needless specular parts: those decided before, and those without which held-out observations lose nothing."""
+    """The fit without needless specular parts: those decided before, and, unless lights follow the prior, those without which
+    held-out observations lose nothing."""
     if kept := run.journal.kept("choice", Specular):
         return kept
     materials = fit.point.materials
     for m in np.flatnonzero(start.lambertian):
         materials = materials.lambertian(m)
     before = Point(materials, fit.point.lights)
-    if run.options.specular == "on" or start.decided.all() or problem.none_held_out:
+    if run.options.specular == "on" or start.decided.all() or problem.none_held_out or follows_prior(problem, fit, run.options):
         evidence = undecided(start.lambertian) if start.decided.any() else []
         return run.journal.keep("choice", Specular(before, start.lambertian, evidence))
     sample = sampled_for(problem, before, run.options)
     return run.journal.keep("choice", without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian))
 
 
+def follows_prior(problem: JointProblem, fit: Fit, choices: Choices) -> bool:
+    """Whether lights have a prior: if so chosen, or where lobes of `fit` explain held-out observations badly."""
+    if choices.light_prior == "auto":
+        return not problem.none_held_out and not fit.held_out < WELL_EXPLAINED
+    return choices.light_prior == "on"
+
+
 def with_prior_chosen(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Prior | None:
     """The fit with a prior on lights; None where the lobes of `fit` explain held-out observations well, or none are held out."""
-    choice, well = run.options.light_prior, problem.none_held_out or fit.held_out < WELL_EXPLAINED
-    if choice == "none" or (choice == "auto" and well):
+    if not follows_prior(problem, fit, run.options):
         return None
     if kept := run.journal.kept("light prior", Prior):
         return kept

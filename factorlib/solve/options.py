@@ -48,7 +48,7 @@ class Choices(Struct, frozen=True):
     interreflection: Interreflection = "auto"
     """Whether surfaces that hide the light send their own, as the photo shows it; auto: where that explains held-out observations better."""
     specular: SpecularParts = "auto"
-    """Whether every material has a specular part; auto: where held-out observations are explained worse without."""
+    """Whether every material has a specular part; auto: where held-out observations are explained worse without, and under the light prior."""
     tone: ToneCurves = "auto"
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
     light_prior: LightPriors = "auto"
