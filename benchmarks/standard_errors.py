@@ -16,11 +16,11 @@ import numpy as np
 import typer
 from jaxtyping import Float
 
-from factorlib.conventions import lat_long_directions
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_rgb_exr
-from factorlib.results.materials import Reflectance, Solved, read_materials, reflectances
+from factorlib.light.prior_fit import cell_means
+from factorlib.results.materials import Reflectance, Solved, in_order, read_materials
 from factorlib.results.metrics import read_metrics
 
 CELLS = 500  # of equal area, 9° apart
@@ -32,7 +32,8 @@ def material_deviations(build: Path, other: Path | None) -> Deviations:
     """|estimate − truth| over the standard error, of all materials, after the factor per channel that is free."""
     table = read_materials(build / "export/materials.json").materials
     if other:
-        true = reflectances(read_materials(other / "export/materials.json"))
+        path = other / "export/materials.json"
+        true = dict(zip(table, in_order(read_materials(path), list(table), path), strict=True))
         factor = sums_of(true.values()) / sums_of([table[n] for n in true])  # of data sets of one connected component
         factors = dict.fromkeys(true, factor)
     else:
@@ -58,24 +59,13 @@ def _off(found: Solved, true: Reflectance, part: str, factor: Float[np.ndarray, 
 def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]:
     """|Δ log radiance| over its standard error, of all lights, cells and channels, each channel's median taken out."""
     against, off = (other / "export/illumination") if other else (build / "evaluate/illumination"), []
-    for path in sorted((build / "export/illumination").glob("*.exr")):
-        found, true, error = (cells_of(read_rgb_exr(folder / path.name)) for folder in (path.parent, against, build / "export/coverage"))
+    folders, cells = (build / "export/illumination", against, build / "export/coverage"), fibonacci_sphere(CELLS)
+    for path in sorted(against.glob("*.exr")):
+        found, true, error = (cell_means(read_rgb_exr(folder / path.name), cells) for folder in folders)
         deviation = error * found.mean(0) / found  # coverage is relative to the light's mean radiance
         difference = np.log(found / np.maximum(true, 1e-6 * true.mean()))
         off.append((np.abs(difference - np.median(difference, axis=0)) / deviation).reshape(-1))
     return np.concatenate(off)
-
-
-def cells_of(lat_long: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "c 3"]:
-    """Means over cells of equal area."""
-    height, width = lat_long.shape[:2]
-    directions = lat_long_directions(height, width).reshape(-1, 3)
-    cell = np.argmax(directions @ fibonacci_sphere(CELLS).T, axis=1)
-    area = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi), width)
-    whole = np.bincount(cell, area, CELLS)
-    sums = np.stack([np.bincount(cell, area * c, CELLS) for c in lat_long.reshape(-1, 3).T], axis=1)
-    known = whole > 0
-    return sums[known] / whole[known, None]
 
 
 def main(
@@ -88,7 +78,7 @@ def main(
         try:
             deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
         except InputError as error:
-            raise SystemExit(f"{error}\nrun `make evaluate` first: {build} holds no whole results") from None
+            raise SystemExit(f"{error}\nrun `make evaluate` first, and name folders of one data set") from None
         print(f"{build!s:46} " + " ".join(f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})".rjust(12) for d in deviations))
 
 

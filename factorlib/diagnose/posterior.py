@@ -3,7 +3,7 @@
 Materials   The information is the Schur complement of the marginal likelihood's system, by reflectances instead of their logarithms, of
             which a nil reflectance would seem to be known for sure.  As in `factorlib.diagnose.uncertainty` its
             inverse and two sandwiches, over clusters of mirror directions and over whole lights, are compared, and the largest counts.
-            It is the observations' alone: what the prior on k_s adds is left out, for the rest of the model's errors is not in it either.
+            The prior on k_s is left out: standard errors say what the observations alone determine.
 Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equation (1) of `factorlib.solve.marginal`).  A map's radiance in
             direction d is Σ_p φ_p(d) w_p with w = exp(u), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation tells
             anything, Σ is the prior's covariance.

@@ -5,8 +5,8 @@
     bounces   Where shadows go on and interreflection = auto, the light that surfaces send to each other is added, if held-out pixels
               are explained better with it after equally many iterations; further rounds follow
     choices   tone curves and specular parts, kept where held-out pixels are explained better with them (curves, specular)
-    prior     lights with the statistics of natural light, where lobes do not explain held-out pixels well (natural).  Materials then keep
-              their specular parts, which have a prior of their own: lobes that explain badly are no witness against them
+    prior     lights with the statistics of natural light, where lobes do not explain held-out pixels well (natural).  All materials
+              then keep their specular parts, which have a prior, too: trials with wrong lights cannot tell which are needless
     polish    if lights are lobes: brings the answer to its optimum, first on many observations, then on all
 """
 

@@ -6,8 +6,8 @@ computer color vision").  The prior on k_s says so, with l = log k_s of a materi
 
     minus twice its log density = (l̄ − log SPECULAR)²/LEVEL² + Σ_c (l_c − l̄)²/TINT²                                 (1)
 
-A metal, such as gold with k_s = (1, .8, .3), costs some 50, a small part of what a few hundred observations say.  Where they say nothing
-of k_s, as of a bright and nearly Lambertian surface, it stays plausible.
+For a metal, such as gold with k_s = (1, .8, .3), (1) is some 50, which a few hundred observations outweigh.  Where observations say little
+of k_s, as those of a bright and nearly Lambertian surface do, (1) decides.
 
 The factor per channel that is free between materials and lights is fixed by the sum of the materials' reflectances, which stays as it was
 at the start.
@@ -31,7 +31,7 @@ from factorlib.solve.arrow import damped, masked
 from factorlib.solve.marginal import Field, Marginal, marginal
 
 DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
-SPECULAR, LEVEL, TINT = 0.05, 0.7, 0.15  # of (1); LEVEL: a factor of 2; TINT: white balance is no better known
+SPECULAR, LEVEL, TINT = 0.05, 0.7, 0.15  # of (1); e^LEVEL: a factor of 2; e^TINT: 16 %, for the white balance of photos is not known better
 GAUGE = 0.01  # standard deviation of a channel's summed reflectance about that of the start
 MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
 MOST_LOG_RADIANCE = 1.5  # change of a cell's log radiance in one step
@@ -65,9 +65,9 @@ class MaterialPrior:
 
     def __init__(self, start: Materials, blocks: Sequence[Block]):
         self.mean, self.precision = unknowns_of(start), np.tile(np.diag([DIFFUSE**-2.0] * 3 + [0.0] * 3 + [ROUGH**-2.0]), (len(start), 1, 1))
-        shiny = (start.specular > LEAST_REFLECTANCE).any(1)
-        self.mean[shiny, 3:6] = np.log(SPECULAR)
-        self.precision[shiny, 3:6, 3:6] = np.full((3, 3), 1 / 9) / LEVEL**2 + (np.eye(3) - 1 / 3) / TINT**2
+        with_specular = (start.specular > LEAST_REFLECTANCE).any(1)
+        self.mean[with_specular, 3:6] = np.log(SPECULAR)
+        self.precision[with_specular, 3:6, 3:6] = np.full((3, 3), 1 / 9) / LEVEL**2 + (np.eye(3) - 1 / 3) / TINT**2
         self.members = [list(members) for members, _ in connected_components(blocks, len(start))]
         self.whole = [_sums(start, members) for members in self.members]
 
@@ -114,10 +114,10 @@ class MarginalDescent:
         iterations: int,
     ) -> State:
         """The state after at most so many steps; only the materials' unknowns that are `free` change."""
-        given, damping = not free.any(), DAMPING
-        state = self._at(fields, theta, lights, given)
+        materials_given, damping = not free.any(), DAMPING
+        state = self._at(fields, theta, lights, materials_given)
         for _ in range(iterations):
-            trial = self._at(fields, *_step(state, free, damping), given)
+            trial = self._at(fields, *_step(state, free, damping), materials_given)
             if trial.value < state.value:
                 small = state.value - trial.value < TOLERANCE * abs(state.value)
                 state, damping = trial, damping * LOWER
@@ -129,9 +129,11 @@ class MarginalDescent:
                 damping = max(damping * HIGHER, DAMPING)
         return state
 
-    def _at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], lights: list[Float[np.ndarray, "3 p"]], given: bool) -> State:
+    def _at(
+        self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], lights: list[Float[np.ndarray, "3 p"]], materials_given: bool
+    ) -> State:
         materials = materials_of(theta)
-        parts = list(self.spread(lambda one: marginal(*one, materials, materials_given=given), list(zip(fields, lights, strict=True))))
+        parts = list(self.spread(lambda one: marginal(*one, materials, materials_given=materials_given), list(zip(fields, lights, strict=True))))
         prior = self.material_prior.at(theta)
         self.report(self.iteration, sum(part.loss for part in parts) / self.values)
         self.iteration += 1

@@ -48,7 +48,8 @@ class Choices(Struct, frozen=True):
     interreflection: Interreflection = "auto"
     """Whether surfaces that hide the light send their own, as the photo shows it; auto: where that explains held-out observations better."""
     specular: SpecularParts = "auto"
-    """Whether every material has a specular part; auto: where held-out observations are explained worse without, and under the light prior."""
+    """Whether every material has a specular part; auto: where held-out observations are explained
+    worse without; all of them where lights follow the statistics of natural light."""
     tone: ToneCurves = "auto"
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are explained better with one."""
     light_prior: LightPriors = "auto"

@@ -164,12 +164,21 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
-    least = min(held_out, rounds.held_out)
-    far = least * least > HOPEFUL * WELL_EXPLAINED * rounds.held_out  # its held-out loss is too high after as great a decrease again
-    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and far
+    needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and another_is_too_few(rounds.held_out, held_out)
     over = outdone or needs_prior or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
-    best, of_best = (current.point, held_out) if better else (rounds.best, rounds.held_out)
-    return Rounds(current.point, best, of_best, history[-1].loss, history, without_gain, bool(over))
+    best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
+    return Rounds(current.point, best, least, history[-1].loss, history, without_gain, bool(over))
+
+
+def another_is_too_few(best: float, held_out: float) -> bool:
+    """Whether lobes still explain badly after another round, if it lowers the held-out loss by the same factor as this one did.
+
+    best: before this round;  held_out: after it
+
+    >>> another_is_too_few(1.35, 0.72), another_is_too_few(2.0, 1.2), another_is_too_few(1.31, 1.18), another_is_too_few(1.2, 1.3)
+    (False, True, True, True)
+    """
+    return min(held_out, best) ** 2 > HOPEFUL * WELL_EXPLAINED * best
 
 
 def robust(problem: JointProblem, point: Point) -> Loss:

@@ -64,7 +64,7 @@ def photo_of(mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5,
     return caster, camera, Pose(rotation, middle - rotation @ caster.centre)
 
 
-def evidence_of(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
+def true_silhouette(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
     return Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
 
 

@@ -18,7 +18,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import CREASE_DEG, read_mesh, usable
 from factorlib.meshes.soup import Soup, no_normals
-from tests.align.scenes import at, ball, blob, chair, evidence_of, mesh_of, photo_of
+from tests.align.scenes import at, ball, blob, chair, mesh_of, photo_of, true_silhouette
 
 QUICK = Search(views=120, rolls=12, keep=(14, 6, 3, 2), steps=(5, 6, 8, 6))
 
@@ -39,7 +39,7 @@ def error_deg(truth, seen) -> float:
 
 def case(mesh, seed=21, **how):
     caster, camera, pose = photo_of(mesh, seed, **how)
-    return caster, camera, rasterise(caster, camera, pose), evidence_of(caster, camera, pose)
+    return caster, camera, rasterise(caster, camera, pose), true_silhouette(caster, camera, pose)
 
 
 def damaged(mesh, how) -> Caster:
@@ -154,7 +154,7 @@ def test_the_mirror_image_of_a_mask_is_found_out():
 def test_standards_are_what_doubts_are_measured_by():
     caster, camera, pose = photo_of(mesh_of([ball(), at(ball(0.5), 1.1, 0.3, 0)]), 4)
     moved = Pose(pose.rotation, pose.translation + np.array([0.02, 0, 0]))
-    obj = ObjectToPlace("chair", caster, evidence_of(caster, camera, pose), moved)
+    obj = ObjectToPlace("chair", caster, true_silhouette(caster, camera, pose), moved)
     result = placed([obj], camera, KnownFocal(camera.focal, "dataset"), "photo", QUICK)
     trust = trust_in(obj, result, 0)
     assert trust.normal_stderr_deg is None and trust.mirrored_score is None and trust.contour_error > 0

@@ -11,7 +11,7 @@ from factorlib.align.search import focal_prior
 from factorlib.align.silhouette import Silhouette
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster
-from tests.align.scenes import ball, chair, evidence_of, mesh_of, normal_error_deg, photo_of
+from tests.align.scenes import ball, chair, mesh_of, normal_error_deg, photo_of, true_silhouette
 
 TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip
 
@@ -32,7 +32,7 @@ def answered(obj, camera, focal):
 def test_careless_keypoints_and_the_mask_give_the_pose(seed, known):
     caster, camera, pose = photo_of(chair(), seed)
     keypoints = seen_in(camera, pose, off=2.0, seed=seed)
-    obj = ObjectToPlace("chair", caster, evidence_of(caster, camera, pose), keypoints=keypoints)
+    obj = ObjectToPlace("chair", caster, true_silhouette(caster, camera, pose), keypoints=keypoints)
     result, found = answered(obj, camera, camera.focal if known else None)
     assert normal_error_deg(caster, camera, pose, result.camera, found) < 2
     assert result.found[0].by_keypoints and result.found[0].runner_up is None
@@ -42,7 +42,7 @@ def test_keypoints_decide_where_the_mask_cannot():
     """A ball looks the same from everywhere; the turn is the keypoints'."""
     caster, camera, pose = photo_of(mesh_of([ball()]), 3)
     points = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], float)
-    obj = ObjectToPlace("ball", caster, evidence_of(caster, camera, pose), keypoints=seen_in(camera, pose, points))
+    obj = ObjectToPlace("ball", caster, true_silhouette(caster, camera, pose), keypoints=seen_in(camera, pose, points))
     _, found = answered(obj, camera, camera.focal)
     assert np.allclose(found.rotation, pose.rotation, atol=0.02)
 

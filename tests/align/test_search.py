@@ -13,7 +13,7 @@ from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import usable
 from factorlib.meshes.soup import Soup, no_normals
-from tests.align.scenes import ball, blob, chair, dumbbell, evidence_of, mesh_of, normal_error_deg, photo_of
+from tests.align.scenes import ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
 
 KNOWN = "dataset"
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
@@ -21,7 +21,7 @@ QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not nee
 
 def found_in(caster, camera, pose, silhouette=None, known_focal=False, mesh_given=None, search=QUICK):
     """What the search finds, and the median normal error in degrees."""
-    silhouette = silhouette or evidence_of(caster, camera, pose)
+    silhouette = silhouette or true_silhouette(caster, camera, pose)
     prior = focal_prior(camera.focal if known_focal else None, KNOWN if known_focal else None, camera.width, camera.height)
     given = mesh_given or caster
     found = find(given, silhouette, camera, prior, search)
@@ -43,14 +43,14 @@ def test_symmetric_shape_has_a_runner_up_that_looks_the_same():
 
 def test_mask_cut_by_the_frame():
     caster, camera, pose = photo_of(chair(), 8, fill=1.0, shift=(0.28, 0.15))
-    silhouette = evidence_of(caster, camera, pose)
+    silhouette = true_silhouette(caster, camera, pose)
     assert is_cut(silhouette)
     assert found_in(caster, camera, pose, silhouette, known_focal=True)[1] < 2
 
 
 def test_what_is_left_out_is_unknown_not_background():
     caster, camera, pose = photo_of(chair(), 9)
-    label = evidence_of(caster, camera, pose).label.copy()
+    label = true_silhouette(caster, camera, pose).label.copy()
     rows, columns = np.nonzero(label)
     label[:, int(np.quantile(columns, 0.7)) :] = UNKNOWN  # an occluder over nearly a third of it
     assert found_in(caster, camera, pose, Silhouette(label), known_focal=True)[1] < 2
@@ -60,7 +60,7 @@ def test_labels_settle_what_the_shape_cannot():
     """The photo shows the ends the other way round than the first mesh: the pose turns by half a turn."""
     caster, camera, pose = photo_of(dumbbell((1, 2)), 10)
     swapped = Caster(dumbbell((2, 1)))
-    silhouette = evidence_of(caster, camera, pose)
+    silhouette = true_silhouette(caster, camera, pose)
     found, error = found_in(caster, camera, pose, silhouette, known_focal=True)
     other, _ = found_in(caster, camera, pose, silhouette, known_focal=True, mesh_given=swapped)
     assert error < 2 and found.score > 0.97
@@ -69,7 +69,7 @@ def test_labels_settle_what_the_shape_cannot():
 
 def test_a_wrong_mesh_scores_lower():
     caster, camera, pose = photo_of(chair(), 11)
-    silhouette, prior = evidence_of(caster, camera, pose), focal_prior(camera.focal, KNOWN, 320, 240)
+    silhouette, prior = true_silhouette(caster, camera, pose), focal_prior(camera.focal, KNOWN, 320, 240)
     assert find(Caster(blob()), silhouette, camera, prior, QUICK).score < 0.8 < 0.95 < find(caster, silhouette, camera, prior, QUICK).score
 
 

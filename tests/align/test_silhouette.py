@@ -20,7 +20,7 @@ from factorlib.align.silhouette import (
 )
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import rasterise
-from tests.align.scenes import at, ball, chair, dumbbell, evidence_of, mesh_of, photo_of
+from tests.align.scenes import at, ball, chair, dumbbell, mesh_of, photo_of, true_silhouette
 
 
 def channels(label, left_out=None, owner=None):
@@ -49,7 +49,7 @@ def test_own_masks_part_objects_of_one_material():
 
 def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
     caster, camera, pose = photo_of(dumbbell(), 3)
-    silhouette = evidence_of(caster, camera, pose)
+    silhouette = true_silhouette(caster, camera, pose)
     mesh_label = rasterise(caster, camera, pose).label
     label = silhouette.label.copy()
     label[:, 150:] = UNKNOWN
@@ -61,7 +61,7 @@ def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
 
 def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
     caster, camera, pose = photo_of(mesh_of([ball()]), 0)
-    label = evidence_of(caster, camera, pose).label
+    label = true_silhouette(caster, camera, pose).label
     thin, broad = label.copy(), label.copy()
     thin[120] = UNKNOWN
     rim = (label == 0) & (np.roll(label, 1, 1) | np.roll(label, -1, 1) > 0)
@@ -145,7 +145,7 @@ def test_a_small_smooth_object_keeps_its_slanted_normals():
 
 def test_overlay_draws_both_contours():
     caster, camera, pose = photo_of(chair(), 7, width=80, height=60)
-    maps, silhouette = rasterise(caster, camera, pose), evidence_of(caster, camera, pose)
+    maps, silhouette = rasterise(caster, camera, pose), true_silhouette(caster, camera, pose)
     picture = overlay(np.full((60, 80, 3), 0.2), maps, Silhouette(np.roll(silhouette.label, 5, axis=1)))
     assert picture.dtype == np.uint8 and picture.shape == (60, 80, 3)
     for colour in ([255, 38, 191], [51, 255, 51]):  # mesh, mask

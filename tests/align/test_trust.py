@@ -12,7 +12,7 @@ from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.align.trust import contour_error, mirrored_score, normal_stderr_deg
-from tests.align.scenes import ball, blob, chair, evidence_of, mesh_of, photo_of
+from tests.align.scenes import ball, blob, chair, mesh_of, photo_of, true_silhouette
 
 KNOWN = FocalPrior(1.0, 0.0)
 
@@ -20,7 +20,7 @@ KNOWN = FocalPrior(1.0, 0.0)
 def seen(mesh, seed=1, **how):
     """The caster, the photo's camera, the true state, and a target of the mask."""
     caster, camera, pose = photo_of(mesh, seed, **how)
-    return caster, camera, state_of(pose, camera, caster), target_of(evidence_of(caster, camera, pose), caster.mesh.labels, 200, 0.2)
+    return caster, camera, state_of(pose, camera, caster), target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, 200, 0.2)
 
 
 @pytest.mark.parametrize("larger", [0.04, -0.04, 0.1])
@@ -61,7 +61,7 @@ def test_the_turn_of_a_ball_costs_nothing():
 def test_the_mirror_image_of_a_photo_off_centre_scores_as_the_photo_did():
     caster, camera, pose = photo_of(chair(), 21, focal=1.0, shift=(0.1, 0.05))
     camera = msgspec.structs.replace(camera, centre=(camera.centre[0] - 12.0, camera.centre[1] + 3.0))
-    silhouette = evidence_of(caster, camera, pose)
+    silhouette = true_silhouette(caster, camera, pose)
     flipped = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
     centre = (camera.width - camera.centre[0], camera.centre[1])
     mirrored = msgspec.structs.replace(camera, centre=centre)
@@ -72,7 +72,7 @@ def test_the_mirror_image_of_a_photo_off_centre_scores_as_the_photo_did():
 
 def test_winner_and_runner_up_are_scored_in_the_same_window():
     caster, camera, pose = photo_of(chair(), 3, width=640, height=480)
-    silhouette, search = evidence_of(caster, camera, pose), Search(views=120, rolls=12, keep=(14, 6, 3, 1))
+    silhouette, search = true_silhouette(caster, camera, pose), Search(views=120, rolls=12, keep=(14, 6, 3, 1))
     found = find(caster, silhouette, camera, focal_prior(camera.focal, "dataset", 640, 480), search)
     target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     for one in (found, found.runner_up):

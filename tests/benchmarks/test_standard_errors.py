@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.standard_errors import cells_of, light_deviations, material_deviations
+from benchmarks.standard_errors import light_deviations, main, material_deviations
+from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
 
@@ -40,8 +41,10 @@ def test_deviations_between_two_runs_are_in_standard_errors_after_the_free_facto
     assert np.mean(off > 1.5) == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)  # their share of the sphere
 
 
-def test_cells_have_the_mean_of_the_map():
-    rng = np.random.default_rng(0)
-    lat_long = rng.random((64, 128, 3))
-    area = np.sin((np.arange(64) + 0.5) / 64 * np.pi)[:, None, None]
-    assert cells_of(lat_long).mean(0) == pytest.approx((lat_long * area).sum((0, 1)) / (128 * area.sum()), rel=0.02)
+def test_results_of_another_data_set_are_refused(folders):
+    one, other = (results(folder, 0.3, 1.0, np.ones((64, 128, 3))) for folder in folders)
+    write_materials(other / "export/materials.json", MaterialTable({"three": solved(Reflectance((0.4,) * 3, (0.1,) * 3, 0.3), ERROR)}))
+    with pytest.raises(InputError, match="'one' is missing"):
+        material_deviations(one, other)
+    with pytest.raises(SystemExit, match="name folders of one data set"):
+        main([one], other)

@@ -35,8 +35,8 @@ def rooms(materials, shown, noise=0.3):
     return blocks
 
 
-def chosen(materials, shown, **options):
-    bundle = Bundle(light_prior="none", lobes=16, insert=6, rounds=3, iterations=12, polish=10, **options)
+def chosen(materials, shown, light_prior="none", **options):
+    bundle = Bundle(light_prior=light_prior, lobes=16, insert=6, polish=10, **{"rounds": 3, "iterations": 12} | options)
     return solve(JointProblem(rooms(materials, shown), OPERATOR), from_nothing(3), Run(bundle))
 
 
@@ -64,6 +64,11 @@ def test_a_lambertian_scene_ends_without_specular_and_with_few_lobes():
 def test_nothing_is_chosen_where_it_is_not_asked_for():
     found = chosen(MIXED, [0, 1, 2], specular="on")
     assert not found.lambertian.any() and found.specular == []
+
+
+def test_under_the_light_prior_all_keep_their_specular_parts():
+    found = chosen(MIXED, [0, 1, 2], light_prior="on", rounds=1, iterations=2)
+    assert found.natural and not found.lambertian.any() and found.specular == []
 
 
 def test_what_shines_more_than_it_scatters_is_not_tried():

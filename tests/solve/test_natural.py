@@ -273,7 +273,8 @@ def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
     assert 30 < costs([1, 0.8, 0.3]) < 60
 
 
-def test_gold_among_paints_keeps_its_colour():
+def test_gold_among_paints_is_not_taken_for_a_paint():
+    """Up to the factor per channel that is free."""
     gold = Materials(
         np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]),
         np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]),
