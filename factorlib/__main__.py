@@ -35,6 +35,7 @@ app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, pretty_
 Dataset = Annotated[str | None, typer.Option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="stage.parameter=value, as in solve.lobes=64; else SET")]
 Force = Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")]
+Recipes = Annotated[list[str] | None, typer.Option("--recipe", help="pictures to make: a path, a name in recipes/, or all; else RECIPE")]
 Stages = Annotated[list[str] | None, typer.Argument(help="stages; all without it")]
 
 
@@ -72,6 +73,13 @@ def chosen(settings: list[str] | None) -> list[str]:
     return settings or [os.environ.get("SET", "")]
 
 
+def wish(
+    dataset: str | None, stages: list[str] | None, settings: list[str] | None, recipes: list[str] | None, force: bool = False
+) -> verbs.Wish:
+    """What is asked for, by the options, else by the environment."""
+    return verbs.Wish(named(dataset), stages or None, chosen(settings), forced(force), recipes or [name for name in [os.environ.get("RECIPE")] if name])
+
+
 def forced(force: bool) -> bool:
     """Whether to run again what is current: --force or FORCE=1.  InputError where FORCE is neither 0, 1 nor empty."""
     word = os.environ.get("FORCE", "")
@@ -86,33 +94,35 @@ def forced(force: bool) -> bool:
 @app.command("all")
 def all_(dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
     """Run the whole pipeline, as far as anything must run."""
-    raise typer.Exit(verbs.make(project(), named(dataset), None, chosen(settings), forced(force)))
+    raise typer.Exit(verbs.make(project(), wish(dataset, None, settings, None, force)))
 
 
 @app.command()
-def stage(name: str, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
-    """Run one stage and what it needs (`python -m factorlib solve`)."""
+def stage(name: str, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
+    """Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes that one's pictures alone."""
     known = project()
     verbs.check_stage(known, name, [command.name or command.callback.__name__ for command in app.registered_commands])
-    raise typer.Exit(verbs.make(known, named(dataset), [name], chosen(settings), forced(force)))
+    raise typer.Exit(verbs.make(known, wish(dataset, [name], settings, recipe, force)))
 
 
 @app.command()
-def plan(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
+def plan(
+    stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None
+) -> None:
     """What would run."""
-    raise typer.Exit(verbs.show_plan(project(), named(dataset), stages or None, chosen(settings), forced(force)))
+    raise typer.Exit(verbs.show_plan(project(), wish(dataset, stages, settings, recipe, force)))
 
 
 @app.command()
-def why(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
+def why(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
     """Every reason why it would run."""
-    raise typer.Exit(verbs.show_why(project(), named(dataset), stages or None, chosen(settings), forced(force)))
+    raise typer.Exit(verbs.show_why(project(), wish(dataset, stages, settings, recipe, force)))
 
 
 @app.command()
-def status(stages: Stages = None, dataset: Dataset = None, settings: Settings = None) -> None:
+def status(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, recipe: Recipes = None) -> None:
     """How far each stage is, and what the current results warned of."""
-    raise typer.Exit(verbs.show_status(project(), named(dataset), stages or None, chosen(settings)))
+    raise typer.Exit(verbs.show_status(project(), wish(dataset, stages, settings, recipe)))
 
 
 @app.command()

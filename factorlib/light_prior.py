@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.images.photo import read_photo
+from factorlib.images.light_map import read_light_map
 from factorlib.jsonfile import json_text, write_json
 from factorlib.light.prior import LightPrior, Source
 from factorlib.light.prior_fit import cell_means, fitted, leave_one_out, log_cells, rounded
@@ -26,7 +26,6 @@ from factorlib.reading import read_bytes
 
 CELLS = 400  # of equal area, some 10° apart
 SUFFIXES = (".hdr", ".exr")
-Map = Float[np.ndarray, "h w 3"]
 
 
 def maps_in(folders: Sequence[Path]) -> list[Path]:
@@ -44,22 +43,10 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
     return found
 
 
-def read_map(path: Path) -> Map:
-    """Linear radiance of a lat-long map; InputError for a file that is none, is black, or holds what is no number."""
-    photo = read_photo(path, "linear")
-    if photo.width != 2 * photo.height:
-        raise InputError(f"{photo.width} × {photo.height} pixels is no lat-long map", file=path, cure="its width must be twice its height")
-    if not photo.finite.all():
-        raise InputError(f"{(~photo.finite).sum()} pixels are no numbers", file=path, cure="mend or remove this map")
-    if not (photo.radiance > 0).any():
-        raise InputError("the map is black", file=path, cure="mend or remove this map")
-    return photo.radiance.astype(float)
-
-
 def means_of(path: Path, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """`cell_means` of a map in a file; InputError where it is too coarse."""
     try:
-        return cell_means(read_map(path), cells)
+        return cell_means(read_light_map(path), cells)
     except InputError:
         raise
     except ValueError as error:

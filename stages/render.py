@@ -16,14 +16,12 @@ from factorlib.dataset.schema import LightSlice
 from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
-from factorlib.light.lobes import Lobes
 from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.ball import ball, ball_normals, observed_cells
+from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised
-from factorlib.results.exposures import read_exposures
-from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Gauge, Model, Reflectance, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
@@ -54,7 +52,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     exported = read_materials(file)
     materials = in_order(exported, names, file)
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
-    reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light_of_photo(inputs), params.tail)
+    light = light_of(inputs["export"], name, msgspec.convert(inputs.facts["dataset.light"], LightSlice))
+    reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light, params.tail)
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     total = 10 + len(names)
 
@@ -86,17 +85,6 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     seen = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
     sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None
     return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
-
-
-def light_of_photo(inputs: Inputs) -> Lobes:
-    """The photo's light in its own camera frame, exposure included."""
-    slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
-    lobes = read_lobes(inputs["export"] / "lobes.parquet")[slice_.illumination]
-    if len(lobes) == 0:
-        log.warning("%s: nothing is known of its light: its pictures are black", inputs.photo)
-    if slice_.world_from_camera is not None:
-        lobes = lobes.turned(np.array(slice_.world_from_camera).T)
-    return lobes.scaled(np.array(read_exposures(inputs["export"] / "exposures.json").get(inputs.photo, 1.0)))
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False) -> None:

@@ -20,11 +20,11 @@ from benchmarks.solve.clock import Clock
 from benchmarks.solve.scores import material_scores, picture_scores
 from benchmarks.solve.sets import DISTANCE, SIZE, SphereSet, camera, sphere
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.generate.mitsuba_variant import mitsuba
-from factorlib.generate.tracing import rgb, rigid, sensor
 from factorlib.geometry.camera import Camera
 from factorlib.model.bounds import ROUGHNESS
 from factorlib.model.materials import Materials
+from factorlib.tracing.scene import rgb, rigid, sensor
+from factorlib.tracing.variant import mitsuba
 
 RATES = (0.003, 0.01, 0.03)
 ROWS, SPP, SCORE_SPP, FLAT, SMALL = 16, 16, 256, 60, 64

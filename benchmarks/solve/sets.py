@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.generate import lights
-from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rigid, traced
 from factorlib.geometry.camera import Camera
+from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, traced
 from factorlib.urm.observations import Observations
 
 SIZE, DISTANCE, GRAZING = 256, 6.0, 0.15

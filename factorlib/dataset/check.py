@@ -21,6 +21,7 @@ from factorlib.dataset.schema import (
     SOURCES,
     CameraSource,
     DatasetFile,
+    Ground,
     MeshEntry,
     ObjectEntry,
     PhotoEntry,
@@ -141,6 +142,15 @@ def _check_part(key: str, part: str, mesh: MeshEntry, refuse: Refusal) -> None:
         refuse(key, f"{file.name} has no part {part!r}", f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
 
 
+def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
+    if not any(ground.normal):
+        refuse(f"{key}.normal", "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
+    if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
+        refuse(f"{key}.normal", "it points away from the camera, or the camera lies in the plane", "turn its sign: it points toward the objects")
+    for value in ground.diffuse or ():
+        check_share(f"{key}.diffuse", value, refuse)
+
+
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
     _check_name(f"{key}.name", photo.name, refuse)
     if photo.name in RESERVED_PHOTOS:
@@ -152,6 +162,8 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
         _check_name(f"{key}.illumination", photo.illumination, refuse)
     if photo.world_from_camera is not None:
         check_rotation(f"{key}.world_from_camera", photo.world_from_camera, refuse)
+    if photo.ground is not None:
+        _check_ground(f"{key}.ground", photo.ground, refuse)
     if photo.camera is not None and photo.camera.focal_px is not None:
         check_focal(f"{key}.camera.focal_px", photo.camera.focal_px, refuse)
     if photo.camera is not None and photo.camera.principal_point is not None:

@@ -70,6 +70,17 @@ class ObjectEntry(_Format):
     keypoints: list[Keypoint] = []
 
 
+class Ground(_Format):
+    """The plane that a photo's objects stand on, in its camera frame and the poses' units; the normal points toward them.
+
+    diffuse: its Lambertian reflectance (linear Rec. 709), where it is known
+    """
+
+    point: Vec3
+    normal: Vec3
+    diffuse: Vec3 | None = None
+
+
 class PhotoEntry(_Format):
     """One photo.  `illumination` defaults to the photo's name; `world_from_camera` fixes its light to the world."""
 
@@ -81,6 +92,7 @@ class PhotoEntry(_Format):
     world_from_camera: Mat3 | None = None
     camera: Camera | None = None
     objects: list[ObjectEntry] = []
+    ground: Ground | None = None
 
 
 class Similarity(_Format):
@@ -210,6 +222,12 @@ class LightSlice(msgspec.Struct, frozen=True):
 
     illumination: str
     world_from_camera: Mat3 | None
+
+
+class GroundSlice(msgspec.Struct, frozen=True):
+    """The ground of a photo, where dataset.yaml gives it."""
+
+    ground: Ground | None
 
 
 class SetSlice(msgspec.Struct, frozen=True):

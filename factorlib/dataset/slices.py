@@ -31,7 +31,7 @@ class Slice(msgspec.Struct, frozen=True):
 def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
     """The slice `name` of one photo, or of the set.
 
-    photo, objects, light are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
+    photo, objects, light, ground are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
     materials, set, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
     """
     if name in _OF_SET:
@@ -75,6 +75,10 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
 
 def _light(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.LightSlice, list[str]]:
     return schema.LightSlice(photo.illumination or photo.name, photo.world_from_camera), []
+
+
+def _ground(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.GroundSlice, list[str]]:
+    return schema.GroundSlice(photo.ground), []
 
 
 def _materials(dataset: Dataset) -> tuple[list[str], list[str]]:
@@ -126,6 +130,6 @@ def _fields(value: Any, name: str) -> dict[str, Any]:
     return {key: leaf for inner, item in items for key, leaf in _fields(item, inner).items()}
 
 
-_OF_PHOTO: dict[str, Callable] = {"photo": _photo, "objects": _objects, "light": _light}
+_OF_PHOTO: dict[str, Callable] = {"photo": _photo, "objects": _objects, "light": _light, "ground": _ground}
 _OF_SET: dict[str, Callable] = {"materials": _materials, "set": _set, "truth": _truth}
 SLICES = (*_OF_PHOTO, *_OF_SET)

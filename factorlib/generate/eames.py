@@ -22,11 +22,11 @@ from factorlib.generate.chair import Part, chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, SceneDict
 from factorlib.generate.shapes import smooth
 from factorlib.generate.synthetic import drawn_materials
-from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
+from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]

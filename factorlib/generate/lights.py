@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.generate.mitsuba_variant import mitsuba
-from factorlib.generate.tracing import envmap, light_seen, rgb, transform
 from factorlib.images.photo import read_photo
+from factorlib.tracing.scene import envmap, light_seen, rgb, transform
+from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin over the ground
 # sunsky's zenith is its +z; its sun_direction is the world's

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import FRONT, alpha_of_roughness
-from factorlib.generate.mitsuba_variant import mitsuba
-from factorlib.generate.tracing import SAMPLER, rgb, rigid, transform
+from factorlib.tracing.scene import SAMPLER, rgb, rigid, transform
+from factorlib.tracing.variant import mitsuba
 
 MAP_ROWS, MAP_COLUMNS = 2048, 8
 SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material

@@ -19,11 +19,11 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.lights import SceneDict
 from factorlib.generate.shapes import SHAPES
-from factorlib.generate.tracing import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
+from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0

@@ -61,7 +61,7 @@ class Bars(Display):
             return
         total, left = self.totals.get(stage, 1), self.left.get(stage, 1)
         done = total - left + sum(share for step, share in self._running.items() if step.stage == stage)
-        words = "; ".join(f"{step.photo or ''} {self._words.get(step, '')}".strip() for step in self._running if step.stage == stage)
+        words = "; ".join(f"{step.of or ''} {self._words.get(step, '')}".strip() for step in self._running if step.stage == stage)
         self.bars.update(self._rows[stage], completed=done, total=total, count=f"{total - left}/{total}", words=words[:80])
         if left == 0:
             self.bars.stop_task(self._rows[stage])

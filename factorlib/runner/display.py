@@ -46,7 +46,7 @@ class Display:
         if step.stage not in self._begun:
             self._begun.add(step.stage)
             left = self.left.get(step.stage, 1)
-            self.say(f"{step.stage:<10} " + ("…" if step.photo is None else f"{left} photo{'s' * (left > 1)} …"))
+            self.say(f"{step.stage:<10} " + ("…" if step.of is None else f"{left} {'photo' if step.photo else 'recipe'}{'s' * (left > 1)} …"))
 
     def waits(self, step: Step) -> None:
         """A step waits for another run to make its result; printed once."""
@@ -66,7 +66,7 @@ class Display:
             if now - spoke >= BEAT:
                 self._spoke[step] = now
                 self.say(
-                    f"{step.stage:<10} {step.photo or '':<16} {now - self._started[step]:6.0f} s  {self._words.get(step, '')}".rstrip()
+                    f"{step.stage:<10} {step.of or '':<16} {now - self._started[step]:6.0f} s  {self._words.get(step, '')}".rstrip()
                 )
 
     def warn(self, step: Step, text: str) -> None:
@@ -79,7 +79,7 @@ class Display:
         """A step is done, after `seconds`."""
         self.count_off(step)
         self._spoke.pop(step, None)
-        self.say(f"{step.stage:<10} {step.photo or '':<16} {seconds:6.1f} s")
+        self.say(f"{step.stage:<10} {step.of or '':<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
         """A step ended with an error; `traceback` names the file with details of a defect of the program."""

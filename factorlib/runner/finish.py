@@ -15,8 +15,9 @@ def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
     planned = survey.planned(frozenset()) if more is None else []
     pipeline, spec = survey.spec.pipeline, survey.spec
     there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
+    over_recipes = tuple(f"{name}/" for name, stage in pipeline.stages.items() if stage.over == "recipe")  # kept: others were asked for before
     before = survey.home.last_keys()
-    keys = {step: key for step, key in before.items() if step in there} | (more or {})
+    keys = {step: key for step, key in before.items() if step in there or step.startswith(over_recipes)} | (more or {})
     keys |= {str(p.step): p.key for p in planned if p.status == "current"}
     if keys != before:
         claim(survey.project, survey.home, survey.data.folder)
@@ -27,8 +28,11 @@ def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
 
 
 def show(survey: Survey, planned: list[Planned]) -> None:
-    """Point the links at the current results; of a stage over photos, at one folder with all of them."""
-    for stage in dict.fromkeys(p.step.stage for p in planned):
+    """Point the links at the current results; of a stage over photos, at one folder with all of them; one for each recipe."""
+    for p in planned:
+        if p.step.recipe and p.status == "current":
+            point(survey.home.pictures(p.step.stage) / p.step.recipe, survey.store.tree(p.output))
+    for stage in dict.fromkeys(p.step.stage for p in planned if not p.step.recipe):
         current = {p.step.photo: p.output for p in planned if p.step.stage == stage and p.status == "current"}
         if current:
             point(survey.home.folder / stage, folder_of(survey, stage, current))

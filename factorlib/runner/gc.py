@@ -80,14 +80,16 @@ def forget_all(project: Project) -> Gone:
 
 def _forget(project: Project, home: Home) -> Gone:
     """Only what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
-    ours = [path for path in home.folder.iterdir() if _is_link_to_result(path)]
+    folders = [folder for folder in home.folder.iterdir() if folder.is_dir() and not folder.is_symlink() and folder != home.errors]
+    pictures = [path for folder in folders for path in folder.iterdir() if _is_link_to_result(path)]  # of recipes
+    ours = [path for path in home.folder.iterdir() if _is_link_to_result(path)] + pictures
     ours += [path for path in (home.keys_file, home.log) if path.is_symlink() or path.is_file()]
     ours += sorted(home.folder.glob(".current.*"))
     if not home.errors.is_symlink():
         ours += sorted(home.errors.glob("*.txt"))
     for path in (*ours, home.mark):
         path.unlink()
-    for folder in (home.errors, home.folder):
+    for folder in (*dict.fromkeys(path.parent for path in pictures), home.errors, home.folder):
         with contextlib.suppress(OSError):  # not there, a link, or with something in it
             folder.rmdir()
     left = sorted(home.folder.iterdir()) if home.folder.is_dir() else []
@@ -95,7 +97,7 @@ def _forget(project: Project, home: Home) -> Gone:
 
 
 def _is_link_to_result(path: Path) -> bool:
-    return path.is_symlink() and os.readlink(path).startswith("../store/")
+    return path.is_symlink() and os.readlink(path).startswith(("../store/", "../../store/"))
 
 
 def _size(path: Path) -> int:

@@ -4,6 +4,7 @@
     current.json  which key each step has
     log.jsonl     what all runs did
     errors/       where a step failed by a defect, its traceback
+    recipes/      links to the current pictures of each recipe
     dataset.txt   whose results these are: only a folder with this mark is a home that the runner made
 """
 
@@ -44,6 +45,10 @@ class Home(msgspec.Struct, frozen=True):
     def errors(self) -> Path:
         """Folder of the errors of steps that failed, a text file each."""
         return self.folder / "errors"
+
+    def pictures(self, stage: str) -> Path:
+        """Folder of the links to the current results of a stage over recipes, one for each recipe."""
+        return self.folder / stage
 
     @property
     def mark(self) -> Path:

@@ -35,7 +35,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One stage.
 
     inputs:  names of stages, or `dataset.<slice>`
-    over:    `photo` for a step per photo; otherwise one step for the whole set
+    over:    `photo` for a step per photo, `recipe` for one per recipe that is asked for; otherwise one step for the whole set
     gather:  in a stage over photos, the file that every `<photo>.json` is gathered into
     makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
     threads: threads of its libraries' numerics, part of what is computed (a sum depends on them), never the machine's
@@ -48,7 +48,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     inputs: list[str] = []
-    over: Literal["photo"] | None = None
+    over: Literal["photo", "recipe"] | None = None
     gather: str | None = None
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
@@ -132,7 +132,7 @@ def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tupl
     for param in stage.given:
         if param in stage.inputs:
             raise InputError(f"{param!r} is a stage already", file=path, key=f"stages.{name}.given", cure="call the parameter something else")
-    if stage.gather and not stage.over:
+    if stage.gather and stage.over != "photo":
         raise InputError("only what is made per photo can be gathered", file=path, key=f"stages.{name}.gather", cure="add over: photo")
 
 

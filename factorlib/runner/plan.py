@@ -23,33 +23,43 @@ Status = Literal["current", "to run", "maybe"]
 
 
 class Step(msgspec.Struct, frozen=True, order=True):
-    """One piece of work: a stage, of one photo or of the whole set."""
+    """One piece of work: a stage, of one photo, of one recipe, or of the whole set."""
 
     stage: str
     photo: str | None = None
+    recipe: str | None = None
+
+    @property
+    def of(self) -> str | None:
+        """The name of its photo or recipe."""
+        return self.photo or self.recipe
 
     def __str__(self) -> str:
-        return f"{self.stage}/{self.photo}" if self.photo else self.stage
+        return f"{self.stage}/{self.of}" if self.of else self.stage
 
 
 class Spec(msgspec.Struct, frozen=True):
-    """The stages that are wanted, over which photos, and the steps that are to run whatever the store holds."""
+    """The stages that are wanted, over which photos and recipes, and the steps that are to run whatever the store holds."""
 
     pipeline: Pipeline
     photos: list[str]
     targets: list[str] | None = None
     forced: frozenset[Step] = frozenset()
+    recipes: list[str] = []
 
     def steps(self) -> list[Step]:
         """All steps of the wanted stages and of what they need, upstream first."""
         return [step for name in self.pipeline.needed(self.targets) for step in self.steps_of(name)]
 
     def steps_of(self, stage: str) -> list[Step]:
-        """The steps of one stage: one per photo, or one for the whole set."""
-        return [Step(stage, photo) for photo in self.photos] if self.pipeline.stages[stage].over else [Step(stage)]
+        """The steps of one stage: one per photo or recipe, or one for the whole set."""
+        over = self.pipeline.stages[stage].over
+        if over == "recipe":
+            return [Step(stage, recipe=recipe) for recipe in self.recipes]
+        return [Step(stage, photo) for photo in self.photos] if over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:
-        """The steps whose results a step is handed: of its own photo, or of all for a step over the whole set."""
+        """The steps whose results a step is handed: of its own photo, or of all for a step over the whole set or of a recipe."""
         upstream = self.pipeline.stages[step.stage].upstream
         if step.photo is None:
             return [found for name in upstream for found in self.steps_of(name)]
@@ -138,6 +148,8 @@ def key_of(record: Record) -> str:
 _KIND = {
     "source": "source of {}",
     "param": "parameter {}",
+    "recipe": "recipe: {}",
+    "recipe file": "file {} of the recipe",
     "default": "default of parameter {}",
     "facts": "dataset.yaml: {}",
     "file": "file {}",
@@ -158,7 +170,7 @@ def difference(before: Record, after: Record) -> list[str]:
 
 
 _ABSENT = object()
-_HASHED = ("source", "file", "given", "input", "data")
+_HASHED = ("source", "file", "recipe file", "given", "input", "data")
 _LONGEST = 80  # characters of a value that are shown
 _NAMED = 4  # names that came or went
 
@@ -200,4 +212,4 @@ def names(steps: Iterable[Step]) -> str:
     counts: dict[str, list[Step]] = {}
     for step in steps:
         counts.setdefault(step.stage, []).append(step)
-    return ", ".join(str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} photos)" for stage, found in counts.items())
+    return ", ".join(str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} {'recipes' if found[0].recipe else 'photos'})" for stage, found in counts.items())

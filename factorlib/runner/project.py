@@ -34,9 +34,22 @@ def nothing_to_look_at(slice_: str, photo: str | None, params: dict[str, Any], s
     return []
 
 
+class Recipe(msgspec.Struct, frozen=True):
+    """What a recipe says.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
+
+    facts: dict[str, Any]
+    files: dict[str, Path]
+
+
+def no_recipes(path: Path) -> Recipe:
+    """Stands in where a data set knows no recipes."""
+    raise InputError("this data set knows no recipes", file=path)
+
+
 class Data(msgspec.Struct, frozen=True):
     """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
 
+    recipe: reads a recipe for this data set; InputError where it asks for what is not there
     faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes it
             and the file in which these stand
     """
@@ -45,6 +58,7 @@ class Data(msgspec.Struct, frozen=True):
     photos: list[str]
     slice: Callable[[str, str | None], Slice]
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = nothing_to_look_at
+    recipe: Callable[[Path], Recipe] = no_recipes
 
 
 class Provider(msgspec.Struct, frozen=True):
@@ -64,7 +78,15 @@ def photo_sets() -> Provider:
         dataset = read_dataset(path)
         take_sigterm_back()
         photos = [photo.name for photo in dataset.spec.photos]
-        return Data(dataset.folder, photos, lambda name, photo: dataset_slice(dataset, name, photo), _looking_at(dataset))
+
+        def recipe(file: Path) -> Recipe:
+            """Read when one is asked for."""
+            from factorlib.recipe.read import files_of, read_recipe
+
+            found = read_recipe(file, dataset)
+            return Recipe(msgspec.to_builtins(found), files_of(found, file))
+
+        return Data(dataset.folder, photos, lambda name, photo: dataset_slice(dataset, name, photo), _looking_at(dataset), recipe)
 
     return Provider(SLICES, read)
 

@@ -185,13 +185,15 @@ class Run:
         files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}
         given = {param: given_folder(stage, param) for param in stage.folders}
         read = {f"given:{param}/{file}": folder / file for param, folder in given.items() for file in stage.given[param]}
+        recipe = self.survey.recipes[step.recipe] if step.recipe else None
+        read |= {f"recipe file:{name}": path for name, path in recipe.files.items()} if recipe else {}
         return Task(
             code=self._code(step.stage),
             photo=step.photo,
             makes=stage.makes,
             gather=stage.gather,
             folders={name: self._folder(step, name) for name in stage.upstream} | given,
-            facts={DATASET + name: slice_.facts for name, slice_ in slices.items()},
+            facts={DATASET + name: slice_.facts for name, slice_ in slices.items()} | ({"recipe": recipe.facts} if recipe else {}),
             files=files | read,
             hashes={file: planned.record[f"file:{file}"] for file in files} | {file: planned.record[file] for file in read},
             log=self._log_above(step, self.folder / f"{label(step)}.log.jsonl") if stage.logs else None,
@@ -289,7 +291,7 @@ class Run:
             write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
-        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.photo, "text": outcome.error}, sort_keys=True) + "\n")
+        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.of, "text": outcome.error}, sort_keys=True) + "\n")
 
     def _log(self, lines: str) -> None:
         self.survey.home.folder.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,8 @@ from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import Data, Project
+from factorlib.runner.project import Data, Project, Recipe
+from factorlib.runner.recipes import asked_for
 from factorlib.runner.store import Outputs, Store
 
 log = logging.getLogger("factorlib.runner")
@@ -29,6 +30,7 @@ class Survey:
     """All that is known before anything runs; `planned` is what every verb shows.
 
     records:  each step's record but for the results it is handed
+    recipes:  those that are asked for, by name
     previous: the record each step had when it last was current for this dataset
     """
 
@@ -40,6 +42,7 @@ class Survey:
     records: dict[Step, Record]
     outputs: Outputs
     previous: dict[str, Record]
+    recipes: dict[str, Recipe]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
@@ -47,8 +50,13 @@ class Survey:
         return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
 
 
-def survey(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False) -> Survey:
-    """Read everything a plan needs; every InputError there is about pipeline, settings or dataset comes from here."""
+def survey(
+    project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False, recipes: list[str] | None = None
+) -> Survey:
+    """Read everything a plan needs; every InputError there is about pipeline, settings, dataset or recipes comes from here.
+
+    recipes: paths or names of those that are asked for; without any, stages over recipes have no steps
+    """
     pipeline = check_values(with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings), project.pipeline_file)
     for name in targets or []:
         if name not in pipeline.stages:
@@ -56,17 +64,18 @@ def survey(project: Project, dataset: str, targets: list[str] | None, settings: 
     folder = project.dataset_folder(dataset)
     data = project.provider.read(folder)
     home, store = home_of(project, data.folder), Store(project.build / "store")
-    spec = Spec(pipeline, data.photos, targets)
+    asked = asked_for(project, data, recipes or [])
+    spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
     if force:
         forced = pipeline.stages if targets is None else targets
         spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
     hashes, packages = FileHashes(store.cache / "files.json"), Packages(store.cache / "packages.json")
-    records = _records(project, spec, data, hashes, packages)
+    records = _records(project, spec, data, hashes, packages, asked)
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
         packages.save()
     outputs, entries = Outputs(store), {step: store.entry(key) for step, key in _last_keys(home).items()}
-    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e})
+    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked)
 
 
 def _last_keys(home: Home) -> dict[str, str]:
@@ -77,7 +86,9 @@ def _last_keys(home: Home) -> dict[str, str]:
         return {}
 
 
-def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages) -> dict[Step, Record]:
+def _records(
+    project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages, recipes: dict[str, Recipe]
+) -> dict[Step, Record]:
     sources = Sources(project.source_roots, hashes)
     _check_params(project, spec.pipeline, sources)
     records = {}
@@ -87,7 +98,15 @@ def _records(project: Project, spec: Spec, data: Data, hashes: FileHashes, packa
         of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
             records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
+            if step.recipe is not None:
+                records[step] |= {"recipe": step.recipe} | _recipe(recipes[step.recipe], hashes)
     return records
+
+
+def _recipe(recipe: Recipe, hashes: FileHashes) -> Record:
+    """What a recipe says, and the files it names, by content."""
+    files = {f"recipe file:{name}": _content(path, hashes) for name, path in recipe.files.items()}
+    return {f"recipe:{field}": value for field, value in recipe.facts.items()} | files
 
 
 def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> None:
@@ -144,6 +163,10 @@ def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> R
         for file in slice_.files:
             record[f"file:{file}"] = _hash(data.folder, file, hashes)
     return record
+
+
+def _content(path: Path, hashes: FileHashes) -> str:
+    return _hash(path.parent, path.name, hashes)
 
 
 def _hash(folder: Path, file: str, hashes: FileHashes) -> str:

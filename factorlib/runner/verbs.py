@@ -7,6 +7,8 @@ import os
 import sys
 import time
 
+import msgspec
+
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.checks import faults, new_faults
@@ -17,21 +19,53 @@ from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
 from factorlib.runner.project import Project
+from factorlib.runner.recipes import ALL
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 
+RENDER = "render"  # the stage whose pictures a recipe replaces
 
-def make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+
+class Wish(msgspec.Struct, frozen=True):
+    """What the command line asks for.
+
+    targets:  stages; None for all but those that run only when asked for
+    settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
+    recipes:  paths, names or `all`: stages over recipes make their pictures
+    """
+
+    dataset: str
+    targets: list[str] | None = None
+    settings: list[str] = []
+    force: bool = False
+    recipes: list[str] = []
+
+
+def make(project: Project, wish: Wish) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
     with heed_stops():
-        return _make(project, dataset, targets, settings, force)
+        return _make(project, wish)
 
 
-def _make(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+def surveyed(project: Project, wish: Wish) -> Survey:
+    """The survey of what is wanted.  Recipes add the stages over them; with the target `render` they are all that is wanted."""
+    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
+    over_recipes = [name for name, stage in stages.items() if stage.over == "recipe"]
+    targets, recipes = wish.targets, wish.recipes
+    if recipes:
+        usual = [name for name, stage in stages.items() if not stage.optional] if targets is None else targets
+        targets = over_recipes if targets == [RENDER] else [*usual, *over_recipes]
+    elif any(name in over_recipes for name in targets or []):
+        recipes = [ALL]
+    return survey(project, wish.dataset, targets, wish.settings, wish.force, recipes)
+
+
+def _make(project: Project, wish: Wish) -> int:
     started = time.perf_counter()
-    seen = survey(project, dataset, targets, settings, force)
+    seen = surveyed(project, wish)
+    targets = seen.spec.targets
     planned = seen.planned()
     if all(p.status == "current" for p in planned):
         remember(seen)
@@ -79,28 +113,28 @@ def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
 def _name_results(seen: Survey, targets: list[str] | None) -> None:
     if targets is not None:
         for name in targets:
-            print(f"  {name}: {seen.project.shown(seen.home.folder / name)}")
+            print(f"  {name}: {seen.project.shown(seen.home.folder / name)}{'/' + next(iter(seen.recipes)) if len(seen.recipes) == 1 else ''}")
         return
     for label, path in results(seen):
         shown = seen.project.shown(path)
         print(f"  {label}: {shown}" + ("/*.exr" if path.is_dir() else ""))
 
 
-def show_plan(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+def show_plan(project: Project, wish: Wish) -> int:
     """Print what would run."""
-    print("\n".join(words.plan_lines(survey(project, dataset, targets, settings, force).planned())))
+    print("\n".join(words.plan_lines(surveyed(project, wish).planned())))
     return 0
 
 
-def show_why(project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool) -> int:
+def show_why(project: Project, wish: Wish) -> int:
     """Print why each step would run."""
-    print("\n".join(words.why_lines(survey(project, dataset, targets, settings, force).planned())))
+    print("\n".join(words.why_lines(surveyed(project, wish).planned())))
     return 0
 
 
-def show_status(project: Project, dataset: str, targets: list[str] | None, settings: list[str]) -> int:
+def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = survey(project, dataset, targets, settings)
+    seen = surveyed(project, wish)
     print("\n".join(words.status_lines(seen.planned(), lambda p: is_running(seen, p), lambda p: warnings_of(seen, p))))
     return 0
 

@@ -61,7 +61,7 @@ def _users(homes: list[Home]) -> dict[str, list[str]]:
 
 
 def _name(key: str, entry: Entry, users: Mapping[str, list[str]]) -> list[str]:
-    photo = entry.record.get("photo")
+    photo = entry.record.get("photo") or entry.record.get("recipe")
     return users.get(key) or [f"{entry.record.get('stage')}{f'/{photo}' if photo else ''} (of an earlier run)"]
 
 

@@ -20,7 +20,7 @@ def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = []
     for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(f"{group[0].step.stage:<10} {group[0].status:<7} {_photos(group):<24} {_short(group[0].reasons)}".rstrip())
+        lines.append(f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip())
     current = sum(p.status == "current" for p in planned)
     return lines + [f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"]
 
@@ -29,7 +29,7 @@ def why_lines(planned: list[Planned]) -> list[str]:
     """Every reason of every step that is not current."""
     lines = []
     for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(f"{group[0].step.stage} {_photos(group)}".rstrip() + f": {group[0].status}")
+        lines.append(f"{group[0].step.stage} {_items(group)}".rstrip() + f": {group[0].status}")
         lines += [f"    {reason}" for reason in group[0].reasons]
     return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
 
@@ -63,7 +63,7 @@ def graph_lines(pipeline: Pipeline) -> list[str]:
         stage = pipeline.stages[name]
         taken = ", ".join(stage.inputs) or "(parameters only)"
         asked = "   (only when asked for)" if stage.optional else ""
-        lines.append(f"{name:<10} {'per photo' if stage.over else 'whole set':<10} <- {taken}{asked}")
+        lines.append(f"{name:<10} {f'per {stage.over}' if stage.over else 'whole set':<10} <- {taken}{asked}")
     return lines
 
 
@@ -78,7 +78,7 @@ def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
 
 
 def mermaid_lines(pipeline: Pipeline) -> list[str]:
-    """The graph of stages in Mermaid's language; stages over photos have double frames."""
+    """The graph of stages in Mermaid's language; stages over photos or recipes have double frames."""
     edges = [f"  {above} --> {name}" for name in pipeline.order() for above in pipeline.stages[name].upstream]
     nodes = [f"  {name}[[{name}]]" if pipeline.stages[name].over else f"  {name}[{name}]" for name in pipeline.order()]
     return ["graph TD", *nodes, *edges]
@@ -106,9 +106,9 @@ def _of_any_photo(reason: str, step: Step) -> str:
     return reason.replace(f" photos.{step.photo}.", " photos.*.", 1) if reason.startswith("dataset.yaml:") else reason
 
 
-def _photos(group: list[Planned]) -> str:
-    names = [p.step.photo for p in group if p.step.photo]
-    return ", ".join(names) if len(names) <= 3 else f"{len(names)} photos"
+def _items(group: list[Planned]) -> str:
+    names = [p.step.of for p in group if p.step.of]
+    return ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if group[0].step.recipe else 'photos'}"
 
 
 def _short(reasons: list[str]) -> str:

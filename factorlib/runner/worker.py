@@ -231,6 +231,7 @@ def _check_made(task: Task) -> None:
 def _write_log(task: Task, events: Events, cost: dict) -> None:
     """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
     where = {"stage": task.code.stage, "photo": task.photo, "key": task.key}
+    where |= {"recipe": task.record["recipe"]} if "recipe" in task.record else {}
     lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [{"event": "done", **where, **cost}]
     path = Store(task.store).log(task.key)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -87,6 +87,7 @@ def make(folder: Path) -> Inputs:
     facts = {
         "dataset.materials": NAMES,
         "dataset.light": {p: _light_facts(p) for p in MESHES},
+        "dataset.ground": {p: {"ground": None} for p in MESHES},
         "dataset.objects": {
             p: {"camera": {}, "objects": [{"name": "chair", "mesh": m}], "meshes": {m: meshes[m]}} for p, m in MESHES.items()
         },

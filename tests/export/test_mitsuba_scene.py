@@ -2,24 +2,27 @@
 
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import LightSlice
 from factorlib.export.environment import mitsuba_map, node_directions, sharpened
 from factorlib.export.mitsuba import Environment, Shape, View, write_scene
-from factorlib.generate.mitsuba_variant import mitsuba
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
+from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
-from stages import export, render
+from factorlib.tracing.variant import mitsuba
+from stages import export
 from tests.export import made_export
 
 SPP = 1024
@@ -60,7 +63,7 @@ def exported(tmp_path_factory):
 def test_scene_equals_resynthesis(exported, photo):
     inputs, out = exported
     geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))
-    light = render.light_of_photo(made_export.of_photo(inputs, out, photo))
+    light = light_of(out, photo, msgspec.convert(inputs.facts["dataset.light"][photo], LightSlice))
     table = read_materials(out / "materials.json").materials
     pixels = whole_pixels(geometry["label"])
     reflector = Reflector(Reference(tolerance=1e-3), light)

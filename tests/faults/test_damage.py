@@ -29,7 +29,7 @@ def project(made_once, tmp_path):
 
 def make(project, **options):
     settings = {"targets": None, "settings": [], "force": False} | options
-    return verbs.make(project, "set", settings["targets"], settings["settings"], settings["force"])
+    return verbs.make(project, verbs.Wish("set", **settings))
 
 
 def shown(project) -> dict[str, bytes]:
@@ -159,7 +159,7 @@ def test_force_replaces_a_damaged_result_even_under_the_same_size_and_time(proje
 def test_a_tree_that_two_keys_share_is_made_once(project, capsys):
     shutil.copytree(project.root / "data" / "set", project.root / "data" / "again")
     write(project.root / "data" / "again" / "b.txt", "beta")  # another photo, the same words in capitals
-    assert verbs.make(project, "again", None, [], False) == 0
+    assert verbs.make(project, verbs.Wish("again")) == 0
     path = tree_of(project, "upper", "b.txt")
     keys = [e for e in entries(project) if e["record"]["stage"] == "upper" and e["record"]["photo"] == "b"]
     assert len(keys) == 2 and len({e["output"] for e in keys}) == 1

@@ -22,7 +22,7 @@ STRANGE = "raise RuntimeError('a library: I/O error: No space left on device (os
 
 def make(project, **options):
     settings = {"targets": None, "settings": [], "force": False} | options
-    return verbs.make(project, "set", settings["targets"], settings["settings"], settings["force"])
+    return verbs.make(project, verbs.Wish("set", **settings))
 
 
 class Disk:

@@ -16,7 +16,7 @@ from tests.runner.toy import make_project, reasons, state, write
 
 def make(project, **options):
     settings = {"targets": None, "settings": [], "force": False} | options
-    return verbs.make(project, "set", settings["targets"], settings["settings"], settings["force"])
+    return verbs.make(project, verbs.Wish("set", **settings))
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def test_a_parameter_names_its_default_and_its_value(project):
 
 def test_a_default_that_changes_is_named(tmp_path):
     project = toy.make_project(tmp_path)
-    assert verbs.make(project, "set", ["table"], [], False) == 0
+    assert verbs.make(project, verbs.Wish("set", ["table"])) == 0
     write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
     assert reasons(project, "table") == ["default of parameter scale: 2 -> 3", "source of stages.table: changed"]
 

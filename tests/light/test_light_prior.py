@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from factorlib import light_prior
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
+from factorlib.images.light_map import read_light_map
 from factorlib.light.prior import read_light_prior
 
 COUNT = 25
@@ -79,10 +80,10 @@ def test_maps_that_tell_nothing_are_named(folder, spoil, said):
 def test_files_that_are_no_map_are_named(folder):
     (folder / "b.exr").write_bytes(b"no picture")
     with pytest.raises(InputError, match="b.exr"):
-        light_prior.read_map(folder / "b.exr")
+        read_light_map(folder / "b.exr")
     write_rgb_exr(folder / "b.exr", np.ones((8, 8, 3)))
     with pytest.raises(InputError, match="no lat-long"):
-        light_prior.read_map(folder / "b.exr")
+        read_light_map(folder / "b.exr")
     write_rgb_exr(folder / "b.exr", np.ones((4, 8, 3)))
     with pytest.raises(InputError, match="too few"):
         light_prior.prior_of([folder / "b.exr"], COUNT)

@@ -20,7 +20,7 @@ from tests.runner.toy import files_of, make_project, reasons, state, write
 
 
 def make(project, dataset="set", settings=(), targets=None, force=False):
-    return verbs.make(project, dataset, targets, list(settings), force)
+    return verbs.make(project, verbs.Wish(dataset, targets, list(settings), force))
 
 
 def ran(project, dataset="set"):
@@ -176,7 +176,7 @@ def test_warnings_are_said_once_and_kept(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "odd")
     assert make(project) == 0
     assert capsys.readouterr().err.count("a is odd") == 1
-    assert verbs.show_status(project, "set", None, []) == 0
+    assert verbs.show_status(project, verbs.Wish("set")) == 0
     assert "a is odd" in capsys.readouterr().out
 
 
@@ -324,7 +324,7 @@ def test_a_run_that_is_interrupted_stops_its_workers(project):
 def test_status_shows_what_runs(project, capsys):
     process = background(project, "upper.sleep=30")
     wait_until(lambda: sleepers(project))
-    verbs.show_status(project, "set", None, ["upper.sleep=30"])
+    verbs.show_status(project, verbs.Wish("set", settings=["upper.sleep=30"]))
     process.kill()
     process.communicate()
     assert "2 running" in capsys.readouterr().out
@@ -332,9 +332,9 @@ def test_status_shows_what_runs(project, capsys):
 
 def test_plan_why_and_graph_show_the_same_plan(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "Alphabet")
-    verbs.show_plan(project, "set", None, [], False)
+    verbs.show_plan(project, verbs.Wish("set"))
     assert "upper      to run  a                        file a.txt: changed" in capsys.readouterr().out
-    verbs.show_why(project, "set", None, [], False)
+    verbs.show_why(project, verbs.Wish("set"))
     assert "upper a: to run\n    file a.txt: changed" in capsys.readouterr().out
     verbs.show_graph(project, False)
     assert "total      whole set  <- count, table" in capsys.readouterr().out

@@ -141,4 +141,4 @@ def copy(project: Project, target: Path) -> Project:
 
 
 if __name__ == "__main__":
-    sys.exit(verbs.make(toy(Path(sys.argv[1])), sys.argv[2], None, sys.argv[3:], False))
+    sys.exit(verbs.make(toy(Path(sys.argv[1])), verbs.Wish(sys.argv[2], settings=sys.argv[3:])))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.generate import tracing
 from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
+from factorlib.tracing import scene as tracing
 
 pytest.importorskip("mitsuba")
 GREEN = tracing.Material((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)

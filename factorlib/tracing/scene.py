@@ -19,13 +19,16 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
-from factorlib.generate.mitsuba_variant import mitsuba
+from factorlib.export.environment import mitsuba_map
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
+from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
+from factorlib.tracing.variant import mitsuba
 
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
+LOBE_ROWS = 256  # of the map that lobes are drawn on
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
@@ -42,15 +45,21 @@ class Material(msgspec.Struct, frozen=True):
 def bsdf(material: Material) -> dict[str, Any]:
     """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
     diffuse, specular = np.array(material.diffuse), np.array(material.specular)
+    if not diffuse.any() and not specular.any():
+        return {"type": "diffuse", "reflectance": rgb(0.0)}
     share = specular.max() / (diffuse.max() + specular.max())
+    if share == 1:
+        return _conductor(specular, material.roughness)
     lambertian = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
     if share == 0:
         return lambertian
-    glossy = {
-        "type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": material.roughness**2,
-        "specular_reflectance": rgb(specular / share),
+    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": _conductor(specular / share, material.roughness)}
+
+
+def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
+    return {
+        "type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2, "specular_reflectance": rgb(reflectance),
     }  # fmt: skip
-    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": glossy}
 
 
 def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:
@@ -70,23 +79,40 @@ def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Flo
     return matrix
 
 
-def shape(mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4)) -> Any:
+def lobes_envmap(lobes: Lobes, height: int = LOBE_ROWS) -> dict[str, Any]:
+    """An emitter of lobes given in OpenCV's camera axes, in the world that is the y-up turn of these."""
+    return {"type": "envmap", "bitmap": mitsuba().Bitmap(mitsuba_map(lobes, height, 2 * height).astype(np.float32))}
+
+
+def shape(
+    mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4), emitter: dict[str, Any] | None = None
+) -> Any:
     """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
         write_ply(path, mesh)
-        return mitsuba().load_dict({"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material})
+        entry = {"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material}
+        return mitsuba().load_dict(entry | ({"emitter": emitter} if emitter else {}))
 
 
-def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice = slice(None)) -> dict[str, Any]:
-    """The pinhole camera, of whose image some columns are taken; its principal point must be the image's centre."""
+def sensor(
+    camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice = slice(None), near: float = 1e-3, alpha: bool = False
+) -> dict[str, Any]:
+    """The pinhole camera, of whose image some columns are taken.
+
+    near: distance from which on things are seen, to 10⁷ times that;  alpha: with a fourth channel, the share of a pixel that is covered
+    """
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
+    (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
+    offset = {"principal_point_offset_x": (w / 2 - cx) / w, "principal_point_offset_y": (h / 2 - cy) / h}  # as its pictures, not its x axis
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal))),
-        "near_clip": 1e-3,
+        "near_clip": near,
+        "far_clip": 1e7 * near,
+        **{name: value for name, value in offset.items() if value},
         "to_world": transform(world_from_camera @ MITSUBA_FROM_CAMERA),
         "sampler": {"type": SAMPLER},
         "film": {
@@ -94,7 +120,7 @@ def sensor(camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns:
             "width": camera.width,
             "height": camera.height,
             "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
+            "pixel_format": "rgba" if alpha else "rgb",
             **crop,
         },
     }
@@ -107,16 +133,19 @@ def traced(
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
-def rendered(entries: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int) -> Float[np.ndarray, "h w 3"]:
+def rendered(
+    entries: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int, hide_emitters: bool = False
+) -> Float[np.ndarray, "h w c"]:
     """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
+
+    hide_emitters: the light itself is not seen (where the sensor has alpha, it is 0 there)
 
     spp: samples a pixel, at least.  Many samples are taken in passes of stratified ones, so that no pass needs much memory.
     """
     mi = mitsuba()
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
     loaded = {name: mi.load_dict(entry, parallel=False) if isinstance(entry, dict) else entry for name, entry in entries.items()}
-    integrator = {"type": "path", "max_depth": max_depth}
-
+    integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
     images = [mi.render(scene, seed=passes * seed + k, spp=-(-spp // passes)) for k in range(passes)]

@@ -26,7 +26,7 @@ scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth
 import numpy as np
 assert np.array(mi.render(scene, spp=1)).sum() > 0
 """
-log = logging.getLogger("factorlib.generate")
+log = logging.getLogger("factorlib.tracing")
 
 
 @cache

@@ -1,0 +1,1 @@
+"""Recipes: which pictures to make of a result, as YAML files."""

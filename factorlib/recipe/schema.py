@@ -1,0 +1,164 @@
+"""What a recipe may say: one struct for each kind of picture, its fields those of the YAML file.
+
+    kind: relight
+    photos: [kitchen]
+    lights: [hall, my_studio.exr]
+
+Photos, objects, materials and lights go by their names in dataset.yaml; files are relative to the recipe.
+Angles are in degrees, sizes in pixels, colours linear Rec. 709.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+Vec2 = tuple[float, float]
+Colour = tuple[Annotated[float, msgspec.Meta(ge=0, le=1)], Annotated[float, msgspec.Meta(ge=0, le=1)], Annotated[float, msgspec.Meta(ge=0, le=1)]]
+Samples = Annotated[int, msgspec.Meta(ge=1, le=65536)]
+Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
+Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
+Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Backdrop = Literal["none", "light"]
+
+
+class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
+    """What every kind has."""
+
+    photos: list[str] = []
+    """Photos whose camera, objects and light are used; all of them where none is named."""
+    samples: Samples = 128
+    """Samples per pixel of the path tracer: noise falls as their square root."""
+
+
+class Sized(Recipe, frozen=True, kw_only=True):
+    """Of kinds whose pictures need not be the photo's size."""
+
+    width: Pixels | None = None
+    """Width of the pictures; without it that of the photo as the pipeline works on it."""
+
+
+class Resynthesis(Recipe, frozen=True, kw_only=True, tag="resynthesis"):
+    """The photo with its objects replaced by path-traced ones."""
+
+
+class View(Sized, frozen=True, kw_only=True, tag="view"):
+    """The objects from another side: the camera is moved about their middle; the light stays."""
+
+    azimuth: Degrees = 30.0
+    """Angle about the upright axis, to the right as the photo's camera sees it."""
+    elevation: Annotated[float, msgspec.Meta(ge=-89, le=89)] = 0.0
+    """Angle upward, added to the photo's own."""
+    zoom: Positive = 1.0
+    """Factor on the size in the picture."""
+    background: Backdrop = "none"
+    """What is seen beside the objects: nothing (transparent), or the light."""
+
+
+class Turntable(Sized, frozen=True, kw_only=True, tag="turntable"):
+    """An animation once around the objects; the light stays."""
+
+    frames: Frames = 24
+    """Pictures of the whole turn."""
+    seconds: Positive = 4.0
+    """Of the whole turn."""
+    background: Backdrop = "none"
+    """What is seen beside the objects: nothing (transparent), or the light."""
+
+
+class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
+    """An animation in which the light turns once about the upright axis, so that highlights move."""
+
+    frames: Frames = 24
+    """Pictures of the whole turn."""
+    seconds: Positive = 4.0
+    """Of the whole turn."""
+
+
+class Relight(Sized, frozen=True, kw_only=True, tag="relight"):
+    """The photo's objects in other lights."""
+
+    lights: list[str] = []
+    """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); all other photos where none is named."""
+    rotate: Degrees = 0.0
+    """Turn of those lights about the upright axis."""
+    background: Backdrop = "none"
+    """What is seen beside the objects: nothing (transparent), or the light."""
+
+
+class Transfer(Recipe, frozen=True, kw_only=True, tag="transfer"):
+    """The photo with other materials on its objects."""
+
+    materials: dict[str, str]
+    """Material of the data set -> the one that takes its place: another of the data set, or one of `table`."""
+    table: str | None = None
+    """File of materials of one's own, in the format of materials.json."""
+
+
+class Ground(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the ground answers light; where it lies is the photo's, or found from what stands on it."""
+
+    specular: Colour = (0.0, 0.0, 0.0)
+    """k_s of a ground that reflects, such as a polished floor."""
+    roughness: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.3
+    """Of that reflection."""
+
+
+class Insert(Recipe, frozen=True, kw_only=True, tag="insert"):
+    """A further object in the photo, standing beside one that is there, with its shadow."""
+
+    mesh: str = "ball"
+    """`ball`, a mesh of the data set, or a mesh file."""
+    material: str | None = None
+    """Material of the data set or of `table`; without it the mesh's own, and for a file or ball the data set's first."""
+    table: str | None = None
+    """File of materials of one's own, in the format of materials.json."""
+    beside: str | None = None
+    """Object on whose ground it stands; without it the photo's first."""
+    at: Vec2 | None = None
+    """Pixel of the photo where it touches the ground; without it beside the object, where there is more room."""
+    size: Positive = 0.5
+    """Its height, in heights of that object."""
+    turn: Degrees = 0.0
+    """Turn about the upright axis."""
+    up: Literal["x", "y", "z"] = "y"
+    """The axis of a mesh file that points upward."""
+    ground: Ground = Ground()
+    """How the ground answers light, beyond its colour, which the photo shows."""
+
+
+class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
+    """Balls of every material in every light, in one picture: rows are materials, columns lights, those that no photo shows included."""
+
+    materials: list[str] = []
+    """Materials of the data set; all where none is named."""
+    lights: list[str] = []
+    """Photos whose light is used, or files; all photos where none is named."""
+    size: Pixels = 128
+    """Of a ball's picture."""
+
+
+AnyRecipe = Resynthesis | View | Turntable | MovingLight | Relight | Transfer | Insert | Grid
+KINDS = {kind.__struct_config__.tag: kind for kind in (Resynthesis, View, Turntable, MovingLight, Relight, Transfer, Insert, Grid)}
+LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
+
+
+def recipe_of(facts: dict) -> AnyRecipe:
+    """A recipe from its JSON-able facts, as a stage is handed them."""
+    return msgspec.convert(facts, KINDS[facts["kind"]])
+
+
+def is_light_file(name: str) -> bool:
+    """Whether a light is a file, not a photo's.
+
+    >>> is_light_file("studio.hdr"), is_light_file("kitchen")
+    (True, False)
+    """
+    return name.lower().endswith(LIGHT_FILES)
+
+
+def is_mesh_file(name: str) -> bool:
+    """Whether a mesh is a file, not one of the data set or the ball: it has a suffix."""
+    return "." in name

@@ -1,0 +1,55 @@
+"""The plane that a photo's objects stand on: given with the photo, or that on which an object would rest.
+
+A rigid object comes to rest on a facet of its convex hull (Goldberg et al., "Part pose statistics", 1999; `trimesh` computes how
+likely each is from a random drop).  Of the facets that look down in the photo, the likeliest is taken: people photograph things upright.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from factorlib.errors import InputError
+from factorlib.render.photo_scene import Placed
+
+MOST_TILT_DEG = 50.0  # of the upright axis against the camera's: photos look down on things, and are held askew
+
+
+class Plane(msgspec.Struct, frozen=True):
+    """In the world: unit normal, toward the objects, and a point."""
+
+    normal: Float[np.ndarray, "3"]
+    point: Float[np.ndarray, "3"]
+
+    def onto(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The points of the plane nearest to `points`."""
+        return points - ((points - self.point) @ self.normal)[:, None] * self.normal
+
+    def hit(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Where rays from the origin meet the plane; NaN where they do not."""
+        down = rays @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (self.point @ self.normal) / down
+        return np.where((distance > 0) & (down < 0), distance, np.nan)[:, None] * rays
+
+
+def resting_plane(placed: Placed) -> Plane:
+    """The plane that an object rests on; InputError where it could rest on none that looks upright in the photo."""
+    vertices = placed.vertices
+    hull = trimesh.convex.convex_hull(vertices - vertices.mean(axis=0))
+    poses, chances = trimesh.poses.compute_stable_poses(hull, n_samples=1)
+    normals = poses[:, 2, :3]  # z of the resting pose, in the world
+    upright = normals[:, 1] > np.cos(np.radians(MOST_TILT_DEG))
+    if not upright.any():
+        found = f"the object '{placed.name}' rests on no side that looks down in the photo"
+        raise InputError(found, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
+    normal = normals[np.argmax(np.where(upright, chances, -1))]
+    lowest = vertices[np.argmin(vertices @ normal)]
+    return Plane(normal / np.linalg.norm(normal), lowest)
+
+
+def height_over(plane: Plane, placed: Placed) -> float:
+    """How far an object reaches up from the plane."""
+    return float(((placed.vertices - plane.point) @ plane.normal).max())

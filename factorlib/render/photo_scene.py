@@ -1,0 +1,153 @@
+"""A photo's objects, camera and light as a scene that is path-traced: as it was, from another side, or in other light.
+
+World    the y-up turn of the photo's camera: x right, y up, z toward the viewer, camera at the origin.
+Light    infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
+Upright  the ground's normal where it is known, else the camera's own y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.geometry.camera import Camera, rotation_of_vector
+from factorlib.light.latlong import turned_map
+from factorlib.light.lobes import Lobes
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import submesh
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, envmap, lobes_envmap, rendered, rigid, sensor, shape
+
+ALL_BOUNCES, DIRECT = -1, 2
+NEAR = 1e-3  # of the objects' distance
+MAP_ROWS = 1024  # of the lattice that Mitsuba is handed of a map
+
+Light = Lobes | Float[np.ndarray, "h w 3"]
+
+
+class Placed(msgspec.Struct, frozen=True):
+    """A mesh and where it stands.  materials: by label, from 1;  world_from_object: a similarity"""
+
+    name: str
+    mesh: Mesh
+    materials: tuple[str, ...]
+    world_from_object: Float[np.ndarray, "4 4"]
+
+    @property
+    def vertices(self) -> Float[np.ndarray, "v 3"]:
+        """In the world."""
+        return self.mesh.vertices @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
+
+
+class PhotoScene(msgspec.Struct, frozen=True):
+    """max_depth: ALL_BOUNCES or DIRECT, as the light was solved for"""
+
+    camera: Camera
+    objects: tuple[Placed, ...]
+    light: Light
+    materials: Mapping[str, Reflectance]
+    max_depth: int = ALL_BOUNCES
+
+    @property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Of the box about all objects."""
+        points = np.concatenate([each.vertices for each in self.objects])
+        return (points.min(axis=0) + points.max(axis=0)) / 2
+
+    @property
+    def near(self) -> float:
+        """From which distance on things are seen."""
+        return NEAR * float(np.linalg.norm(self.middle))
+
+
+def world_from_camera_frame(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """world_from_object of cam_from_object."""
+    turn = np.eye(4)
+    turn[:3, :3] = YUP_FROM_CAMERA
+    return turn @ matrix
+
+
+def light_entry(light: Light) -> dict[str, Any]:
+    """The light as Mitsuba's `envmap`."""
+    return lobes_envmap(light) if isinstance(light, Lobes) else envmap(light, finer=max(1, MAP_ROWS // len(light)))
+
+
+def shapes(objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()) -> dict[str, Any]:
+    """A shape for each material of each object; objects named in `black` reflect nothing."""
+    found = {}
+    for each in objects:
+        for label in each.mesh.labels:
+            name = each.materials[label - 1]
+            surface = bsdf(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0) if each.name in black else materials[name])
+            surface = {"type": "twosided", "bsdf": surface} if each.mesh.open else surface
+            found[f"{each.name}_{label}"] = shape(submesh(each.mesh, label), surface, each.world_from_object)
+    return found
+
+
+def traced_photo(
+    scene: PhotoScene,
+    samples: int,
+    seed: int = 0,
+    world_from_camera: Float[np.ndarray, "4 4"] | None = None,
+    with_light: bool = False,
+) -> Float[np.ndarray, "h w 4"]:
+    """Linear radiance, coverage multiplied in, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
+
+    world_from_camera: of OpenCV's camera axes; without it the photo's own
+    """
+    own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
+    entries = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
+    view = sensor(scene.camera, own, near=scene.near, alpha=True)
+    picture = rendered(entries, view, samples, seed, scene.max_depth, hide_emitters=not with_light)
+    if with_light:
+        picture[..., 3] = 1
+    return picture
+
+
+def lit_ball(light: Light, material: Reflectance, size: int, samples: int) -> Float[np.ndarray, "h w 4"]:
+    """A ball of a material that fills the picture, seen from the front in a light: radiance and coverage."""
+    distance = 20.0
+    focal = size / 2 * np.sqrt(distance**2 - 1)
+    camera = Camera(size, size, focal, (size / 2, size / 2))
+    sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
+    view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
+    return rendered({"light": light_entry(light), "ball": sphere}, view, samples, 0, DIRECT, hide_emitters=True)
+
+
+def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
+    """The scene as a camera of another number of pixels sees it."""
+    if width is None:
+        return scene
+    factor = width / scene.camera.width
+    centre = (scene.camera.centre[0] * factor, scene.camera.centre[1] * factor)
+    camera = Camera(width, max(1, round(scene.camera.height * factor)), scene.camera.focal * factor, centre)
+    return msgspec.structs.replace(scene, camera=camera)
+
+
+def orbit(
+    scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0, up: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "4 4"]:
+    """world_from_camera of the photo's camera moved about the objects' middle.
+
+    azimuth_deg: to the right;  elevation_deg: upward;  zoom: of the size in the picture, by distance;  up: (0, 1, 0) if not given
+    """
+    up = np.array([0.0, 1.0, 0.0]) if up is None else up
+    middle = scene.middle
+    right = np.cross(up, -middle)
+    right /= np.linalg.norm(right)
+    turn = rotation_of_vector(np.radians(azimuth_deg) * up) @ rotation_of_vector(-np.radians(elevation_deg) * right)
+    return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
+
+
+def turned_light(light: Light, angle_deg: float, up: Float[np.ndarray, "3"] | None = None) -> Light:
+    """The light turned about the upright axis of the world."""
+    up = np.array([0.0, 1.0, 0.0]) if up is None else up
+    turn = rotation_of_vector(np.radians(angle_deg) * up)
+    if isinstance(light, Lobes):
+        return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
+    return turned_map(light, turn, finer=2)

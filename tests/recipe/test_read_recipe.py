@@ -1,0 +1,75 @@
+"""Recipes: what is written is read, what is not there is named, and every recipe that comes with the project is good."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from factorlib.dataset.read import read_dataset
+from factorlib.errors import InputError
+from factorlib.recipe.read import files_of, read_recipe
+from factorlib.recipe.schema import KINDS, Insert, recipe_of
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.runner.project import LIBRARY
+
+EAMES = LIBRARY / "data" / "eames"
+RECIPES = sorted((LIBRARY / "recipes").rglob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return read_dataset(EAMES)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "one.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+def test_recipes_that_come_with_the_project_are_good_and_survive_the_way_to_a_stage(path, dataset):
+    recipe = read_recipe(path, dataset)
+    assert recipe_of(msgspec.to_builtins(recipe)) == recipe
+
+
+def test_every_kind_has_a_recipe_that_comes_with_the_project(dataset):
+    assert {type(read_recipe(path, dataset)) for path in RECIPES} == set(KINDS.values())
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("kind: relight\nphotos: [kitchn]", ["photos", "no photo 'kitchn'", "did you mean 'kitchen'"]),
+        ("kind: relight\nlights: [hal]", ["lights", "did you mean 'hall'"]),
+        ("kind: relight\nlights: [studio.hdr]", ["there is no file 'studio.hdr'", "relative to the recipe"]),
+        ("kind: relightt", ["there is no kind 'relightt'", "did you mean 'relight'"]),
+        ("samples: 3", ["does not say what kind", "turntable"]),
+        ("[1, 2]", ["does not say what kind"]),
+        ("kind: [insert]", ["there is no kind"]),
+        ("kind: insert\nsiz: 3", ["one.yaml:2: siz", "did you mean 'size'"]),
+        ("kind: insert\nmesh: char", ["there is no mesh 'char'", "did you mean 'chair'"]),
+        ("kind: insert\nmesh: x.obj", ["there is no file 'x.obj'"]),
+        ("kind: insert\nmaterial: redd", ["did you mean 'red'"]),
+        ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object in photo 'kitchen' called 'red_chair'", "yellow_chair"]),
+        ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
+        ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
+        ("kind: transfer\nmaterials: {yellow: gold}", ["there is no material 'gold'"]),
+        ("kind: transfer", ["materials"]),
+        ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
+    ],
+)
+def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
+    with pytest.raises(InputError) as error:
+        read_recipe(written(tmp_path, text), dataset)
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tmp_path):
+    (tmp_path / "bunny.obj").write_text("")
+    one = solved(Reflectance((0.1,) * 3, (0.5,) * 3, 0.2), StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0))
+    write_materials(tmp_path / "own.json", MaterialTable({"gold": one}))
+    path = written(tmp_path, "kind: insert\nmesh: bunny.obj\nmaterial: gold\ntable: own.json")
+    recipe = read_recipe(path, dataset)
+    assert isinstance(recipe, Insert) and recipe.material == "gold"
+    assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}

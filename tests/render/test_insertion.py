@@ -1,0 +1,99 @@
+"""Insertion against a scene that has the object in truth."""
+
+import numpy as np
+import pytest
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.geometry.camera import Camera
+from factorlib.light.lobes import Lobes
+from factorlib.render.ground import Plane
+from factorlib.render.insertion import Spot, ball, inserted, stood
+from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
+
+CAMERA = Camera(64, 48, 70.0, (32.0, 20.0))
+MATERIALS = {"red": Reflectance((0.6, 0.2, 0.1), (0.08,) * 3, 0.3), "grey": Reflectance((0.5,) * 3, (0.0,) * 3, 1.0)}
+GROUND = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6]))
+SPOT = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
+STRIPES = (0.2, 0.5)
+
+
+def light() -> Lobes:
+    axis = np.array([[0.2, -0.95, 0.1], [0.75, -0.6, 0.2]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]]))
+
+
+def there() -> Placed:
+    matrix = np.eye(4)
+    matrix[:3, 3] = (0.9, 0, -6.5)
+    return Placed("there", ball(), ("grey",), matrix)
+
+
+def true_photo(objects, samples=1024):
+    """Striped ground, which the insertion knows nothing of, beyond the disc too."""
+    entries = {"light": light_entry(light()), **shapes(objects, MATERIALS)}
+    for k in range(-8, 8):
+        frame = np.eye(4)
+        frame[:3, :3] = np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1)
+        frame[:3, 3] = (k + 0.5, -1.0, -6)
+        grey = STRIPES[k % 2]
+        entries[f"stripe{k + 8}"] = {"type": "rectangle", "to_world": transform(frame), "bsdf": bsdf(Reflectance((grey,) * 3, (0.0,) * 3, 1.0))}
+    return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
+
+
+def new(material="red") -> Placed:
+    return stood("new", ball(), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
+
+
+@pytest.fixture(scope="module")
+def made():
+    scene = PhotoScene(CAMERA, (there(),), light(), MATERIALS)
+    photo = true_photo([there()])
+    covered = np.zeros(photo.shape[:2], bool)
+    return scene, photo, covered, inserted(scene, new(), SPOT, photo, covered, 512)
+
+
+def blocks(picture):
+    return picture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
+
+
+def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
+    """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
+    _, photo, _, found = made
+    truth = true_photo([there(), new()])
+    error, change = np.abs(blocks(found.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
+    assert error.mean() < 0.08 * change.mean()
+    assert np.sqrt((error**2).mean()) < 0.1 * np.sqrt((change**2).mean())
+
+
+def test_what_no_path_joins_to_the_object_stays_as_it_was(made):
+    _, photo, _, found = made
+    sky = photo[0]
+    assert np.array_equal(found.composite[0], sky) and (found.shadow[0] == 1).all()
+
+
+def test_the_ground_looks_as_in_the_photo(made):
+    """The stripes' reflectances are .2 and .5."""
+    assert 0.2 < found_ground(made) < 0.5
+
+
+def found_ground(made):
+    return made[3].ground.mean()
+
+
+def test_twice_the_light_is_twice_the_picture(made):
+    scene, photo, covered, found = made
+    brighter = PhotoScene(CAMERA, scene.objects, scene.light.scaled(2.0), MATERIALS)
+    again = inserted(brighter, new(), SPOT, 2 * photo, covered, 512)
+    assert np.allclose(again.composite, 2 * found.composite, rtol=1e-4, atol=1e-6)
+
+
+def test_a_polished_ground_shows_the_object_and_only_there(made):
+    scene, photo, covered, found = made
+    gloss = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
+    polished = inserted(scene, new(), SPOT, photo, covered, 256, gloss=gloss)
+    difference = np.abs(polished.composite - inserted(scene, new(), SPOT, photo, covered, 256).composite).max(axis=-1)
+    rows, columns = np.nonzero(found.coverage > 0)
+    below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
+    assert below.max() > 0.05 and difference[0].max() == 0

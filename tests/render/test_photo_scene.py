@@ -1,0 +1,125 @@
+"""Path-traced photos: other views and lights obey the laws of geometry, and a plane is where things stand."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, rotation_of_vector
+from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.lobes import Lobes
+from factorlib.meshes.mesh import Mesh
+from factorlib.render.ground import Plane, resting_plane
+from factorlib.render.insertion import ball, spot_at, spot_beside, stood
+from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.results.materials import Reflectance
+
+CAMERA = Camera(48, 40, 60.0, (26.0, 18.0))
+MATERIALS = {"red": Reflectance((0.6, 0.2, 0.1), (0.1, 0.1, 0.1), 0.4), "grey": Reflectance((0.4,) * 3, (0.0,) * 3, 1.0)}
+
+
+def lobes() -> Lobes:
+    axis = np.array([[0.3, -0.9, -0.2], [-0.7, -0.2, -0.6]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([2.0, 20.0]), np.array([[0.5, 0.6, 0.9], [4.0, 3.0, 2.0]]))
+
+
+def placed(name, mesh, where, material="red", rotation=np.eye(3)) -> Placed:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, where
+    return Placed(name, mesh, (material,), matrix)
+
+
+def box(width: float, height: float, depth: float) -> Mesh:
+    import trimesh
+
+    solid = trimesh.creation.box((width, height, depth))
+    faces = np.arange(36, dtype=np.int32).reshape(12, 3)
+    return Mesh(solid.triangles.reshape(-1, 3), faces, np.repeat(solid.face_normals, 3, axis=0), np.ones(12, np.int16))
+
+
+@pytest.fixture
+def scene():
+    objects = (placed("left", box(1, 1.4, 0.6), (-0.6, 0, -6)), placed("right", ball(), (1.2, -0.2, -7)))
+    return PhotoScene(CAMERA, objects, lobes(), MATERIALS)
+
+
+def differ(a, b):
+    """Of the mean, over 8 × 8 pixels: noise averages out."""
+    means = [x[:40, :48].reshape(5, 8, 6, 8, -1).mean(axis=(1, 3)) for x in (a, b)]
+    return np.abs(means[0] - means[1]).max() / means[0].max()
+
+
+def test_no_turn_is_the_photo_itself(scene):
+    assert np.allclose(orbit(scene, 0), orbit(scene, 360), atol=1e-9)
+    assert np.array_equal(traced_photo(scene, 4), traced_photo(scene, 4, world_from_camera=orbit(scene, 0)))
+
+
+def test_the_camera_goes_right_and_up_and_keeps_its_distance(scene):
+    moved = orbit(scene, 30, 20)[:3, 3]
+    assert moved[0] > 0 and moved[1] > 0
+    assert np.linalg.norm(moved - scene.middle) == pytest.approx(np.linalg.norm(scene.middle))
+    assert np.linalg.norm(orbit(scene, 0, zoom=2)[:3, 3] - scene.middle) == pytest.approx(np.linalg.norm(scene.middle) / 2)
+
+
+def test_turning_camera_objects_and_light_together_changes_nothing(scene):
+    """About the upright axis through the camera."""
+    turn = rotation_of_vector(np.radians(50) * np.array([0, 1.0, 0]))
+    whole = np.eye(4)
+    whole[:3, :3] = turn
+    objects = tuple(msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects)
+    other = msgspec.structs.replace(scene, objects=objects, light=turned_light(scene.light, 50))
+    assert differ(traced_photo(scene, 256), traced_photo(other, 256, world_from_camera=whole @ orbit(scene, 0))) < 0.02
+
+
+@pytest.mark.parametrize("angle", [0, 70])
+def test_lobes_and_their_map_are_the_same_light(scene, angle):
+    """Also turned: the map's axes are the world's, the lobes' the camera's."""
+    as_map = msgspec.structs.replace(scene, light=turned_light(lat_long_of_lobes(scene.light, 64, 128), angle))
+    as_lobes = msgspec.structs.replace(scene, light=turned_light(scene.light, angle))
+    assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
+
+
+def test_a_larger_picture_shows_the_same(scene):
+    large = traced_photo(resized(scene, 96), 64)
+    assert differ(traced_photo(scene, 256), large.reshape(40, 2, 48, 2, 4).mean(axis=(1, 3))) < 0.03
+
+
+def test_a_ball_fills_its_picture():
+    picture = lit_ball(lobes(), MATERIALS["grey"], 32, 16)
+    inside = picture[..., 3] > 0.99
+    assert inside.mean() == pytest.approx(np.pi / 4, abs=0.06)
+    assert inside[16, 1] and inside[1, 16] and not inside[0, 0]
+
+
+def test_a_box_stands_on_its_largest_side_that_looks_down():
+    tilted = rotation_of_vector(np.radians(25) * np.array([1.0, 0, 0]))
+    plane = resting_plane(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
+    assert np.allclose(plane.normal, tilted @ [0, 1, 0], atol=1e-6)
+    assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
+
+
+def test_an_object_that_stands_on_no_side_is_refused():
+    askew = rotation_of_vector(np.radians(54.7) * np.array([1.0, 0, -1.0]) / 2**0.5)  # a cube on its corner
+    with pytest.raises(InputError, match="rests on no side"):
+        resting_plane(placed("cube", box(1, 1, 1), (0, 0, -5), rotation=askew))
+
+
+def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(scene):
+    left = scene.objects[0]
+    plane = resting_plane(left)
+    spot = spot_beside(scene, plane, left, 0.5, 1.0)
+    new = stood("new", box(0.2, 0.3, 3.0), ("red",), np.array([0, 0, 1.0]), 40, spot)
+    along = (new.vertices - plane.point) @ plane.normal
+    assert along.min() == pytest.approx(0, abs=1e-9) and along.max() == pytest.approx(0.7)
+    foot = plane.onto(((new.vertices.min(axis=0) + new.vertices.max(axis=0)) / 2)[None])[0]
+    assert np.allclose(foot, spot.point, atol=1e-9)
+    assert spot.point[0] < left.vertices[:, 0].min()  # on the left, for the ball stands on the right
+
+
+def test_a_pixel_names_the_spot_that_it_shows(scene):
+    plane = Plane(np.array([0, 1.0, 0]), np.array([0, -0.7, -6]))
+    spot = spot_at(scene, plane, scene.objects[0], (30.5, 33.0), 0.5)
+    ray = CAMERA.rays_through(np.array([[30.5, 33.0]]))[0] * [1, -1, -1]
+    assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
+    with pytest.raises(InputError, match="above the horizon"):
+        spot_at(scene, plane, scene.objects[0], (30.5, 3.0), 0.5)

@@ -1,0 +1,127 @@
+"""A stage over recipes: a step for each that is asked for, its pictures under the recipe's name, and nothing else rerun for it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from factorlib.errors import InputError
+from factorlib.runner import verbs
+from factorlib.runner.gc import collect
+from factorlib.runner.home import made_homes
+from factorlib.runner.project import Project, Provider, Recipe
+from factorlib.runner.recipes import asked_for
+from factorlib.runner.survey import survey
+from tests.runner import toy
+from tests.runner.toy import write
+
+SHOUT = """
+import msgspec
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    mark: str = "!"
+def main(params, inputs, out, progress):
+    recipe = inputs.facts["recipe"]
+    more = inputs.file("recipe file:" + recipe["file"]).read_text() if recipe.get("file") else ""
+    photos = sorted(path.stem for path in inputs["upper"].glob("*.txt"))
+    (out / "said.txt").write_text(recipe["word"] + params.mark + more + "".join(photos))
+"""
+OVER_RECIPES = '  shout: {inputs: [upper], over: recipe, optional: true, makes: ["said.txt"]}\n'
+
+
+def reading(path: Path) -> Recipe:
+    said = json.loads(path.read_text())
+    return Recipe(said, {said["file"]: path.parent / said["file"]} if said.get("file") else {})
+
+
+@pytest.fixture
+def project(tmp_path):
+    made = toy.make_project(tmp_path / "root")
+    write(made.root / "stages" / "shout.py", SHOUT)
+    write(made.pipeline_file, toy.PIPELINE + OVER_RECIPES)
+    write(made.root / "recipes" / "hello.yaml", '{"word": "hello"}')
+    write(made.root / "recipes" / "set" / "bye.yaml", '{"word": "bye", "file": "more.txt"}')
+    write(made.root / "recipes" / "set" / "more.txt", "…")
+    write(made.root / "recipes" / "other" / "not.yaml", '{"word": "not for this set"}')
+
+    def read(folder):
+        data = toy.read(folder)
+        return type(data)(data.folder, data.photos, data.slice, recipe=reading)
+
+    return Project(made.root, Provider(("photo",), read))
+
+
+def said(project, recipe):
+    return (project.build / "set" / "shout" / recipe / "said.txt").read_text()
+
+
+def to_run(project, *recipes, targets=("shout",)):
+    seen = survey(project, "set", list(targets), [], recipes=list(recipes))
+    return [str(p.step) for p in seen.planned() if p.status != "current"]
+
+
+def make(project, *recipes, targets=("render",), **more):
+    return verbs.make(project, verbs.Wish("set", list(targets), recipes=list(recipes), **more))
+
+
+def test_every_recipe_is_a_step_with_a_folder_of_its_own(project):
+    assert make(project, "all") == 0
+    assert said(project, "hello") == "hello!ab" and said(project, "bye") == "bye!…ab"
+    assert not (project.build / "set" / "total").exists()  # what no recipe takes did not run
+
+
+def test_a_stage_over_recipes_makes_all_of_them_where_none_is_named(project):
+    assert make(project, targets=["shout"]) == 0
+    assert said(project, "hello") and said(project, "bye")
+
+
+def test_what_was_asked_for_before_stays(project):
+    assert make(project, "hello") == 0 and make(project, "bye") == 0
+    assert said(project, "hello") and said(project, "bye")
+    assert to_run(project, "all") == []
+    assert verbs.make(project, verbs.Wish("set")) == 0  # without recipes
+    collect(project)
+    assert said(project, "hello") and to_run(project, "all") == []
+
+
+def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
+    assert make(project, "all") == 0
+    write(project.root / "recipes" / "hello.yaml", '{ "word":   "hello" }')
+    assert to_run(project, "all") == []
+    write(project.root / "recipes" / "hello.yaml", '{"word": "hi"}')
+    assert to_run(project, "all") == ["shout/hello"]
+    write(project.root / "recipes" / "set" / "more.txt", "and more")
+    assert to_run(project, "all") == ["shout/hello", "shout/bye"]
+    seen = survey(project, "set", ["shout"], [], recipes=["all"])
+    assert [p.reasons for p in seen.planned()[-2:]] == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
+
+
+def test_a_path_is_a_recipe_as_well(project, monkeypatch):
+    write(project.root / "mine" / "own.yaml", '{"word": "own"}')
+    monkeypatch.chdir(project.root)
+    assert make(project, "mine/own.yaml") == 0 and said(project, "own") == "own!ab"
+
+
+@pytest.mark.parametrize("word, wrong", [("helo", "did you mean 'hello'"), ("recipes/helo.yaml", "did you mean 'hello'"), ("not", "known are")])
+def test_a_recipe_that_is_not_there_names_those_that_are(project, word, wrong):
+    data = project.provider.read(project.root / "data" / "set")
+    with pytest.raises(InputError) as error:
+        asked_for(project, data, [word])
+    assert wrong in str(error.value)
+
+
+def test_two_recipes_of_one_name_are_refused(project):
+    write(project.root / "mine" / "hello.yaml", '{"word": "own"}')
+    data = project.provider.read(project.root / "data" / "set")
+    with pytest.raises(InputError, match="two recipes are called 'hello'"):
+        asked_for(project, data, ["hello", str(project.root / "mine" / "hello.yaml")])
+
+
+def test_clean_forgets_the_pictures_too(project):
+    assert make(project, "all") == 0
+    verbs.clean(project, "set")
+    assert made_homes(project) == [] and not (project.build / "set").exists()
+
+
+def test_plan_and_why_name_recipes(project, capsys):
+    verbs.show_plan(project, verbs.Wish("set", ["render"], recipes=["all"]))
+    assert "hello, bye" in capsys.readouterr().out
