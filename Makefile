@@ -46,6 +46,7 @@ help:
 	@echo 'make <stage> DATASET=…               one stage and what it needs: $(STAGES)'
 	@echo '     SET="solve.lobes=64 …"          with other parameters      FORCE=1   run again, whatever is there'
 	@echo 'make fit_mesh | refine DATASET=…      only when asked for: proportions of meshes, poses by shading; SET="align.poses=build/…/refine" uses them'
+	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'

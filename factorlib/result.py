@@ -1,0 +1,216 @@
+"""A result in Python: `factorlib.load_result("build/eames")`.
+
+    r = factorlib.load_result("build/eames")
+    r.materials["red"].roughness, r.materials["red"].stderr.roughness
+    r.environment("kitchen").rotated(90).to_exr("kitchen.exr")
+    r.relight("yellow_chair", "garden")            # a picture, shown by a notebook
+    r.render("terrace", azimuth=40).to_png("terrace.png")
+
+Names that are not there are refused with those that are.  Pictures are path-traced, as those of recipes.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.dataset.read import read_dataset
+from factorlib.dataset.slices import dataset_slice
+from factorlib.errors import InputError, did_you_mean
+from factorlib.geometry.camera import rotation_of_vector
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_exr, write_rgb_exr
+from factorlib.images.light_map import read_light_map
+from factorlib.images.picture import exposure_of, picture, png_bytes
+from factorlib.light.latlong import turned_map
+from factorlib.recipe.schema import is_light_file
+from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
+from factorlib.render.solved_set import SolvedSet
+from factorlib.results.materials import Solved
+from factorlib.stage import Inputs
+from factorlib.wholefile import write_bytes
+
+T = TypeVar("T")
+STAGES, SLICES = ("masks", "align", "export"), ("materials", "objects", "light", "ground")
+MARK = "dataset.txt"
+SAMPLES = 64
+
+
+def load_result(folder: str | Path) -> Result:
+    """The result in build/<dataset>, or in the folder of that name in ./build.
+
+    Raises InputError where there is none, or its data set is no longer where it was.
+    """
+    found = next((path for path in (Path(folder), Path("build") / folder) if (path / MARK).is_file()), None)
+    if found is None:
+        known = sorted(str(path.parent) for path in Path("build").glob(f"*/{MARK}"))
+        cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
+        raise InputError("there is no result here", file=folder, cure=cure)
+    missing = [stage for stage in STAGES if not (found / stage).is_dir()]
+    if missing:
+        raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=f"make export DATASET={found.name}")
+    dataset = read_dataset(_dataset_of(found))
+    slices = {name: dataset_slice(dataset, name) for name in SLICES}
+    files = {file: dataset.folder / file for each in slices.values() for file in each.files}
+    folders = {stage: (found / stage).resolve() for stage in STAGES}
+    return Result(found, SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files)))
+
+
+def _dataset_of(folder: Path) -> Path:
+    """dataset.txt is relative to the checkout, whose build/ the folder lies in, where the data set lies in it."""
+    words = (folder / MARK).read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
+    return folder.resolve().parent.parent / words
+
+
+class Named(Mapping[str, T]):
+    """A table whose missing names are refused with those that are there."""
+
+    def __init__(self, what: str, table: Mapping[str, T]):
+        self._what, self._table = what, table
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._table:
+            raise InputError(f"there is no {self._what} {name!r}", cure=did_you_mean(name, self._table))
+        return self._table[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._table)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._table
+
+    def __repr__(self) -> str:
+        return f"{self._what}s: {', '.join(self._table)}"
+
+
+class Result:
+    """What was solved of a data set.
+
+    materials: by name, with `diffuse`, `specular` (linear Rec. 709), `roughness` and their standard errors `stderr`
+    photos, objects: names;  an object is named as in dataset.yaml, or <photo>/<object> where several photos have one of that name
+    """
+
+    def __init__(self, folder: Path, solved: SolvedSet):
+        self.folder, self._solved = folder, solved
+        self.materials: Named[Solved] = Named("material", {name: solved.table.materials[name] for name in solved.names})
+        self.photos = solved.photos
+
+    @property
+    def objects(self) -> list[str]:
+        """Every object as <photo>/<object>."""
+        return [f"{photo}/{obj.name}" for photo, each in self._solved.objects.items() for obj in each.objects]
+
+    def environment(self, name: str) -> Environment:
+        """The environment map of a photo's light, as exported (`docs/formats.md`); InputError for an unknown photo."""
+        light = self._solved.lights[self._photo(name)].illumination
+        path = self.folder / "export" / "illumination" / f"{light}.exr"
+        return Environment(read_rgb_exr(path).astype(float))
+
+    def render(
+        self, photo: str, azimuth: float = 0.0, elevation: float = 0.0, zoom: float = 1.0, width: int | None = None, samples: int = SAMPLES
+    ) -> Picture:
+        """The objects of a photo in its light, from another side: angles in degrees about the objects' middle."""
+        scene = resized(self._solved.scene(self._photo(photo)), width)
+        return Picture(traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)))
+
+    def relight(self, name: str, light: str | Environment, width: int | None = None, samples: int = SAMPLES) -> Picture:
+        """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`."""
+        photo, one = self._object(name)
+        scene = resized(self._solved.scene(photo), width)
+        objects = tuple(each for each in scene.objects if each.name == one)
+        return Picture(traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples))
+
+    def scene(self, photo: str) -> PhotoScene:
+        """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
+        return self._solved.scene(self._photo(photo))
+
+    def _photo(self, name: str) -> str:
+        return Named("photo", {photo: photo for photo in self.photos})[name]
+
+    def _object(self, name: str) -> tuple[str, str]:
+        known = {each: tuple(each.split("/")) for each in self.objects}
+        short = {one: (photo, one) for photo, one in reversed(known.values())}  # the first photo that has it
+        return Named("object", {**short, **known})[name]
+
+    def _light(self, light: str | Environment) -> Light:
+        if isinstance(light, Environment):
+            return light.lat_long
+        if is_light_file(light):
+            return read_light_map(Path(light))
+        return self._solved.light(self._photo(light))
+
+    def __repr__(self) -> str:
+        return f"{self.folder}: {len(self.photos)} photos, {self.materials!r}"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(_row(name, material) for name, material in self.materials.items())
+        head = "".join(f"<th>{word}</th>" for word in ("material", "diffuse", "specular", "roughness"))
+        return f"<p>{html.escape(str(self.folder))}: photos {html.escape(', '.join(self.photos))}</p><table><tr>{head}</tr>{rows}</table>"
+
+
+def _row(name: str, material: Solved) -> str:
+    def numbers(values: tuple[float, ...], errors: tuple[float, ...]) -> str:
+        """With their standard errors."""
+        return ", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True))
+
+    stderr = material.stderr
+    cells = (
+        html.escape(name),
+        numbers(material.diffuse, stderr.diffuse),
+        numbers(material.specular, stderr.specular),
+        numbers((material.roughness,), (stderr.roughness,)),
+    )
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+class Environment(msgspec.Struct, frozen=True):
+    """lat_long: [h, 2h, 3], linear Rec. 709; the top row is up (+y), the middle of the picture toward the viewer (+z)"""
+
+    lat_long: Float[np.ndarray, "h w 3"]
+
+    def rotated(self, degrees: float) -> Environment:
+        """Turned about the upright axis: what was toward the viewer goes to the right (+x) at 90°."""
+        return Environment(turned_map(self.lat_long, rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))))
+
+    def to_exr(self, path: str | Path) -> None:
+        """Write it as OpenEXR's lat-long environment."""
+        write_rgb_exr(path, self.lat_long, LAT_LONG)
+
+    def _repr_html_(self) -> str:
+        return _image(picture(self.lat_long))
+
+
+class Picture(msgspec.Struct, frozen=True):
+    """pixels: [h, w, 4], linear radiance times coverage, and coverage"""
+
+    pixels: Float[np.ndarray, "h w 4"]
+
+    def to_exr(self, path: str | Path) -> None:
+        """Write linear radiance and coverage."""
+        write_exr(path, {channel: self.pixels[..., k] for k, channel in enumerate("RGBA")})
+
+    def to_png(self, path: str | Path, exposure: float = 1.0) -> None:
+        """Write it as 8-bit sRGB, transparent beside the objects; exposure 1 is the photo's."""
+        write_bytes(path, png_bytes(self._shown(exposure)))
+
+    def _shown(self, exposure: float) -> np.ndarray:
+        alpha = np.clip(self.pixels[..., 3:], 0, 1)
+        colour = picture(self.pixels[..., :3] / np.where(alpha > 0, alpha, 1), exposure)
+        return np.concatenate([colour, np.rint(255 * alpha).astype(np.uint8)], axis=-1)
+
+    def _repr_html_(self) -> str:
+        inside = self.pixels[..., 3] > 0.5
+        return _image(self._shown(min(1.0, exposure_of(self.pixels[..., :3], inside))))
+
+
+def _image(pixels: np.ndarray) -> str:
+    return f'<img src="data:image/png;base64,{base64.b64encode(png_bytes(pixels)).decode()}">'

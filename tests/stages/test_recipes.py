@@ -1,0 +1,119 @@
+"""The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
+
+import msgspec
+import numpy as np
+import pytest
+from PIL import Image
+
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr, write_rgb_exr
+from factorlib.images.picture import picture, read_png
+from factorlib.jsonfile import write_json
+from factorlib.recipe import schema
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.stage import Inputs, silent
+from stages import export, recipes
+from tests.export import made_export
+
+ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recipes")
+    inputs = made_export.make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
+    return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
+
+
+def drawn(made, out, recipe, **files):
+    facts = {**made.facts, "recipe": msgspec.to_builtins(recipe)}
+    inputs = Inputs(made.folders, facts, {**made.files, **{f"recipe file:{name}": path for name, path in files.items()}})
+    out.mkdir()
+    recipes.main(recipes.Params(), inputs, out, silent)
+    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+
+
+KINDS = [
+    (schema.Resynthesis(samples=2), ["front.exr", "front.png", "side.exr", "side.png"]),
+    (schema.View(photos=["side"], samples=2, width=32, background="light"), ["side.exr", "side.png"]),
+    (schema.Turntable(photos=["front"], samples=1, frames=3), ["front.gif", "front/000.png", "front/001.png", "front/002.png"]),
+    (schema.MovingLight(photos=["front"], samples=1, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
+    (schema.Relight(samples=1, rotate=30.0), ["front/side.exr", "front/side.png", "side/front.exr", "side/front.png"]),
+    (schema.Transfer(materials={"red": "unseen"}, photos=["front"], samples=2), ["front.exr", "front.png"]),
+    (schema.Insert(photos=["front"], samples=2), ["front.exr", "front.png"]),
+    (schema.Insert(photos=["front"], samples=2, mesh="egg", material="brass", at=(40.0, 50.0)), ["front.exr", "front.png"]),
+    (schema.Grid(samples=2, size=16), ["grid.exr", "grid.png", "grid.txt"]),
+]
+
+
+@pytest.mark.parametrize("recipe, files", KINDS, ids=lambda value: type(value).__name__)
+def test_files_of_every_kind_and_the_same_bytes_again(made, tmp_path, recipe, files):
+    ground = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
+    made = Inputs(made.folders, {**made.facts, "dataset.ground": {p: ground for p in made_export.MESHES}}, made.files)
+    first, second = (drawn(made, tmp_path / name, recipe) for name in "ab")
+    assert sorted(first) == sorted(files) and first == second
+
+
+def test_the_photo_stays_where_no_object_is(made, tmp_path):
+    drawn(made, tmp_path / "out", schema.Resynthesis(photos=["front"], samples=4))
+    masks = read_exr(made["masks"] / "front.exr")
+    photo = picture(np.stack([masks[c] for c in "RGB"], axis=-1), 1.0)
+    found, empty = read_png(tmp_path / "out" / "front.png"), read_exr(made["align"] / "front.exr")["label"] == 0
+    far = ~np.any([np.roll(~empty, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
+    assert np.array_equal(found[far], photo[far]) and not np.array_equal(found[~empty], photo[~empty])
+
+
+def test_a_material_of_ones_own_is_what_is_seen(made, tmp_path):
+    write_materials(tmp_path / "own.json", MaterialTable({"black": solved(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0), ERROR)}))
+    recipe = schema.Transfer(photos=["front"], materials={"red": "black"}, table="own.json", samples=4)
+    drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
+    inside = read_exr(made["align"] / "front.exr")["confidence"] > 0
+    dark = read_exr(tmp_path / "out" / "front.exr")["G"][inside]
+    assert (dark == 0).mean() > 0.9
+
+
+def test_a_material_that_reflects_more_than_arrives_is_refused(made, tmp_path):
+    write_json(tmp_path / "own.json", MaterialTable({"too much": solved(Reflectance((0.9,) * 3, (0.3,) * 3, 0.5), ERROR)}))
+    recipe = schema.Transfer(photos=["front"], materials={"red": "too much"}, table="own.json")
+    with pytest.raises(InputError, match="more light is reflected than arrives"):
+        drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
+
+
+def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
+    """Light from the right of the map's middle, +x, is a quarter of the width from the left edge: the right side of the ball is lit."""
+    lat_long = np.full((16, 32, 3), 0.01)
+    lat_long[6:10, 7:9] = 50.0
+    write_rgb_exr(tmp_path / "lamp.exr", lat_long)
+    recipe = schema.Relight(photos=["front"], lights=["lamp.exr"], samples=64)
+    drawn(made, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
+    picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
+    columns = np.nonzero(picture["A"].max(axis=0))[0]
+    left, right = np.array_split(columns, 2)
+    assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
+
+
+def test_frames_of_an_animation_turn_once(made, tmp_path):
+    drawn(made, tmp_path / "out", schema.Turntable(photos=["side"], samples=4, frames=4, seconds=2.0))
+    with Image.open(tmp_path / "out" / "side.gif") as film:
+        assert film.n_frames == 4 and film.info["duration"] == 500
+    frames = [read_png(tmp_path / "out" / "side" / f"{k:03}.png").astype(float) for k in range(4)]
+    assert min(np.abs(frames[0] - other).mean() for other in frames[1:]) > 1
+
+
+def test_a_photo_without_objects_is_refused(made, tmp_path):
+    objects = {**made.facts["dataset.objects"], "front": {"camera": {}, "objects": [], "meshes": {}}}
+    empty = Inputs(made.folders, {**made.facts, "dataset.objects": objects}, made.files)
+    with pytest.raises(InputError, match="'front' has no objects to draw"):
+        drawn(empty, tmp_path / "out", schema.Resynthesis(photos=["front"]))
+
+
+def test_a_photo_that_cannot_be_drawn_is_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
+    objects = {**made.facts["dataset.objects"], "front": {"camera": {}, "objects": [], "meshes": {}}}
+    some = Inputs(made.folders, {**made.facts, "dataset.objects": objects}, made.files)
+    assert sorted(drawn(some, tmp_path / "out", schema.Resynthesis(samples=1))) == ["side.exr", "side.png"]
+    assert "front: left out" in caplog.text
+    none = Inputs(made.folders, {**made.facts, "dataset.objects": dict.fromkeys(objects, objects["front"])}, made.files)
+    with pytest.raises(InputError, match="no objects"):
+        drawn(none, tmp_path / "none", schema.Resynthesis())
