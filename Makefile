@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph params validate verify clean gc setup lock test test-long data help $(STAGES)
+.PHONY: all plan why status graph params new validate verify clean gc setup lock test test-long data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph params validate verify clean gc $(STAGES): .venv/ready
+all plan why status graph params new validate verify clean gc $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 setup: .venv/ready
@@ -48,6 +48,7 @@ help:
 	@echo 'make fit_mesh | refine DATASET=…      only when asked for: proportions of meshes, poses by shading; SET="align.poses=build/…/refine" uses them'
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
+	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'

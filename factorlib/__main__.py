@@ -138,6 +138,23 @@ def params(stages: Stages = None) -> None:
 
 
 @app.command()
+def new(
+    dataset: Dataset = None,
+    photos: Annotated[Path | None, typer.Option(help="folder of photos; else PHOTOS")] = None,
+    masks: Annotated[Path | None, typer.Option(help="folder of masks; else MASKS")] = None,
+    meshes: Annotated[Path | None, typer.Option(help="folder of meshes; else MESHES")] = None,
+) -> None:
+    """Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml."""
+    folders = [given or _folder_named(key) for given, key in ((photos, "PHOTOS"), (masks, "MASKS"), (meshes, "MESHES"))]
+    raise typer.Exit(verbs.begin(project(), named(dataset), *folders))
+
+
+def _folder_named(key: str) -> Path | None:
+    """The folder that the environment names."""
+    return Path(os.environ[key]).expanduser() if os.environ.get(key) else None
+
+
+@app.command()
 def validate(dataset: Dataset = None, settings: Settings = None) -> None:
     """Check pipeline.yaml, settings and dataset without running anything."""
     raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings)))

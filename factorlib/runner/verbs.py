@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shlex
 import sys
 import time
+from importlib import import_module
+from pathlib import Path
 
 import msgspec
 
@@ -15,10 +18,11 @@ from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
 from factorlib.runner.home import made_home, made_homes
 from factorlib.runner.logs import warnings_in
+from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned
-from factorlib.runner.project import Project
+from factorlib.runner.project import Project, is_path
 from factorlib.runner.recipes import ALL
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
@@ -174,6 +178,18 @@ def show_params(project: Project, stages: list[str] | None) -> int:
         code = Code(project.root, project.package, name, {}, project.pipeline_file)
         lines = words.parameter_lines(name, parameters(load_stage(code).Params))
         print("\n".join([""] * (number > 0) + lines))
+    return 0
+
+
+def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
+    """Make a new dataset of folders of files, and say what is left to do."""
+    if photos is None:
+        raise InputError("no folder of photos is named", key="PHOTOS", cure="add PHOTOS=<folder>, and MASKS=… and MESHES=… where there are some")
+    folder = Path(os.path.abspath(dataset)) if is_path(dataset) else project.root / "data" / dataset
+    check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
+    missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)  # by its name, as stages: it imports science
+    print(f"{project.shown(folder)}/dataset.yaml is written" + (", with `?` where you must say more:" if missing else ""))
+    print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
     return 0
 
 

@@ -1,0 +1,197 @@
+"""A dataset.yaml for photos of one's own: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
+
+The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels, `kitchen_oak.png` or
+`kitchen/oak.png` for one material, or one COCO json for all.  Materials are the names in those, or label_1, label_2, … for labels.
+What no file says (which material a part of a mesh has, which mesh a photo shows) is left as `?`, which `make validate` refuses, and listed.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+
+from factorlib.dataset.check import IMAGES, LONGEST_NAME, MESHES
+from factorlib.errors import InputError
+from factorlib.labels.coco import Category
+from factorlib.labels.png import read_values
+from factorlib.meshes.read import read_parts
+from factorlib.reading import read_bytes, reading
+
+LEFT_OUT, MOST_LABELS, UNKNOWN = 255, 254, "?"
+
+
+class Found(msgspec.Struct):
+    """masks: by photo, a path or {material: path};  parts: by mesh;  missing: what is left to do, in words"""
+
+    photos: dict[str, Path]
+    masks: dict[str, str | dict[str, str]]
+    materials: list[str]
+    meshes: dict[str, Path]
+    parts: dict[str, list[str]]
+    missing: list[str]
+
+
+def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
+    """Copy the files, write target/dataset.yaml, and return what is still missing, in words.
+
+    Raises InputError where the folder is there already, one of the others is not, or there are no photos.
+    """
+    if target.exists():
+        raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
+    found = look(photos, masks, meshes)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
+        draft = Path(folder) / target.name
+        _copied(photos, draft / "photos", found.photos.values())
+        if masks is not None:
+            _copied(masks, draft / "masks", [path for path in masks.rglob("*") if path.suffix.lower() in (".png", ".json")])
+        if meshes is not None:
+            _copied(meshes, draft / "meshes", [path for path in meshes.rglob("*") if path.is_file()])  # with .mtl, buffers
+        (draft / "dataset.yaml").write_text(yaml_text(found, photos, meshes), encoding="utf-8")
+        draft.rename(target)
+    return found.missing
+
+
+def look(photos: Path, masks: Path | None, meshes: Path | None) -> Found:
+    """What the files in the folders say."""
+    pictures = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
+    if not pictures:
+        raise InputError(f"there are no photos ({', '.join(IMAGES[:6])}, …) in it", file=photos, key="PHOTOS", cure="name their folder")
+    found = Found(pictures, {}, [], {}, {}, [])
+    if masks is not None:
+        _look_at_masks(masks, found)
+    if meshes is not None:
+        _look_at_meshes(meshes, found)
+    found.missing += [f"photo {name}: no mask called {name}.png or {name}_<material>.png" for name in pictures if name not in found.masks]
+    if not found.meshes:
+        found.missing.append("there is no mesh: give MESHES=<folder>; rough ones will do")
+    if not found.materials:
+        found.missing.append("no mask names a material")
+    return found
+
+
+def _look_at_masks(folder: Path, found: Found) -> None:
+    files = _files(folder, (".png", ".json"), "MASKS", deep=True)
+    coco = [path for path in files if path.suffix.lower() == ".json"]
+    names: dict[str, None] = {}
+    if coco:
+        found.masks = dict.fromkeys(found.photos, f"masks/{coco[0].relative_to(folder)}")
+        names = dict.fromkeys(category.name for category in _categories(coco[0]))
+        found.missing += [f"masks/{path.name}: a second COCO file is not used" for path in coco[1:]]
+    labels = 0
+    for photo in found.photos if not coco else ():
+        whole = [path for path in files if path.parent == folder and _name(path) == photo]
+        each = {_material(path, photo, folder): path for path in files if _material(path, photo, folder)}
+        if whole:
+            values = np.unique(read_values(whole[0], photo))
+            labels = max([labels, *(int(value) for value in values if value <= MOST_LABELS)])
+            found.masks[photo] = f"masks/{whole[0].relative_to(folder)}"
+        elif each:
+            found.masks[photo] = {name: f"masks/{path.relative_to(folder)}" for name, path in sorted(each.items())}
+            names |= dict.fromkeys(sorted(each))
+    found.materials = list(names) or [f"label_{k}" for k in range(1, labels + 1)]
+
+
+def _material(path: Path, photo: str, folder: Path) -> str | None:
+    """kitchen_oak.png and kitchen/oak.png are the oak of the kitchen."""
+    if path.parent == folder:
+        return path.stem[len(photo) + 1 :] or None if path.stem.startswith(f"{photo}_") else None
+    return _name(path) if path.parent == folder / photo else None
+
+
+def _categories(path: Path) -> list[Category]:
+    class Categories(msgspec.Struct):
+        """The part of a COCO file that names materials."""
+
+        categories: list[Category]
+
+    with reading("COCO", path, cure="it needs images, annotations and categories"):
+        return msgspec.json.decode(read_bytes(path, "COCO"), type=Categories).categories
+
+
+def _look_at_meshes(folder: Path, found: Found) -> None:
+    found.meshes = _by_name(_files(folder, MESHES, "MESHES", deep=True), "MESHES")
+    found.parts = {name: list(dict.fromkeys(names[0] for names in read_parts(path))) for name, path in found.meshes.items()}
+    for name, parts in found.parts.items():
+        if len(found.materials) != 1 and (open_ := [part for part in parts if part not in found.materials]):
+            found.missing.append(f"mesh {name}: write which material {', '.join(open_)} {'is' if len(open_) == 1 else 'are'} made of")
+    for photo in found.photos if len(found.meshes) > 1 else ():
+        if not objects_of(photo, found):
+            found.missing.append(f"photo {photo}: write which of the meshes it shows")
+
+
+def objects_of(photo: str, found: Found) -> list[str]:
+    """The meshes that a photo shows: the only one there is, or those whose names are in the photo's."""
+    return list(found.meshes) if len(found.meshes) == 1 else [name for name in found.meshes if name in photo]
+
+
+def _files(folder: Path, suffixes: tuple[str, ...], key: str, deep: bool = False) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError("there is no such folder", file=folder, key=key, cure="name one")
+    return sorted(path for path in (folder.rglob("*") if deep else folder.iterdir()) if path.suffix.lower() in suffixes and path.is_file())
+
+
+def _by_name(files: list[Path], key: str) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in files:
+        if (name := _name(path)) in found:
+            raise InputError(f"{path.name} and {found[name].name} would both be called {name!r}", file=path, key=key, cure="rename one of them")
+        found[name] = path
+    return found
+
+
+def _name(path: Path) -> str:
+    """A name that dataset.yaml takes.
+
+    >>> _name(Path("IMG 0412 (1).jpeg"))
+    'IMG_0412_1'
+    """
+    return re.sub(r"[^A-Za-z0-9-]+", "_", path.stem).strip("_")[:LONGEST_NAME] or "unnamed"
+
+
+def _copied(source: Path, target: Path, files: object) -> None:
+    for path in files:
+        place = target / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, place)
+
+
+def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
+    """dataset.yaml with remarks for whoever edits it."""
+    lines = ["# What the files say; `?` is for you to write.  Every key: docs/dataset.md", "format: 1"]
+    lines += [f"materials: [{', '.join(map(_quoted, found.materials))}]    # label k of a mask is the k-th, from 1", "meshes:" if found.meshes else "meshes: {}"]
+    for name, path in found.meshes.items():
+        lines += [f"  {name}:", f"    file: {_quoted(f'meshes/{path.relative_to(meshes)}')}"]
+        if len(found.materials) == 1:
+            lines.append(f"    material: {_quoted(found.materials[0])}")
+        else:
+            lines.append("    parts:    # part of the mesh: material")
+            lines += [f"      {_quoted(part)}: {_quoted(part if part in found.materials else UNKNOWN)}" for part in found.parts[name]]
+    lines.append("photos:")
+    for name, path in found.photos.items():
+        lines += [f"  - name: {_quoted(name)}", f"    image: {_quoted(f'photos/{path.relative_to(photos)}')}"]
+        masks = found.masks.get(name, UNKNOWN)
+        if isinstance(masks, str):
+            lines.append(f"    masks: {_quoted(masks)}")
+        else:
+            lines += ["    masks:", *(f"      {_quoted(material)}: {_quoted(file)}" for material, file in masks.items())]
+        objects = objects_of(name, found) or ([UNKNOWN] if found.meshes else [])
+        lines.append("    objects:    # of each: the mesh; another material for a part by `materials: {part: material}`" if objects else "    objects: []")
+        for mesh in objects:
+            lines += [f"      - name: {_quoted(mesh)}", f"        mesh: {_quoted(mesh)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(word: str) -> str:
+    """As YAML reads it: plain where it is a word and nothing else.
+
+    >>> _quoted("red"), _quoted("yes"), _quoted("?"), _quoted("1.5")
+    ('red', '"yes"', '"?"', '"1.5"')
+    """
+    plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", word) and word.lower() not in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
+    return word if plain else msgspec.json.encode(word).decode()
