@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph params new validate verify clean gc setup lock test test-long data help $(STAGES)
+.PHONY: all plan why status graph params new compare validate verify clean gc setup lock test test-long data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph params new validate verify clean gc $(STAGES): .venv/ready
+all plan why status graph params new compare validate verify clean gc $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 setup: .venv/ready
@@ -52,6 +52,7 @@ help:
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
 	@echo 'make graph                           the stages and what they take'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
+	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=…]               forget the results of a dataset, or of all'
 	@echo 'make gc                              delete results that no dataset names any more'

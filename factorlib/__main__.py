@@ -155,6 +155,18 @@ def _folder_named(key: str) -> Path | None:
 
 
 @app.command()
+def compare(
+    first: Annotated[str | None, typer.Argument(help="folder of a result, as build/eames; else A")] = None,
+    second: Annotated[str | None, typer.Argument(help="another; else B")] = None,
+) -> None:
+    """A page that shows two results side by side: what differs in parameters, numbers, materials, lights and re-syntheses."""
+    folders = [given or os.environ.get(key) for given, key in ((first, "A"), (second, "B"))]
+    if not all(folders):
+        raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
+    raise typer.Exit(verbs.compare(project(), *map(Path, folders)))
+
+
+@app.command()
 def validate(dataset: Dataset = None, settings: Settings = None) -> None:
     """Check pipeline.yaml, settings and dataset without running anything."""
     raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings)))

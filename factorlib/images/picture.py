@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.images.transfer import srgb_encode
@@ -59,18 +56,6 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     return encoded("picture.png", spec, pixels)
-
-
-def write_gif(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float, behind: int = 255) -> None:
-    """Write an animation of so many seconds that goes round for ever; `behind` is the grey where frames are transparent."""
-    solid = []
-    for frame in frames:
-        alpha = frame[..., 3:].astype(float) / 255
-        solid.append(Image.fromarray(np.rint(frame[..., :3] * alpha + behind * (1 - alpha)).astype(np.uint8)))
-    memory = io.BytesIO()
-    each = max(20, round(1000 * seconds / len(frames)))  # browsers show shorter ones slowly
-    solid[0].save(memory, "GIF", save_all=True, append_images=solid[1:], duration=each, loop=0, disposal=2)
-    write_bytes(path, memory.getvalue())
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

@@ -6,7 +6,7 @@ from os import PathLike
 
 from factorlib.errors import InputError
 
-RESERVED = ("studies", "bench", "store")  # folders of build/ that are no datasets
+RESERVED = ("studies", "bench", "store", "compare")  # folders of build/ that are no datasets
 LONGEST = 255  # bytes of a name, on every common file system
 
 

@@ -16,18 +16,19 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
-from factorlib.runner.home import made_home, made_homes
+from factorlib.runner.home import Home, made_home, made_homes
 from factorlib.runner.logs import warnings_in
 from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
-from factorlib.runner.plan import Planned
+from factorlib.runner.plan import Planned, difference
 from factorlib.runner.project import Project, is_path
 from factorlib.runner.recipes import ALL
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
+from factorlib.wholefile import write_text
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 
@@ -191,6 +192,35 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     print(f"{project.shown(folder)}/dataset.yaml is written" + (", with `?` where you must say more:" if missing else ""))
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
     return 0
+
+
+def compare(project: Project, first: Path, second: Path) -> int:
+    """Write a page that shows two results, folders such as build/eames, side by side."""
+    folders = [path if path.is_dir() else project.build / path for path in (first, second)]
+    for folder, named in zip(folders, (first, second), strict=True):
+        if not Home(folder).keys_file.is_file():
+            known = [str(home.folder.name) for home in made_homes(project)]
+            raise InputError("there is no result here", file=named, key="compare", cure=did_you_mean(str(named), known))
+    changes = _changes(Store(project.build / "store"), *map(Home, folders))
+    page = import_module("factorlib.report.comparison").comparison(*folders, changes)  # by its name, as stages: it imports science
+    path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, page)
+    print(f"comparison: {project.shown(path)}")
+    return 0
+
+
+def _changes(store: Store, first: Home, second: Home) -> list[str] | None:
+    """Between the records of the steps that both have, each once; None where the store no longer has one.  Results of other steps are left out."""
+    keys = [home.keys() for home in (first, second)]
+    found: dict[str, None] = {}
+    for step in keys[0].keys() & keys[1].keys():
+        entries = [store.entry(each[step]) for each in keys]
+        if None in entries:
+            return None
+        records = [{name: value for name, value in entry.record.items() if not name.startswith("input:")} for entry in entries]
+        found |= dict.fromkeys(f"{step.partition('/')[0]}: {change}" for change in difference(*records))
+    return sorted(found)
 
 
 def validate(project: Project, dataset: str, settings: list[str]) -> int:
