@@ -49,7 +49,7 @@ help:
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
-	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything'
+	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
 	@echo 'make graph                           the stages and what they take'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'

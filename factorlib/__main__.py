@@ -81,11 +81,16 @@ def wish(
 
 
 def forced(force: bool) -> bool:
-    """Whether to run again what is current: --force or FORCE=1.  InputError where FORCE is neither 0, 1 nor empty."""
-    word = os.environ.get("FORCE", "")
-    if not force and word not in ("", "0", "1"):
-        raise InputError(f"{word!r} is neither 1 nor 0", key="FORCE", cure="write FORCE=1 to run again, or leave it out")
-    return force or word == "1"
+    """Whether to run again what is current: --force or FORCE=1."""
+    return switched_on("FORCE", force)
+
+
+def switched_on(key: str, option: bool) -> bool:
+    """Whether an option, or the environment's `key`, is on.  InputError where the latter is neither 0, 1 nor empty."""
+    word = os.environ.get(key, "")
+    if not option and word not in ("", "0", "1"):
+        raise InputError(f"{word!r} is neither 1 nor 0", key=key, cure=f"write {key}=1, or leave it out")
+    return option or word == "1"
 
 
 # ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -167,9 +172,11 @@ def compare(
 
 
 @app.command()
-def validate(dataset: Dataset = None, settings: Settings = None) -> None:
-    """Check pipeline.yaml, settings and dataset without running anything."""
-    raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings)))
+def validate(
+    dataset: Dataset = None, settings: Settings = None, sheet: Annotated[bool, typer.Option("--sheet", help="as SHEET=1")] = False
+) -> None:
+    """Check pipeline.yaml, settings and dataset without running anything; with a sheet, draw photos, labels and meshes side by side."""
+    raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings), switched_on("SHEET", sheet)))
 
 
 @app.command()

@@ -29,7 +29,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     photos: list[str] = []
     """Photos whose camera, objects and light are used; all of them where none is named."""
-    samples: Samples = 128
+    samples: Samples = 64
     """Samples per pixel of the path tracer: noise falls as their square root."""
 
 

@@ -16,7 +16,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.checks import faults, new_faults
 from factorlib.runner.finish import remember, results
-from factorlib.runner.home import Home, made_home, made_homes
+from factorlib.runner.home import Home, claim, made_home, made_homes
 from factorlib.runner.logs import warnings_in
 from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.params import parameters
@@ -223,8 +223,11 @@ def _changes(store: Store, first: Home, second: Home) -> list[str] | None:
     return sorted(found)
 
 
-def validate(project: Project, dataset: str, settings: list[str]) -> int:
-    """Check pipeline.yaml, the settings, dataset.yaml and every file it names, of photos only their headers."""
+def validate(project: Project, dataset: str, settings: list[str], sheet: bool = False) -> int:
+    """Check pipeline.yaml, the settings, dataset.yaml and every file it names, of photos only their headers.
+
+    sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes
+    """
     seen = survey(project, dataset, None, settings)
     if found := faults(seen, seen.records):
         return _refused(seen, found)
@@ -232,6 +235,11 @@ def validate(project: Project, dataset: str, settings: list[str]) -> int:
         f"{seen.data.folder.name}: pipeline.yaml, dataset.yaml and the files it names are good: "
         f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
     )
+    if sheet:
+        claim(project, seen.home, seen.data.folder)
+        path = seen.home.folder / "sheet.png"
+        import_module("factorlib.sheet").write_sheet(seen.data.folder, path)  # by its name, as stages: it imports science
+        print(f"  contact sheet: {project.shown(path)}")
     return 0
 
 
