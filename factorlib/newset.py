@@ -1,7 +1,7 @@
 """A dataset.yaml for photos of one's own: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
 
 The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels, `kitchen_oak.png` or
-`kitchen/oak.png` for one material, or one COCO json for all.  Materials are the names in those, or label_1, label_2, … for labels.
+`kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels `kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or label_1, label_2, … for labels.
 What no file says (which material a part of a mesh has, which mesh a photo shows) is left as `?`, which `make validate` refuses, and listed.
 """
 
@@ -26,10 +26,11 @@ LEFT_OUT, MOST_LABELS, UNKNOWN = 255, 254, "?"
 
 
 class Found(msgspec.Struct):
-    """masks: by photo, a path or {material: path};  parts: by mesh;  missing: what is left to do, in words"""
+    """masks: by photo, a path or {material: path};  silhouettes: by photo, {object: path};  parts: by mesh;  missing: what is left to do, in words"""
 
     photos: dict[str, Path]
     masks: dict[str, str | dict[str, str]]
+    silhouettes: dict[str, dict[str, str]]
     materials: list[str]
     meshes: dict[str, Path]
     parts: dict[str, list[str]]
@@ -62,7 +63,7 @@ def look(photos: Path, masks: Path | None, meshes: Path | None) -> Found:
     pictures = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
     if not pictures:
         raise InputError(f"there are no photos ({', '.join(IMAGES[:6])}, …) in it", file=photos, key="PHOTOS", cure="name their folder")
-    found = Found(pictures, {}, [], {}, {}, [])
+    found = Found(pictures, {}, {}, [], {}, {}, [])
     if masks is not None:
         _look_at_masks(masks, found)
     if meshes is not None:
@@ -91,10 +92,15 @@ def _look_at_masks(folder: Path, found: Found) -> None:
             values = np.unique(read_values(whole[0], photo))
             labels = max([labels, *(int(value) for value in values if value <= MOST_LABELS)])
             found.masks[photo] = f"masks/{whole[0].relative_to(folder)}"
+            found.silhouettes[photo] = _written(each, folder)
         elif each:
-            found.masks[photo] = {name: f"masks/{path.relative_to(folder)}" for name, path in sorted(each.items())}
+            found.masks[photo] = _written(each, folder)
             names |= dict.fromkeys(sorted(each))
     found.materials = list(names) or [f"label_{k}" for k in range(1, labels + 1)]
+
+
+def _written(files: dict[str, Path], folder: Path) -> dict[str, str]:
+    return {name: f"masks/{path.relative_to(folder)}" for name, path in sorted(files.items())}
 
 
 def _material(path: Path, photo: str, folder: Path) -> str | None:
@@ -182,7 +188,10 @@ def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
             lines += ["    masks:", *(f"      {_quoted(material)}: {_quoted(file)}" for material, file in masks.items())]
         objects = objects_of(name, found) or ([UNKNOWN] if found.meshes else [])
         lines.append("    objects:    # of each: the mesh; another material for a part by `materials: {part: material}`" if objects else "    objects: []")
-        for mesh in objects:
+        silhouettes = found.silhouettes.get(name, {}) if objects else {}
+        for each, mask in silhouettes.items():
+            lines += [f"      - name: {_quoted(each)}", f"        mesh: {_quoted(objects[0] if len(objects) == 1 else UNKNOWN)}", f"        mask: {_quoted(mask)}"]
+        for mesh in objects if not silhouettes else ():
             lines += [f"      - name: {_quoted(mesh)}", f"        mesh: {_quoted(mesh)}"]
     return "\n".join(lines) + "\n"
 

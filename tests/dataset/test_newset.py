@@ -48,6 +48,16 @@ def test_labels_of_pixels_become_materials_and_parts_are_left_open(folders):
         read_dataset(folders / "data" / "mine")
 
 
+def test_beside_labels_a_further_mask_is_the_silhouette_of_an_object(folders):
+    mask(folders / "masks" / "kitchen.png", [0, 1, 2])
+    mask(folders / "masks" / "kitchen_left.png", [0, 1, 0])
+    mask(folders / "masks" / "kitchen_right.png", [0, 0, 1])
+    mask(folders / "masks" / "IMG_0412.png", [0, 1])
+    _, spec = made(folders)
+    assert spec["photos"][1]["objects"] == [{"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")]
+    assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
+
+
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folders):
     for photo in ("kitchen", "IMG_0412"):
         mask(folders / "masks" / f"{photo}_shell.png", [0, 255])
