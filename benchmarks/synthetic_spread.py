@@ -23,7 +23,7 @@ MARGIN = 1.25  # of the worst error
 
 def numbers(project: Project, settings: str) -> list[float]:
     """The value of each bound in `SYNTHETIC`, of a run with these settings."""
-    if verbs.make(project, "synthetic", ["evaluate"], [settings], force=False) != 0:
+    if verbs.make(project, verbs.Wish("synthetic", ["evaluate"], [settings])) != 0:
         raise SystemExit(1)
     rows = rows_of(read_json(project.build / "synthetic" / "evaluate" / "metrics.json"), SYNTHETIC)
     return [math.nan if row.value is None else row.value for row in rows]

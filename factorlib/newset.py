@@ -21,6 +21,7 @@ from factorlib.labels.coco import Category
 from factorlib.labels.png import read_values
 from factorlib.meshes.read import read_parts
 from factorlib.reading import read_bytes, reading
+from factorlib.wholefile import write_text
 
 LEFT_OUT, MOST_LABELS, UNKNOWN = 255, 254, "?"
 
@@ -53,7 +54,7 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
             _copied(masks, draft / "masks", [path for path in masks.rglob("*") if path.suffix.lower() in (".png", ".json")])
         if meshes is not None:
             _copied(meshes, draft / "meshes", [path for path in meshes.rglob("*") if path.is_file()])  # with .mtl, buffers
-        (draft / "dataset.yaml").write_text(yaml_text(found, photos, meshes), encoding="utf-8")
+        write_text(draft / "dataset.yaml", yaml_text(found, photos, meshes))
         draft.rename(target)
     return found.missing
 

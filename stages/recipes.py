@@ -24,6 +24,7 @@ from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo,
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs, Progress
+from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
 
@@ -182,7 +183,7 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
         exposure = exposure_of(column[..., :3], column[..., 3] > 0.5)
         columns.append(column * np.array([exposure] * 3 + [1.0]))
     _write_alone(out / "grid", np.concatenate(columns, axis=1), lambda radiance: radiance)
-    (out / "grid.txt").write_text(f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n", encoding="utf-8")
+    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
     progress(total, total)
 
 

@@ -11,13 +11,13 @@ from factorlib.runner import verbs
 from tests.runner import toy
 from tests.runner.toy import files_of, write
 
-NO_NAMES = ["", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "data/..", "build/store", "x\0y", "x" * 256]
+NO_NAMES = ["", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "compare", "data/..", "build/store", "x\0y", "x" * 256]
 
 
 @pytest.fixture(scope="module")
 def made_once(tmp_path_factory):
     made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
-    assert verbs.make(made, "set", None, [], False) == 0
+    assert verbs.make(made, verbs.Wish("set")) == 0
     return made
 
 
@@ -125,10 +125,9 @@ def test_without_a_name_the_store_and_every_home_go_and_nothing_else(project, ca
 @pytest.mark.parametrize("word", NO_NAMES)
 @pytest.mark.parametrize("verb", ["make", "show_plan", "show_status", "validate"])
 def test_every_verb_refuses_what_is_no_name(project, word, verb):
-    more = {"make": (None, [], False), "show_plan": (None, [], False), "show_status": (None, []), "validate": ([],)}[verb]
     before = everything(project)
     with pytest.raises(InputError) as caught:
-        getattr(verbs, verb)(project, word, *more)
+        verbs.validate(project, word, []) if verb == "validate" else getattr(verbs, verb)(project, verbs.Wish(word))
     assert "DATASET" in str(caught.value) and everything(project) == before
 
 

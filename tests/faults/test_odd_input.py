@@ -20,7 +20,7 @@ DAMAGED = [b"", b"{", b"[]", b"[1, 2]", b"5", b"null", b'"x"', b"\xff\xfe", b'{"
 @pytest.fixture(scope="module")
 def made_once(tmp_path_factory):
     made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
-    assert verbs.make(made, "set", None, [], False) == 0
+    assert verbs.make(made, verbs.Wish("set")) == 0
     return made
 
 
@@ -103,7 +103,7 @@ def test_a_damaged_current_json_loses_nothing(project, monkeypatch, content, cap
         assert "current.json" in call(monkeypatch, project, "gc") and "delete it" in call(monkeypatch, project, "gc")
         assert sorted((project.build / "store" / "trees").iterdir()) == trees
     assert set(state(project).values()) == {"current"} and "current.json" in caplog.text
-    assert verbs.make(project, "set", None, [], False) == 0
+    assert verbs.make(project, verbs.Wish("set")) == 0
     assert json.loads(mark.read_bytes()) == before
 
 
@@ -128,12 +128,12 @@ def test_damaged_entries_of_a_cache_are_made_anew(tmp_path):
 @pytest.mark.parametrize("line", [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b'{"event": "warning", "text": [1]}', b"[" * 5000])
 def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, line, capsys):
     write(project.root / "data" / "set" / "a.txt", "odd")
-    assert verbs.make(project, "set", None, [], False) == 0
+    assert verbs.make(project, verbs.Wish("set")) == 0
     for log in (project.build / "store" / "logs").glob("*.jsonl"):
         log.write_bytes(line + b"\n" + log.read_bytes() + line)
-    assert verbs.show_status(project, "set", None, []) == 0
+    assert verbs.show_status(project, verbs.Wish("set")) == 0
     assert "a is odd" in capsys.readouterr().out
-    assert verbs.make(project, "set", ["total"], [], True) == 0
+    assert verbs.make(project, verbs.Wish("set", ["total"], force=True)) == 0
     if line not in (b"", b'{"event": "warning", "text": [1]}'):
         assert "damaged line" in caplog.text
         assert (project.build / "set" / "total" / "log.txt").read_text() == "6", "what the report is handed"

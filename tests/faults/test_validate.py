@@ -156,7 +156,7 @@ def test_a_good_set_is_said_to_be_good(project, folder, capsys):
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_each_fault_is_found_without_running_anything(project, folder, capsys, fault):
     fault(folder)
-    for verb in (lambda: verbs.validate(project, str(folder), []), lambda: verbs.make(project, str(folder), None, [], False)):
+    for verb in (lambda: verbs.validate(project, str(folder), []), lambda: verbs.make(project, verbs.Wish(str(folder)))):
         code, said = said_by(verb, capsys)
         assert code == 1 and re.search(FAULTS[fault], said), said
     assert not list((project.root / "build").glob("set/*")), "something was run"
@@ -223,12 +223,12 @@ def looked_at(root, **texts):
 
 def test_a_run_looks_at_what_is_new_and_no_more(tmp_path, capsys):
     project, asked = looked_at(tmp_path, a="Alpha", b="Beta")
-    assert verbs.make(project, "set", None, [], False) == 0
+    assert verbs.make(project, verbs.Wish("set")) == 0
     assert asked == [("photo", "a"), ("photo", "b")]
     asked.clear()
-    assert verbs.make(project, "set", None, [], False) == 0
-    assert verbs.make(project, "set", None, ["upper.times=2"], False) == 0
+    assert verbs.make(project, verbs.Wish("set")) == 0
+    assert verbs.make(project, verbs.Wish("set", settings=["upper.times=2"])) == 0
     assert asked == []
     toy.write(tmp_path / "data/set/c.txt", "a fault")
-    assert verbs.make(project, "set", None, [], False) == 1
+    assert verbs.make(project, verbs.Wish("set")) == 1
     assert asked == [("photo", "c")] and "a fault" in capsys.readouterr().err
