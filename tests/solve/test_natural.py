@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
-from factorlib.diagnose.posterior import Posterior
+from factorlib.diagnose.posterior import MODEL_ERROR, Posterior
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.model.lights import UnitLobes
 from factorlib.model.loss import Loss
@@ -180,6 +180,13 @@ def test_a_nil_reflectance_is_not_known_for_sure(solved):
     errors, at_nil = (Posterior(problem, one, PRIOR).standard_errors().materials for one in (found, there))
     assert (at_nil.diffuse[2] > 0.3 * errors.diffuse[2]).all()
     assert (errors.vector() > 0).all()
+
+
+def test_no_observation_mends_what_the_model_has_wrong(solved):
+    """k_s and roughness are never known better than the model is right."""
+    problem, _, found = solved
+    errors, materials = Posterior(problem, found, PRIOR).standard_errors().materials, found.point.materials
+    assert (errors.roughness >= MODEL_ERROR[6]).all() and (errors.specular >= MODEL_ERROR[3:6] * materials.specular).all()
 
 
 def test_lights_lie_within_their_standard_errors(solved):
