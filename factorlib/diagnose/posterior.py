@@ -30,7 +30,6 @@ from factorlib.solve.marginal import Field, Marginal, marginal
 from factorlib.solve.marginal_descent import materials_of, unknowns_of
 from factorlib.solve.natural import Natural, fields_of
 
-
 # Standard deviations, relative of k_d and k_s, absolute of roughness: with them 68 % of true values lie within one standard error on
 # the sets that settings are chosen on (eames-like, seeds 11, 12, 13 and data/eames).  Lights follow the prior only where the model explains
 # photographs badly, so they are never added to what is exact.
