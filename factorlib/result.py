@@ -26,6 +26,7 @@ from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_exr, write_rgb_exr
+from factorlib.images.hdr import write_hdr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.light.latlong import turned_map
@@ -184,6 +185,10 @@ class Environment(msgspec.Struct, frozen=True):
     def to_exr(self, path: str | Path) -> None:
         """Write it as OpenEXR's lat-long environment."""
         write_rgb_exr(path, self.lat_long, LAT_LONG)
+
+    def to_hdr(self, path: str | Path) -> None:
+        """Write it as Radiance HDR: eight bits a channel under one exponent."""
+        write_hdr(path, self.lat_long)
 
     def _repr_html_(self) -> str:
         return _image(picture(self.lat_long))

@@ -1,6 +1,6 @@
 """What was solved, in the forms that other programs read.
 
-Writes illumination/<light>.exr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
+Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
 scenes/<photo>.xml with their meshes and lights, materials.mtlx and <mesh>.glb.
 """
 
@@ -21,6 +21,7 @@ from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
+from factorlib.images.hdr import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.limits import NO_LIMITS
@@ -94,7 +95,9 @@ def _write_lights(out: Path, lobes: dict[str, Lobes], params: Params) -> None:
     for folder in ("illumination", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
     for name, light in lobes.items():
-        write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long_of_lobes(light, params.height, 2 * params.height), LAT_LONG)
+        lat_long = lat_long_of_lobes(light, params.height, 2 * params.height)
+        write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long, LAT_LONG)
+        write_hdr(out / "illumination" / f"{name}.hdr", lat_long)
         write_rgb_exr(out / "scenes" / "light" / f"{name}.exr", _mitsuba_map(light, params), LAT_LONG)
 
 

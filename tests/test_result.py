@@ -9,6 +9,7 @@ import pytest
 import factorlib
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import write_json
 from factorlib.stage import silent
@@ -74,6 +75,9 @@ def test_environments_are_the_exported_ones_turned_and_written(result, folder, t
     light = result.environment("side")
     assert np.array_equal(light.lat_long, read_rgb_exr(folder / "export" / "illumination" / "room.exr"))
     light.to_exr(tmp_path / "room.exr")
+    light.to_hdr(tmp_path / "room.hdr")
+    found, brightest = read_light_map(tmp_path / "room.hdr"), light.lat_long.max(axis=-1, keepdims=True)
+    assert (np.abs(found - light.lat_long) <= brightest / 128).all()
     assert np.array_equal(read_rgb_exr(tmp_path / "room.exr"), light.lat_long.astype(np.float32))
     spot = factorlib.result.Environment(np.zeros((16, 32, 3)))
     spot.lat_long[8, 16] = 1  # toward the viewer
