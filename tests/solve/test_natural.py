@@ -187,6 +187,7 @@ def test_no_observation_mends_what_the_model_has_wrong(solved):
     problem, _, found = solved
     errors, materials = Posterior(problem, found, PRIOR).standard_errors().materials, found.point.materials
     assert (errors.roughness >= MODEL_ERROR[6]).all() and (errors.specular >= MODEL_ERROR[3:6] * materials.specular).all()
+    assert (errors.diffuse >= MODEL_ERROR[:3] * materials.diffuse).all() and (MODEL_ERROR > 0).all()
 
 
 def test_lights_lie_within_their_standard_errors(solved):
