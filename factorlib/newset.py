@@ -88,7 +88,8 @@ def _look_at_masks(folder: Path, found: Found) -> None:
     labels = 0
     for photo in found.photos if not coco else ():
         whole = [path for path in files if path.parent == folder and _name(path) == photo]
-        each = {_material(path, photo, folder): path for path in files if _material(path, photo, folder)}
+        mine = [path for path in files if _name(path) not in found.photos]  # kitchen_2.png is the photo kitchen_2's, if there is one
+        each = {name: path for path in mine if (name := _material(path, photo, folder))}
         if whole:
             values = np.unique(read_values(whole[0], photo))
             labels = max([labels, *(int(value) for value in values if value <= MOST_LABELS)])
@@ -107,7 +108,7 @@ def _written(files: dict[str, Path], folder: Path) -> dict[str, str]:
 def _material(path: Path, photo: str, folder: Path) -> str | None:
     """kitchen_oak.png and kitchen/oak.png are the oak of the kitchen."""
     if path.parent == folder:
-        return path.stem[len(photo) + 1 :] or None if path.stem.startswith(f"{photo}_") else None
+        return _name(path).removeprefix(f"{photo}_") if _name(path).startswith(f"{photo}_") else None
     return _name(path) if path.parent == folder / photo else None
 
 

@@ -19,7 +19,7 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file, recipe_of
-from factorlib.render.insertion import inserted, spot_at, spot_beside, stood
+from factorlib.render.insertion import NEW, inserted, spot_at, spot_beside, stood
 from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
@@ -79,7 +79,7 @@ def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path,
     """The same with other materials."""
     report(0)
     known, scene = results.known(recipe.table), results.scene(photo)
-    materials = {name: known[recipe.materials.get(name, name)] for name in scene.materials}
+    materials = {name: known[recipe.materials[name]] if name in recipe.materials else own for name, own in scene.materials.items()}
     traced = traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples)
     _write(out / photo, _over(results.photo(photo), traced, results.tone(photo)))
 
@@ -89,29 +89,29 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     scene = results.scene(photo)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     plane, diffuse = results.ground(photo, neighbour)
-    known = results.known(recipe.table)
+    known = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's alone
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
-        spot = spot_at(scene, plane, neighbour, recipe.at, recipe.size)
+        spot = spot_at(scene, plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
         tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         spot = spot_beside(scene, plane, neighbour, recipe.size, wide / tall)
-    new = stood("inserted", mesh, names, up, recipe.turn, spot)
+    new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
     gloss = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness) if any(recipe.ground.specular) else None
     found = inserted(
         msgspec.structs.replace(scene, materials={**scene.materials, **known}),
         new,
         spot,
-        results.photo(photo),
+        results.straightened(photo),
         results.covered(photo),
         recipe.samples,
         diffuse=diffuse,
         gloss=gloss,
-        shown=results.tone(photo),
         report=lambda done, total: report(done / total),
     )
-    _write(out / photo, found.composite)
+    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (gloss is None)
+    _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
 
 
 # ── pictures of the objects alone ────────────────────────────────────────────────────────────────────────────────────
@@ -152,10 +152,12 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
         report(k / len(lights))
-        lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
+        light = results.light(name)
+        lit = msgspec.structs.replace(scene, light=turned_light(light, recipe.rotate) if recipe.rotate else light)
         traced = traced_photo(lit, recipe.samples, with_light=recipe.background == "light")
         exposure = exposure_of(traced[..., :3], traced[..., 3] > 0.5) if is_light_file(name) else 1.0
-        _write_alone(out / photo / Path(name).stem, traced * np.array([exposure] * 3 + [1.0]), lambda radiance: radiance)
+        tone = (lambda radiance: radiance) if is_light_file(name) else results.tone(name)
+        _write_alone(out / photo / Path(name).stem, traced * np.array([exposure] * 3 + [1.0]), tone)
 
 
 DRAWN = {

@@ -25,6 +25,10 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     _check(recipe.photos, photos, "photo", path, "photos")
     if isinstance(recipe, Relight | Grid):
         _check([name for name in recipe.lights if not is_light_file(name)], photos, "photo", path, "lights")
+        stems = [Path(name).stem for name in recipe.lights]
+        for name in stems:
+            if stems.count(name) > 1:
+                raise InputError(f"two lights are called {name!r}: one picture would replace the other", file=path, key="lights", cure="rename a file")
     if isinstance(recipe, Grid):
         _check(recipe.materials, dataset.spec.materials, "material", path, "materials")
     if isinstance(recipe, Transfer):
@@ -63,7 +67,8 @@ def _own(table: str | None, path: Path) -> list[str]:
     if table is None or not (path.parent / table).is_file():
         return []
     content = read_json(path.parent / table)
-    return list(content.get("materials", {})) if isinstance(content, dict) else []
+    materials = content.get("materials") if isinstance(content, dict) else None
+    return list(materials) if isinstance(materials, dict) else []
 
 
 def _check(names: Iterable[str], known: list[str], what: str, path: Path, key: str) -> None:

@@ -42,7 +42,9 @@ RADIUS, FADE = 8.0, 0.5  # of the disc, in sizes of the object; share of it from
 FIT_SAMPLES = 16
 GREY, DARKEST, BRIGHTEST = 0.3, 0.02, 0.85  # diffuse reflectance of the ground: where nothing tells it, and its bounds
 GAP = 0.15  # between the objects, in heights of the new one
+HAIR = 1e-4  # of a mesh's radius
 GROUND = "ground"
+NEW = "+"  # what the new object and its materials are called: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
 
@@ -65,8 +67,9 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
     right /= np.linalg.norm(right)
     across = neighbour.vertices @ right
     foot = plane.onto(neighbour.vertices.mean(axis=0)[None])[0]
+    foot = foot + ((across.min() + across.max()) / 2 - foot @ right) * right
     away = (np.ptp(across) / 2 + (slenderness / 2 + GAP) * height) * right
-    spots = [foot + (across.mean() - foot @ right) * right + side * away for side in (1.0, -1.0)]
+    spots = [foot + side * away for side in (1.0, -1.0)]
     others = [each for each in scene.objects if each is not neighbour]
 
     def room(point: Float[np.ndarray, "3"]) -> float:
@@ -128,14 +131,14 @@ def inserted(
     *,
     diffuse: tuple[float, float, float] | None = None,
     gloss: Reflectance | None = None,
-    shown: Callable[[Picture], Picture] = lambda radiance: radiance,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Inserted:
     """The photo with the new object.
 
-    photo: linear, as it shows the scene;  known: pixels that an object of the scene covers (they do not show the ground)
+    photo: linear radiance, its tone curve undone;  known: pixels that an object of the scene covers (they do not show the ground)
     diffuse: of the ground, where it is known;  gloss: of a ground that reflects, its specular part
-    shown: what the photo's tone curve makes of radiance
+
+    Raises InputError where the new object is not seen.
     """
     total = 4 + (2 if gloss else 0)
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
@@ -151,14 +154,17 @@ def inserted(
     with_ = rendered({**fixed, **ground, **more}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
     report(3, total)
     coverage = _coverage(scene, new, camera, samples)
+    if not coverage.any():
+        found = "the new object is not seen: it stands outside the picture, or something hides it"
+        raise InputError(found, key="at", cure="say where it stands, `at: [x, y]`, or make it smaller")
     report(4, total)
     shadow = _shadow(without, with_, coverage, scene.camera, spot)
     own = np.maximum(with_ - (1 - coverage[..., None]) * shadow * without, 0) * (coverage > 0)[..., None]
-    composite = (1 - coverage[..., None]) * shadow * photo + _shown_of(own, coverage, shown)
+    composite = (1 - coverage[..., None]) * shadow * photo + own
     if gloss is not None:
         polished = _ground(spot, gloss)
         before, after = (rendered({**fixed, **polished, **m}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True) for m in ({}, more))
-        mirrored = (after - before) * (disc & ~known & (coverage == 0))[..., None] * _fading(scene.camera, spot)[..., None]
+        mirrored = (after - before) * ((disc & ~known) * (1 - coverage) * _fading(scene.camera, spot))[..., None]
         composite = np.maximum(composite + mirrored, 0)
         report(total, total)
     return Inserted(composite, coverage, shadow, np.asarray(diffuse))
@@ -184,14 +190,19 @@ def _ground(spot: Spot, material: Reflectance) -> dict[str, Any]:
 
 def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
     """The new object shines with radiance 1, all else is black: what is seen is its share of each pixel."""
-    glowing = {f"new_{label}": _emitter(new, label) for label in new.mesh.labels}
+    glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)}
     black = shapes(scene.objects, scene.materials, black=[each.name for each in scene.objects])
     picture = rendered({**black, **glowing}, camera, samples, 1, 1)
     return np.clip(picture[..., 0], 0, 1)
 
 
-def _emitter(new: Placed, label: int) -> Any:
-    return shape(submesh(new.mesh, label), {"type": "diffuse", "reflectance": rgb(0.0)}, new.world_from_object, {"type": "area", "radiance": rgb(1.0)})
+def _emitter(new: Placed, label: int, side: int) -> Any:
+    """Lights shine on the side of their normals alone: an open mesh has another, turned round and a hair behind."""
+    part = submesh(new.mesh, label)
+    if side:
+        behind = part.vertices - HAIR * new.mesh.radius * part.normals
+        part = Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True)
+    return shape(part, {"type": "diffuse", "reflectance": rgb(0.0)}, new.world_from_object, {"type": "area", "radiance": rgb(1.0)})
 
 
 def _shadow(without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], camera: Camera, spot: Spot) -> Picture:
@@ -220,12 +231,6 @@ def _disc_pixels(camera: Camera, spot: Spot) -> Bool[np.ndarray, "h w"]:
 def _ground_points(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w 3"]:
     rays = camera.rays() @ YUP_FROM_CAMERA
     return spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
-
-
-def _shown_of(own: Picture, coverage: Float[np.ndarray, "h w"], shown: Callable[[Picture], Picture]) -> Picture:
-    """The tone curve of the object's own radiance, not of what is left of it in a pixel that it fills in part."""
-    share = np.where(coverage > 0, coverage, 1)[..., None]
-    return share * shown(own / share)
 
 
 def _pixel(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:

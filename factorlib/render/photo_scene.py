@@ -2,7 +2,7 @@
 
 World    the y-up turn of the photo's camera: x right, y up, z toward the viewer, camera at the origin.
 Light    infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
-Upright  the ground's normal where it is known, else the camera's own y.
+Upright  the camera's own y, unless another direction is given.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectE
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.tone import shown
+from factorlib.images.tone import shown, straightened
 from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
@@ -63,6 +63,20 @@ class SolvedSet:
         """Its linear radiance."""
         channels = read_exr(self.inputs["masks"] / f"{photo}.exr")
         return np.nan_to_num(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float))
+
+    def straightened(self, photo: str) -> Float[np.ndarray, "h w 3"]:
+        """The same without its tone curve."""
+        tone = self.table.model.tone.get(photo)
+        return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
+
+    def pixel(self, photo: str, at: tuple[float, float]) -> tuple[float, float]:
+        """A pixel of the photo in pixels of masks' picture; InputError where it is none of the photo's."""
+        height, width = self.photo(photo).shape[:2]
+        factor = self.poses[photo].camera.factor
+        if not (0 <= at[0] <= factor * width and 0 <= at[1] <= factor * height):
+            found = f"pixel {at} is not in photo '{photo}', of {factor * width} × {factor * height} pixels"
+            raise InputError(found, key="at", cure="name one that shows the ground")
+        return at[0] / factor, at[1] / factor
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Pixels that are no background."""
