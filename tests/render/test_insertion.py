@@ -6,8 +6,9 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
+from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import Spot, ball, inserted, stood
+from factorlib.render.insertion import NEW, Spot, ball, inserted, stood
 from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
@@ -97,3 +98,20 @@ def test_a_polished_ground_shows_the_object_and_only_there(made):
     rows, columns = np.nonzero(found.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
     assert below.max() > 0.05 and difference[0].max() == 0
+
+
+@pytest.mark.parametrize("turn", [0, 180])
+def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_it(turn):
+    """Whatever the objects of the photo are called."""
+    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
+    quad = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0, 0, 1.0], (4, 1)), np.ones(2, np.int16), open=True)
+    seen = []
+    for where in (-8.0, -4.0):
+        matrix = 0.3 * np.eye(4)
+        matrix[:, 3] = (-0.9 * -where / 6, -0.6 * -where / 6, where, 1)
+        before = Placed("new", ball(), ("grey",), matrix)
+        scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
+        placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
+        photo = np.ones((CAMERA.height, CAMERA.width, 3))
+        seen.append(inserted(scene, placed, SPOT, photo, np.zeros(photo.shape[:2], bool), 16).coverage.sum())
+    assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
