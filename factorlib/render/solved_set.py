@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import msgspec
@@ -26,6 +27,7 @@ from factorlib.results.materials import MaterialTable, Reflectance, read_materia
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.stage import Inputs
 
+log = logging.getLogger("factorlib.render")
 MOST_REFLECTED = 0.999  # max k_d + max k_s of a material of one's own
 
 
@@ -53,6 +55,10 @@ class SolvedSet:
         if not objects.objects:
             found, cure = f"photo '{photo}' has no objects to draw", "name other photos in the recipe"
             raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
+        for obj in objects.objects:
+            if poses.objects[obj.name].left_out:
+                doubts = "; ".join(poses.objects[obj.name].doubts)
+                log.warning("%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s", photo, obj.name, doubts)
         pixels = read_exr(self.inputs["masks"] / f"{photo}.exr")["label"]
         camera = poses.camera.camera(pixels.shape[1], pixels.shape[0])
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
