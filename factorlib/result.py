@@ -11,7 +11,6 @@ Names that are not there are refused with those that are.  Pictures are path-tra
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,17 +24,18 @@ from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
 from factorlib.images.hdr import write_hdr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.picture import exposure_of, picture, png_bytes
+from factorlib.images.picture import picture
 from factorlib.light.latlong import turned_map
 from factorlib.recipe.schema import is_light_file
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
 from factorlib.render.solved_set import SolvedSet
+from factorlib.render.traced import Traced, as_it_is
+from factorlib.report.png import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs
-from factorlib.wholefile import write_bytes
 
 T = TypeVar("T")
 STAGES, SLICES = ("masks", "align", "export"), ("materials", "objects", "light", "ground")
@@ -69,6 +69,10 @@ def _dataset_of(folder: Path) -> Path:
     return folder.resolve().parent.parent / words
 
 
+class UnknownName(InputError, KeyError):
+    """Both, so that `get` and `in` work as they do with any mapping."""
+
+
 class Named(Mapping[str, T]):
     """A table whose missing names are refused with those that are there."""
 
@@ -77,7 +81,7 @@ class Named(Mapping[str, T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self._table:
-            raise InputError(f"there is no {self._what} {name!r}", cure=did_you_mean(name, self._table))
+            raise UnknownName(f"there is no {self._what} {name!r}", cure=did_you_mean(name, self._table))
         return self._table[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -85,9 +89,6 @@ class Named(Mapping[str, T]):
 
     def __len__(self) -> int:
         return len(self._table)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._table
 
     def __repr__(self) -> str:
         return f"{self._what}s: {', '.join(self._table)}"
@@ -111,7 +112,10 @@ class Result:
         return [f"{photo}/{obj.name}" for photo, each in self._solved.objects.items() for obj in each.objects]
 
     def environment(self, name: str) -> Environment:
-        """The environment map of a photo's light, as exported (`docs/formats.md`); InputError for an unknown photo."""
+        """The environment map of a photo's light, as exported (`docs/formats.md`); InputError for an unknown photo.
+
+        In the light's own frame: the world's where the photo gives `world_from_camera`, and without the photo's exposure.
+        """
         light = self._solved.lights[self._photo(name)].illumination
         path = self.folder / "export" / "illumination" / f"{light}.exr"
         return Environment(read_rgb_exr(path).astype(float))
@@ -121,14 +125,15 @@ class Result:
     ) -> Picture:
         """The objects of a photo in its light, from another side: angles in degrees about the objects' middle."""
         scene = resized(self._solved.scene(self._photo(photo)), width)
-        return Picture(traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)))
+        return Picture(traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)), self._solved.tone(photo))
 
     def relight(self, name: str, light: str | Environment, width: int | None = None, samples: int = SAMPLES) -> Picture:
         """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`."""
         photo, one = self._object(name)
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
-        return Picture(traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples))
+        traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
+        return Picture(traced, self._solved.tone(light) if light in self.photos else as_it_is)
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
@@ -194,28 +199,12 @@ class Environment(msgspec.Struct, frozen=True):
         return _image(picture(self.lat_long))
 
 
-class Picture(msgspec.Struct, frozen=True):
-    """pixels: [h, w, 4], linear radiance times coverage, and coverage"""
-
-    pixels: Float[np.ndarray, "h w 4"]
-
-    def to_exr(self, path: str | Path) -> None:
-        """Write linear radiance and coverage."""
-        write_exr(path, {channel: self.pixels[..., k] for k, channel in enumerate("RGBA")})
-
-    def to_png(self, path: str | Path, exposure: float = 1.0) -> None:
-        """Write it as 8-bit sRGB, transparent beside the objects; exposure 1 is the photo's."""
-        write_bytes(path, png_bytes(self._shown(exposure)))
-
-    def _shown(self, exposure: float) -> np.ndarray:
-        alpha = np.clip(self.pixels[..., 3:], 0, 1)
-        colour = picture(self.pixels[..., :3] / np.where(alpha > 0, alpha, 1), exposure)
-        return np.concatenate([colour, np.rint(255 * alpha).astype(np.uint8)], axis=-1)
+class Picture(Traced, frozen=True):
+    """A path-traced picture that notebooks show, darker where it would be overexposed."""
 
     def _repr_html_(self) -> str:
-        inside = self.pixels[..., 3] > 0.5
-        return _image(self._shown(min(1.0, exposure_of(self.pixels[..., :3], inside))))
+        return _image(self.rgba(min(1.0, self.exposure)))
 
 
 def _image(pixels: np.ndarray) -> str:
-    return f'<img src="data:image/png;base64,{base64.b64encode(png_bytes(pixels)).decode()}">'
+    return f'<img src="{data_uri(pixels)}">'

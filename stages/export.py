@@ -24,10 +24,9 @@ from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.images.hdr import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.meshes.limits import NO_LIMITS
-from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.once import MeshesOnce
 from factorlib.meshes.ply import submesh, write_ply
-from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.meshes.read import CREASE_DEG
 from factorlib.results.exposures import read_exposures, write_exposures
 from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, read_materials, reflectances, write_materials
@@ -68,7 +67,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(2, 4, "meshes")
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
-        write_glb(out / f"{name}.glb", files.mesh(name, mesh, {}), names, materials)
+        write_glb(out / f"{name}.glb", files.read.mesh(name, mesh), names, materials)
     progress(3, 4, "scenes")
     poses, max_depth = read_poses(inputs["align"] / "poses.json"), ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, light in lights.items():
@@ -135,21 +134,13 @@ class MeshFiles:
     """Meshes read once and written once, split by material, per choice of materials for their parts."""
 
     def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
-        self.inputs, self.scenes, self.materials, self.crease_deg = inputs, scenes, materials, crease_deg
-        self._meshes: dict[tuple, Mesh] = {}
+        self.scenes, self.materials = scenes, materials
+        self.read = MeshesOnce(inputs.file, materials, crease_deg)
         self._stems: dict[tuple, str] = {}
-
-    def mesh(self, name: str, entry: MeshEntry, overrides: dict[str, str]) -> Mesh:
-        """The mesh `name` with `overrides` of its parts' materials, read when first asked for."""
-        key = (name, *sorted(overrides.items()))
-        if key not in self._meshes:
-            file = self.inputs.file(entry.file)
-            self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
-        return self._meshes[key]
 
     def shapes(self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]) -> list[Shape]:
         """One per material of the object."""
-        mesh, stem = self.mesh(obj.mesh, meshes[obj.mesh], obj.materials), self._written(obj, meshes)
+        mesh, stem = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), self._written(obj, meshes)
         place = np.eye(4)
         pose = poses[obj.name]
         place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
@@ -162,7 +153,7 @@ class MeshFiles:
         if key not in self._stems:
             number = 1 + sum(other[0] == obj.mesh for other in self._stems)
             stem = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
-            mesh = self.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
+            mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
             for label in mesh.labels:
                 write_ply(self.scenes / f"{stem}.{self.materials[label - 1]}.ply", submesh(mesh, label))
             self._stems[key] = stem

@@ -14,14 +14,15 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.images.animation import write_gif
-from factorlib.images.exr import write_exr, write_rgb_exr
-from factorlib.images.picture import exposure_of, picture, write_png
+from factorlib.images.exr import write_rgb_exr
+from factorlib.images.picture import picture, write_png
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file, recipe_of
-from factorlib.render.insertion import NEW, inserted, spot_at, spot_beside, stood
+from factorlib.render.insertion import NEW, STEPS, Backdrop, inserted, spot_at, spot_beside, stood
 from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
+from factorlib.render.traced import Traced
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_text
@@ -71,8 +72,8 @@ Report = Callable[[float], None]
 def resynthesis(recipe: schema.Resynthesis, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Path-traced objects over the photo's background."""
     report(0)
-    traced = traced_photo(results.scene(photo), recipe.samples)
-    _write(out / photo, _over(results.photo(photo), traced, results.tone(photo)))
+    traced = Traced(traced_photo(results.scene(photo), recipe.samples), results.tone(photo))
+    _write(out / photo, traced.over(results.photo(photo)))
 
 
 def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -80,37 +81,29 @@ def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path,
     report(0)
     known, scene = results.known(recipe.table), results.scene(photo)
     materials = {name: known[recipe.materials[name]] if name in recipe.materials else own for name, own in scene.materials.items()}
-    traced = traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples)
-    _write(out / photo, _over(results.photo(photo), traced, results.tone(photo)))
+    traced = Traced(traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples), results.tone(photo))
+    _write(out / photo, traced.over(results.photo(photo)))
 
 
 def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """A further object on the ground of one that is there."""
     scene = results.scene(photo)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    plane, diffuse = results.ground(photo, neighbour)
+    polish = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness) if any(recipe.ground.specular) else None
+    ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
     known = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's alone
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
-        spot = spot_at(scene, plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
+        spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
         tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
-        spot = spot_beside(scene, plane, neighbour, recipe.size, wide / tall)
+        spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
     new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
-    gloss = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness) if any(recipe.ground.specular) else None
-    found = inserted(
-        msgspec.structs.replace(scene, materials={**scene.materials, **known}),
-        new,
-        spot,
-        results.straightened(photo),
-        results.covered(photo),
-        recipe.samples,
-        diffuse=diffuse,
-        gloss=gloss,
-        report=lambda done, total: report(done / total),
-    )
-    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (gloss is None)
+    scene = msgspec.structs.replace(scene, materials={**scene.materials, **known})
+    backdrop = Backdrop(scene, results.straightened(photo), results.covered(photo))
+    found = inserted(backdrop, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
+    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
 
 
@@ -123,7 +116,7 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
     scene = resized(results.scene(photo), recipe.width)
     camera = orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom)
     traced = traced_photo(scene, recipe.samples, world_from_camera=camera, with_light=recipe.background == "light")
-    _write_alone(out / photo, traced, results.tone(photo))
+    _write_alone(out / photo, Traced(traced, results.tone(photo)))
 
 
 def turntable(recipe: schema.Turntable, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -132,8 +125,9 @@ def turntable(recipe: schema.Turntable, results: SolvedSet, photo: str, out: Pat
     for k in range(recipe.frames):
         report(k / recipe.frames)
         camera = orbit(scene, 360 * k / recipe.frames)
-        frames.append(traced_photo(scene, recipe.samples, world_from_camera=camera, with_light=recipe.background == "light"))
-    _write_animation(out, photo, frames, results.tone(photo), recipe.seconds)
+        traced = traced_photo(scene, recipe.samples, world_from_camera=camera, with_light=recipe.background == "light")
+        frames.append(Traced(traced, results.tone(photo)))
+    _write_animation(out, photo, frames, recipe.seconds)
 
 
 def moving_light(recipe: schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -142,8 +136,8 @@ def moving_light(recipe: schema.MovingLight, results: SolvedSet, photo: str, out
     for k in range(recipe.frames):
         report(k / recipe.frames)
         turned = msgspec.structs.replace(scene, light=turned_light(scene.light, 360 * k / recipe.frames))
-        frames.append(traced_photo(turned, recipe.samples))
-    _write_animation(out, photo, frames, results.tone(photo), recipe.seconds)
+        frames.append(Traced(traced_photo(turned, recipe.samples), results.tone(photo)))
+    _write_animation(out, photo, frames, recipe.seconds)
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -152,12 +146,10 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
         report(k / len(lights))
-        light = results.light(name)
-        lit = msgspec.structs.replace(scene, light=turned_light(light, recipe.rotate) if recipe.rotate else light)
+        lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
         traced = traced_photo(lit, recipe.samples, with_light=recipe.background == "light")
-        exposure = exposure_of(traced[..., :3], traced[..., 3] > 0.5) if is_light_file(name) else 1.0
-        tone = (lambda radiance: radiance) if is_light_file(name) else results.tone(name)
-        _write_alone(out / photo / Path(name).stem, traced * np.array([exposure] * 3 + [1.0]), tone)
+        shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
+        _write_alone(out / photo / Path(name).stem, shown)
 
 
 DRAWN = {
@@ -181,26 +173,13 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
             balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples))
-        column = np.concatenate(balls)
-        exposure = exposure_of(column[..., :3], column[..., 3] > 0.5)
-        columns.append(column * np.array([exposure] * 3 + [1.0]))
-    _write_alone(out / "grid", np.concatenate(columns, axis=1), lambda radiance: radiance)
+        columns.append(Traced(np.concatenate(balls)).exposed().pixels)
+    _write_alone(out / "grid", Traced(np.concatenate(columns, axis=1)))
     write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
     progress(total, total)
 
 
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _over(photo: np.ndarray, traced: np.ndarray, tone: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Traced objects over the photo."""
-    share = np.clip(traced[..., 3:], 0, 1)
-    return (1 - share) * photo + share * tone(_not_multiplied(traced))
-
-
-def _not_multiplied(traced: np.ndarray) -> np.ndarray:
-    """Radiance of what fills a pixel in part, as if it filled all of it."""
-    return traced[..., :3] / np.where(traced[..., 3:] > 0, traced[..., 3:], 1)
 
 
 def _write(stem: Path, radiance: np.ndarray) -> None:
@@ -210,22 +189,17 @@ def _write(stem: Path, radiance: np.ndarray) -> None:
     write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))
 
 
-def _write_alone(stem: Path, traced: np.ndarray, tone: Callable[[np.ndarray], np.ndarray]) -> None:
+def _write_alone(stem: Path, traced: Traced) -> None:
     """Objects without a background: transparent beside them."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    write_exr(stem.with_name(stem.name + ".exr"), {c: traced[..., k] for k, c in enumerate("RGBA")})
-    write_png(stem.with_name(stem.name + ".png"), _with_alpha(traced, tone))
+    traced.to_exr(stem.with_name(stem.name + ".exr"))
+    traced.to_png(stem.with_name(stem.name + ".png"))
 
 
-def _with_alpha(traced: np.ndarray, tone: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    alpha = np.rint(255 * np.clip(traced[..., 3:], 0, 1)).astype(np.uint8)
-    return np.concatenate([picture(tone(_not_multiplied(traced)), 1.0), alpha], axis=-1)
-
-
-def _write_animation(out: Path, photo: str, frames: list[np.ndarray], tone: Callable[[np.ndarray], np.ndarray], seconds: float) -> None:
-    """Every frame as a PNG, and all as a GIF on grey, which has no half-transparent pixels."""
+def _write_animation(out: Path, photo: str, frames: list[Traced], seconds: float) -> None:
+    """Every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
     (out / photo).mkdir(parents=True)
-    pixels = [_with_alpha(frame, tone) for frame in frames]
+    pixels = [frame.rgba() for frame in frames]
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
     write_gif(out / f"{photo}.gif", pixels, seconds)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import read_json
-from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, Grid, Insert, Relight, Transfer, is_light_file, is_mesh_file
+from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, Grid, Insert, OfPhotos, Relight, Transfer, is_light_file, is_mesh_file
+from factorlib.recipe.table import read_table
 from factorlib.yamlfile import load_yaml, read_yaml
 
 
@@ -22,30 +24,55 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     recipe = read_yaml(path, KINDS[kind])
     photos = [photo.name for photo in dataset.spec.photos]
     meshes = sorted({obj.mesh for photo in dataset.spec.photos for obj in photo.objects})
-    _check(recipe.photos, photos, "photo", path, "photos")
+    for name, file in files_of(recipe, path).items():
+        if not is_plain_file(file):
+            cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
+            raise InputError(f"there is no file {name!r}", file=path, cure=cure)
+    if isinstance(recipe, OfPhotos):
+        _check(recipe.photos, photos, "photo", path, "photos")
+        _check_once(recipe.photos, "photo", path, "photos")
     if isinstance(recipe, Relight | Grid):
         _check([name for name in recipe.lights if not is_light_file(name)], photos, "photo", path, "lights")
-        stems = [Path(name).stem for name in recipe.lights]
-        for name in stems:
-            if stems.count(name) > 1:
-                raise InputError(f"two lights are called {name!r}: one picture would replace the other", file=path, key="lights", cure="rename a file")
-    if isinstance(recipe, Grid):
-        _check(recipe.materials, dataset.spec.materials, "material", path, "materials")
-    if isinstance(recipe, Transfer):
+    if isinstance(recipe, Relight):
+        _check_once([Path(name).stem for name in recipe.lights], "light", path, "lights")
+        if not recipe.lights and len(photos) == 1:
+            raise InputError("there is no other photo whose light could be used", file=path, key="lights", cure="name a file (.hdr, .exr)")
+    if isinstance(recipe, Transfer | Grid):
         _check(recipe.materials, dataset.spec.materials, "material", path, "materials")
     if isinstance(recipe, Transfer | Insert):
-        _check(_materials_wanted(recipe), [*dataset.spec.materials, *_own(recipe.table, path)], "material", path, "materials")
-    if isinstance(recipe, Insert) and recipe.beside is not None:
-        for photo in recipe.photos or photos:
-            objects = [obj.name for obj in dataset.photo(photo).objects]
-            _check([recipe.beside], objects, f"object in photo '{photo}' called", path, "beside")
-    for name, file in files_of(recipe, path).items():
-        if not file.is_file():
-            cure = f"files are relative to the recipe; without a file there are: {', '.join([BALL, *meshes])}"
-            raise InputError(f"there is no file {name!r}", file=path, cure=cure)
-    if isinstance(recipe, Insert) and not is_mesh_file(recipe.mesh):
-        _check([recipe.mesh], [BALL, *meshes], "mesh", path, "mesh")
+        own = read_table(path.parent / recipe.table) if recipe.table is not None else {}
+        wanted = recipe.materials.values() if isinstance(recipe, Transfer) else [recipe.material] if recipe.material is not None else []
+        _check(wanted, [*dataset.spec.materials, *own], "material", path, "materials" if isinstance(recipe, Transfer) else "material")
+    if isinstance(recipe, Insert):
+        _check_insert(recipe, meshes, dataset, path)
     return recipe
+
+
+def _check_insert(recipe: Insert, meshes: list[str], dataset: Dataset, path: Path) -> None:
+    if not is_mesh_file(recipe.mesh):
+        _check([recipe.mesh], [BALL, *meshes], "mesh", path, "mesh")
+    elif Path(recipe.mesh).suffix.lower() not in MESHES:
+        raise InputError(f"{recipe.mesh!r} is no mesh that is read here", file=path, key="mesh", cure=f"one of {', '.join(MESHES)}")
+    if recipe.beside is not None:
+        for photo in recipe.photos or [photo.name for photo in dataset.spec.photos]:
+            objects = [obj.name for obj in dataset.photo(photo).objects]
+            if recipe.beside not in objects:
+                found = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {', '.join(objects) or 'none'}"
+                raise InputError(found, file=path, key="beside", cure="name the photos that have it: `photos: [...]`")
+
+
+def is_plain_file(path: Path) -> bool:
+    """Whether there is a file at a path; no path at all is none either."""
+    try:
+        return path.is_file()
+    except ValueError:  # a NUL
+        return False
+
+
+def _check_once(names: list[str], what: str, path: Path, key: str) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"the {what} {name!r} is named twice: one picture would replace the other", file=path, key=key, cure="name it once")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
@@ -53,22 +80,7 @@ def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
     named = [name for name in getattr(recipe, "lights", []) if is_light_file(name)]
     named += [name for name in [getattr(recipe, "table", None)] if name is not None]
     named += [name for name in [getattr(recipe, "mesh", "")] if is_mesh_file(name)]
-    return {name: (path.parent / name).resolve() for name in named}
-
-
-def _materials_wanted(recipe: Transfer | Insert) -> list[str]:
-    if isinstance(recipe, Transfer):
-        return list(recipe.materials.values())
-    return [] if recipe.material is None else [recipe.material]
-
-
-def _own(table: str | None, path: Path) -> list[str]:
-    """Names in a table of one's own; nothing for a file that is missing or no table, which is said elsewhere."""
-    if table is None or not (path.parent / table).is_file():
-        return []
-    content = read_json(path.parent / table)
-    materials = content.get("materials") if isinstance(content, dict) else None
-    return list(materials) if isinstance(materials, dict) else []
+    return {name: Path(os.path.abspath(path.parent / name)) for name in named}
 
 
 def _check(names: Iterable[str], known: list[str], what: str, path: Path, key: str) -> None:

@@ -14,33 +14,40 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from factorlib.recipe.table import Colour, Share
+
 Vec2 = tuple[float, float]
-Colour = tuple[Annotated[float, msgspec.Meta(ge=0, le=1)], Annotated[float, msgspec.Meta(ge=0, le=1)], Annotated[float, msgspec.Meta(ge=0, le=1)]]
 Samples = Annotated[int, msgspec.Meta(ge=1, le=65536)]
 Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Factor = Annotated[float, msgspec.Meta(gt=0, le=100)]
+Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 Backdrop = Literal["none", "light"]
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
     """What every kind has."""
 
-    photos: list[str] = []
-    """Photos whose camera, objects and light are used; all of them where none is named."""
     samples: Samples = 64
     """Samples per pixel of the path tracer: noise falls as their square root."""
 
 
-class Sized(Recipe, frozen=True, kw_only=True):
+class OfPhotos(Recipe, frozen=True, kw_only=True):
+    """Of kinds that make pictures of each photo."""
+
+    photos: list[str] = []
+    """Photos whose camera, objects and light are used; all of them where none is named."""
+
+
+class Sized(OfPhotos, frozen=True, kw_only=True):
     """Of kinds whose pictures need not be the photo's size."""
 
     width: Pixels | None = None
     """Width of the pictures; without it that of the photo as the pipeline works on it."""
 
 
-class Resynthesis(Recipe, frozen=True, kw_only=True, tag="resynthesis"):
+class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
     """The photo with its objects replaced by path-traced ones."""
 
 
@@ -48,10 +55,10 @@ class View(Sized, frozen=True, kw_only=True, tag="view"):
     """The objects from another side: the camera is moved about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
-    """Angle about the upright axis, to the right as the photo's camera sees it."""
+    """Angle about the camera's upright axis, to the right as the photo's camera sees it."""
     elevation: Annotated[float, msgspec.Meta(ge=-89, le=89)] = 0.0
     """Angle upward, added to the photo's own."""
-    zoom: Positive = 1.0
+    zoom: Factor = 1.0
     """Factor on the size in the picture."""
     background: Backdrop = "none"
     """What is seen beside the objects: nothing (transparent), or the light."""
@@ -62,18 +69,18 @@ class Turntable(Sized, frozen=True, kw_only=True, tag="turntable"):
 
     frames: Frames = 24
     """Pictures of the whole turn."""
-    seconds: Positive = 4.0
+    seconds: Seconds = 4.0
     """Of the whole turn."""
     background: Backdrop = "none"
     """What is seen beside the objects: nothing (transparent), or the light."""
 
 
 class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
-    """An animation in which the light turns once about the upright axis, so that highlights move."""
+    """An animation in which the light turns once about the camera's upright axis, so that highlights move."""
 
     frames: Frames = 24
     """Pictures of the whole turn."""
-    seconds: Positive = 4.0
+    seconds: Seconds = 4.0
     """Of the whole turn."""
 
 
@@ -83,30 +90,30 @@ class Relight(Sized, frozen=True, kw_only=True, tag="relight"):
     lights: list[str] = []
     """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); all other photos where none is named."""
     rotate: Degrees = 0.0
-    """Turn of those lights about the upright axis."""
+    """Turn of those lights about the camera's upright axis."""
     background: Backdrop = "none"
     """What is seen beside the objects: nothing (transparent), or the light."""
 
 
-class Transfer(Recipe, frozen=True, kw_only=True, tag="transfer"):
+class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
     """The photo with other materials on its objects."""
 
     materials: dict[str, str]
     """Material of the data set -> the one that takes its place: another of the data set, or one of `table`."""
     table: str | None = None
-    """File of materials of one's own, in the format of materials.json."""
+    """File of materials of one's own, like materials.json (`factorlib.recipe.table`)."""
 
 
-class Ground(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the ground answers light; where it lies is the photo's, or found from what stands on it."""
+class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a ground reflects beside its diffuse colour, which the photo shows."""
 
     specular: Colour = (0.0, 0.0, 0.0)
     """k_s of a ground that reflects, such as a polished floor."""
-    roughness: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.3
+    roughness: Share = 0.3
     """Of that reflection."""
 
 
-class Insert(Recipe, frozen=True, kw_only=True, tag="insert"):
+class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
     """A further object in the photo, standing beside one that is there, with its shadow."""
 
     mesh: str = "ball"
@@ -114,19 +121,19 @@ class Insert(Recipe, frozen=True, kw_only=True, tag="insert"):
     material: str | None = None
     """Material of the data set or of `table`; without it the mesh's own, and for a file or ball the data set's first."""
     table: str | None = None
-    """File of materials of one's own, in the format of materials.json."""
+    """File of materials of one's own, like materials.json (`factorlib.recipe.table`)."""
     beside: str | None = None
     """Object on whose ground it stands; without it the photo's first."""
     at: Vec2 | None = None
     """Pixel of the photo where it touches the ground; without it beside the object, where there is more room."""
-    size: Positive = 0.5
+    size: Factor = 0.5
     """Its height, in heights of that object."""
     turn: Degrees = 0.0
-    """Turn about the upright axis."""
+    """Turn about the ground's normal."""
     up: Literal["x", "y", "z"] = "y"
     """The axis of a mesh file that points upward."""
-    ground: Ground = Ground()
-    """How the ground answers light, beyond its colour, which the photo shows."""
+    ground: Polish = Polish()
+    """What the ground reflects beside its diffuse colour."""
 
 
 class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):

@@ -5,13 +5,14 @@ and the objects answer the change of light by
 
     s = L₁ / L₀     (1)
 
-which is exact for a Lambertian surface of any texture, where the difference L₁ − L₀ (Debevec, "Rendering synthetic objects into real
+which is exact for a Lambertian surface of any texture in the light of the scene, where the difference L₁ − L₀ (Debevec, "Rendering synthetic objects into real
 scenes", 1998) needs the texture's own albedo.  With the new object's own radiance L₁ − (1 − α) s L₀,
 
     composite = (1 − α) s B + max(L₁ − (1 − α) s L₀, 0)     (2)
 
 s under the object is that of the nearest pixel beside it.  L₀ and L₁ take the same random numbers, so s is exactly 1 where no path
-meets the object: those pixels stay as they were.  A ground that reflects adds what it shows of the object: the change of its specular part alone.
+meets the object: those pixels stay as they were.  A ground that reflects adds what it shows of the object, the change of its specular part
+alone; s then also scales what the photo shows of that part, so such a ground is right only where it is mostly diffuse.
 
 The ground is a disc about the object, its diffuse reflectance that which makes L₀ look as the photo.  Beyond it nothing is known of what
 the photo shows, and shadows fade out toward its rim.
@@ -24,17 +25,18 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
+from factorlib.export.mitsuba import ALL_BOUNCES
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
+from factorlib.render.photo_scene import PhotoScene, Placed, light_entry, shapes
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rgb, rigid, sensor, shape, transform
 
@@ -42,15 +44,38 @@ RADIUS, FADE = 8.0, 0.5  # of the disc, in sizes of the object; share of it from
 FIT_SAMPLES = 16
 GREY, DARKEST, BRIGHTEST = 0.3, 0.02, 0.85  # diffuse reflectance of the ground: where nothing tells it, and its bounds
 GAP = 0.15  # between the objects, in heights of the new one
-HAIR = 1e-4  # of a mesh's radius
-GROUND = "ground"
+HAIR = 1e-4  # of an object's size: how far apart surfaces are that must not meet
+GROUND, STEPS = "+ground", 5
 NEW = "+"  # what the new object and its materials are called: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
 
 
+class Backdrop(msgspec.Struct, frozen=True):
+    """What a new object is put into: a photo, and the scene that was solved of it.
+
+    photo:   linear radiance, its tone curve undone
+    covered: pixels that show something else than the ground
+    """
+
+    scene: PhotoScene
+    photo: Picture
+    covered: Bool[np.ndarray, "h w"]
+
+
+class Ground(msgspec.Struct, frozen=True):
+    """The plane that things stand on.
+
+    diffuse: its Lambertian reflectance, None where it is not known;  polish: the specular part of a ground that reflects
+    """
+
+    plane: Plane
+    diffuse: tuple[float, float, float] | None = None
+    polish: Reflectance | None = None
+
+
 class Spot(msgspec.Struct, frozen=True):
-    """Where a new object stands: in the world, on a plane."""
+    """Where a new object stands on the ground, in the world, and how high it is."""
 
     plane: Plane
     point: Float[np.ndarray, "3"]
@@ -104,14 +129,6 @@ def stood(name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarra
     return Placed(name, mesh, materials, matrix)
 
 
-def ball(segments: int = 48) -> Mesh:
-    """A sphere of radius 1 of one material."""
-    sphere = trimesh.creation.uv_sphere(radius=1.0, count=[segments, 2 * segments])
-    vertices = np.asarray(sphere.vertices, dtype=float)
-    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return Mesh(vertices, np.asarray(sphere.faces, np.int32), normals, np.ones(len(sphere.faces), np.int16))
-
-
 class Inserted(msgspec.Struct, frozen=True):
     """composite: (2), linear;  coverage: α;  shadow: s of (1);  ground: the diffuse reflectance that was found for it"""
 
@@ -122,69 +139,64 @@ class Inserted(msgspec.Struct, frozen=True):
 
 
 def inserted(
-    scene: PhotoScene,
-    new: Placed,
-    spot: Spot,
-    photo: Picture,
-    known: Bool[np.ndarray, "h w"],
-    samples: int,
-    *,
-    diffuse: tuple[float, float, float] | None = None,
-    gloss: Reflectance | None = None,
-    report: Callable[[int, int], None] = lambda done, total: None,
+    backdrop: Backdrop, new: Placed, spot: Spot, ground: Ground, samples: int, report: Callable[[int], None] = lambda done: None
 ) -> Inserted:
-    """The photo with the new object.
-
-    photo: linear radiance, its tone curve undone;  known: pixels that an object of the scene covers (they do not show the ground)
-    diffuse: of the ground, where it is known;  gloss: of a ground that reflects, its specular part
+    """The photo with the new object; report: how many of STEPS are done.
 
     Raises InputError where the new object is not seen.
     """
-    total = 4 + (2 if gloss else 0)
+    scene, photo = backdrop.scene, backdrop.photo
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    fixed = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
-    more = shapes([new], scene.materials)
-    disc = _disc_pixels(scene.camera, spot)
-    if diffuse is None:
-        diffuse = _ground_colour(fixed, camera, spot, photo, disc & ~known)
-    report(1, total)
-    ground = _ground(spot, Reflectance(tuple(diffuse), (0.0,) * 3, 1.0))
-    without = rendered({**fixed, **ground}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
-    report(2, total)
-    with_ = rendered({**fixed, **ground, **more}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
-    report(3, total)
+    there, more = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}, shapes([new], scene.materials)
+
+    def traced(entries: dict[str, Any], samples: int = samples) -> Picture:
+        """With the same random numbers each time."""
+        return rendered({**there, **entries}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
+
+    distance = _distance(scene.camera, spot)
+    near, shows_ground = _fading(distance)[..., None], (distance < 1) & ~backdrop.covered
     coverage = _coverage(scene, new, camera, samples)
     if not coverage.any():
         found = "the new object is not seen: it stands outside the picture, or something hides it"
         raise InputError(found, key="at", cure="say where it stands, `at: [x, y]`, or make it smaller")
-    report(4, total)
-    shadow = _shadow(without, with_, coverage, scene.camera, spot)
-    own = np.maximum(with_ - (1 - coverage[..., None]) * shadow * without, 0) * (coverage > 0)[..., None]
-    composite = (1 - coverage[..., None]) * shadow * photo + own
-    if gloss is not None:
-        polished = _ground(spot, gloss)
-        before, after = (rendered({**fixed, **polished, **m}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True) for m in ({}, more))
-        mirrored = (after - before) * ((disc & ~known) * (1 - coverage) * _fading(scene.camera, spot))[..., None]
-        composite = np.maximum(composite + mirrored, 0)
-        report(total, total)
+    report(1)
+    diffuse = ground.diffuse or _ground_colour(traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES), photo, shows_ground)
+    report(2)
+    disc = _disc(spot, _lambertian(diffuse))
+    without = traced(disc)
+    report(3)
+    with_ = traced({**disc, **more})
+    report(4)
+    beside = (1 - coverage)[..., None]
+    shadow = _shadow(without, with_, coverage, near)
+    own = np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
+    composite = beside * shadow * photo + own
+    if ground.polish is not None:
+        polished = _disc(spot, ground.polish)
+        mirrored = traced({**polished, **more}) - traced(polished)
+        composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * near, 0)
+    report(STEPS)
     return Inserted(composite, coverage, shadow, np.asarray(diffuse))
 
 
-def _ground_colour(fixed: dict[str, Any], camera: dict[str, Any], spot: Spot, photo: Picture, where: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
-    """The diffuse reflectance that makes the ground look as in the photo: the median over what shows it."""
-    lit = rendered({**fixed, **_ground(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0))}, camera, FIT_SAMPLES, 1, ALL_BOUNCES, hide_emitters=True)
-    usable = where & (lit.min(axis=-1) > 0)
+def _lambertian(diffuse: tuple[float, float, float]) -> Reflectance:
+    return Reflectance(diffuse, (0.0,) * 3, 1.0)
+
+
+def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
+    """The diffuse reflectance that makes the ground look as in the photo: the median over what shows it.  lit: the scene on GREY ground"""
+    usable = shows_ground & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3
     found = GREY * np.median(photo[usable] / lit[usable], axis=0)
     return tuple(float(c) for c in np.clip(found, DARKEST, BRIGHTEST))
 
 
-def _ground(spot: Spot, material: Reflectance) -> dict[str, Any]:
-    """A disc about the spot."""
+def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
+    """The ground about the spot."""
     frame = np.eye(4)
     frame[:3, :3] = RADIUS * spot.height * _rotation_between(np.array([0.0, 0.0, 1.0]), spot.plane.normal)
-    frame[:3, 3] = spot.point - 1e-4 * spot.height * spot.plane.normal
+    frame[:3, 3] = spot.point - HAIR * spot.height * spot.plane.normal
     return {GROUND: {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}}
 
 
@@ -205,7 +217,7 @@ def _emitter(new: Placed, label: int, side: int) -> Any:
     return shape(part, {"type": "diffuse", "reflectance": rgb(0.0)}, new.world_from_object, {"type": "area", "radiance": rgb(1.0)})
 
 
-def _shadow(without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], camera: Camera, spot: Spot) -> Picture:
+def _shadow(without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], near: Float[np.ndarray, "h w 1"]) -> Picture:
     """(1), that of the nearest pixel beside the object for those under it; 1 where nothing is lit, and toward the rim of the disc."""
     beside = coverage == 0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -213,19 +225,19 @@ def _shadow(without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"]
     if beside.any():
         row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
-    return 1 + (shadow - 1) * _fading(camera, spot)[..., None]
+    return 1 + (shadow - 1) * near
 
 
-def _fading(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w"]:
-    """1 near the spot, falling smoothly to 0 at the rim of the disc; 1 where the ground is not seen, as on the objects."""
+def _distance(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w"]:
+    """Of the point of the ground behind each pixel from the spot, in radii of the disc; infinite above the horizon."""
     distance = np.linalg.norm(_ground_points(camera, spot) - spot.point, axis=-1) / (RADIUS * spot.height)
-    t = np.clip((1 - np.nan_to_num(distance, nan=0.0)) / (1 - FADE), 0, 1)
+    return np.nan_to_num(distance, nan=np.inf)
+
+
+def _fading(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """1 near the spot, falling smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen."""
+    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
     return t * t * (3 - 2 * t)
-
-
-def _disc_pixels(camera: Camera, spot: Spot) -> Bool[np.ndarray, "h w"]:
-    distance = np.linalg.norm(_ground_points(camera, spot) - spot.point, axis=-1)
-    return np.nan_to_num(distance, nan=np.inf) < RADIUS * spot.height
 
 
 def _ground_points(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w 3"]:
@@ -239,10 +251,4 @@ def _pixel(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "
 
 def _rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest turn of one unit vector into another."""
-    axis, cosine = np.cross(first, second), float(first @ second)
-    if np.linalg.norm(axis) < 1e-9:
-        if cosine > 0:
-            return np.eye(3)
-        other = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
-        return rotation_of_vector(np.pi * other / np.linalg.norm(other))
-    return rotation_of_vector(np.arctan2(np.linalg.norm(axis), cosine) * axis / np.linalg.norm(axis))
+    return Rotation.align_vectors(second[None], first[None])[0].as_matrix()

@@ -2,7 +2,7 @@
 
 World    the y-up turn of the photo's camera: x right, y up, z toward the viewer, camera at the origin.
 Light    infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
-Upright  the camera's own y, unless another direction is given.
+Upright  the camera's own y.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
 from factorlib.light.lobes import Lobes
@@ -23,7 +24,7 @@ from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, envmap, lobes_envmap, rendered, rigid, sensor, shape
 
-ALL_BOUNCES, DIRECT = -1, 2
+UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # of the objects' distance
 MAP_ROWS = 1024  # of the lattice that Mitsuba is handed of a map
 
@@ -92,18 +93,17 @@ def shapes(objects: Sequence[Placed], materials: Mapping[str, Reflectance], blac
 def traced_photo(
     scene: PhotoScene,
     samples: int,
-    seed: int = 0,
     world_from_camera: Float[np.ndarray, "4 4"] | None = None,
     with_light: bool = False,
 ) -> Float[np.ndarray, "h w 4"]:
-    """Linear radiance, coverage multiplied in, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
+    """Linear radiance times coverage, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
 
     world_from_camera: of OpenCV's camera axes; without it the photo's own
     """
     own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
     entries = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
     view = sensor(scene.camera, own, near=scene.near, alpha=True)
-    picture = rendered(entries, view, samples, seed, scene.max_depth, hide_emitters=not with_light)
+    picture = rendered(entries, view, samples, 0, scene.max_depth, hide_emitters=not with_light)
     if with_light:
         picture[..., 3] = 1
     return picture
@@ -129,25 +129,23 @@ def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
     return msgspec.structs.replace(scene, camera=camera)
 
 
-def orbit(
-    scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0, up: Float[np.ndarray, "3"] | None = None
-) -> Float[np.ndarray, "4 4"]:
+def orbit(scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0) -> Float[np.ndarray, "4 4"]:
     """world_from_camera of the photo's camera moved about the objects' middle.
 
-    azimuth_deg: to the right;  elevation_deg: upward;  zoom: of the size in the picture, by distance;  up: (0, 1, 0) if not given
+    azimuth_deg: to the right;  elevation_deg: upward;  zoom: of the size in the picture, by distance
     """
-    up = np.array([0.0, 1.0, 0.0]) if up is None else up
     middle = scene.middle
-    right = np.cross(up, -middle)
+    right = np.cross(UP, -middle)
     right /= np.linalg.norm(right)
-    turn = rotation_of_vector(np.radians(azimuth_deg) * up) @ rotation_of_vector(-np.radians(elevation_deg) * right)
+    turn = rotation_of_vector(np.radians(azimuth_deg) * UP) @ rotation_of_vector(-np.radians(elevation_deg) * right)
     return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
 
 
-def turned_light(light: Light, angle_deg: float, up: Float[np.ndarray, "3"] | None = None) -> Light:
-    """The light turned about the upright axis of the world."""
-    up = np.array([0.0, 1.0, 0.0]) if up is None else up
-    turn = rotation_of_vector(np.radians(angle_deg) * up)
+def turned_light(light: Light, angle_deg: float) -> Light:
+    """The light turned about the upright axis of the world; as it is for 0."""
+    if angle_deg == 0:
+        return light  # a turned map is a little blurred
+    turn = rotation_of_vector(np.radians(angle_deg) * UP)
     if isinstance(light, Lobes):
         return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
     return turned_map(light, turn, finer=2)

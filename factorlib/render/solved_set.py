@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -12,23 +11,26 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
 from factorlib.errors import InputError
+from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
+from factorlib.generate.shapes import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
-from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.once import MeshesOnce
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file
+from factorlib.recipe.table import read_table
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import ball
+from factorlib.render.insertion import Ground
 from factorlib.render.photo_light import light_of
-from factorlib.render.photo_scene import ALL_BOUNCES, DIRECT, Light, PhotoScene, Placed, world_from_camera_frame
+from factorlib.render.photo_scene import Light, PhotoScene, Placed, world_from_camera_frame
+from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.stage import Inputs
 
 log = logging.getLogger("factorlib.render")
-MOST_REFLECTED = 0.999  # max k_d + max k_s of a material of one's own
 
 
 class SolvedSet:
@@ -38,7 +40,7 @@ class SolvedSet:
     """
 
     def __init__(self, inputs: Inputs, crease_deg: float = CREASE_DEG):
-        self.inputs, self.crease_deg = inputs, crease_deg
+        self.inputs = inputs
         self.names: list[str] = inputs.facts["dataset.materials"]
         self.objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
         self.lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
@@ -47,7 +49,8 @@ class SolvedSet:
         self.table: MaterialTable = read_materials(inputs["export"] / "materials.json")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
-        self._meshes: dict[tuple, Mesh] = {}
+        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg)
+        self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's objects, in their poses, in its light."""
@@ -59,15 +62,15 @@ class SolvedSet:
             if poses.objects[obj.name].left_out:
                 doubts = "; ".join(poses.objects[obj.name].doubts)
                 log.warning("%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s", photo, obj.name, doubts)
-        pixels = read_exr(self.inputs["masks"] / f"{photo}.exr")["label"]
-        camera = poses.camera.camera(pixels.shape[1], pixels.shape[0])
+        height, width = self._masks(photo)["label"].shape
+        camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
         return PhotoScene(camera, placed, self.light(photo), self.materials, depth)
 
     def photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Its linear radiance."""
-        channels = read_exr(self.inputs["masks"] / f"{photo}.exr")
+        channels = self._masks(photo)
         return np.nan_to_num(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float))
 
     def straightened(self, photo: str) -> Float[np.ndarray, "h w 3"]:
@@ -77,7 +80,7 @@ class SolvedSet:
 
     def pixel(self, photo: str, at: tuple[float, float]) -> tuple[float, float]:
         """A pixel of the photo in pixels of masks' picture; InputError where it is none of the photo's."""
-        height, width = self.photo(photo).shape[:2]
+        height, width = self._masks(photo)["label"].shape
         factor = self.poses[photo].camera.factor
         if not (0 <= at[0] <= factor * width and 0 <= at[1] <= factor * height):
             found = f"pixel {at} is not in photo '{photo}', of {factor * width} × {factor * height} pixels"
@@ -86,13 +89,13 @@ class SolvedSet:
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Pixels that are no background."""
-        channels = read_exr(self.inputs["masks"] / f"{photo}.exr")
+        channels = self._masks(photo)
         return (channels["label"] > 0) | (channels["left_out"] > 0)
 
-    def tone(self, photo: str) -> Callable[[np.ndarray], np.ndarray]:
+    def tone(self, photo: str) -> Tone:
         """What the photo shows of radiance."""
         tone = self.table.model.tone.get(photo)
-        return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else lambda radiance: radiance
+        return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
 
     def light(self, name: str) -> Light:
         """A photo's light in its camera's axes, or that of a file."""
@@ -104,44 +107,37 @@ class SolvedSet:
         """The solved materials, and those of a table of one's own, which go before."""
         if table is None:
             return self.materials
-        file = self.inputs.file(f"recipe file:{table}")
-        own = reflectances(read_materials(file))
-        for name, material in own.items():
-            if material.total > MOST_REFLECTED:
-                found = f"max diffuse + max specular = {material.total:.3f}: more light is reflected than arrives"
-                raise InputError(found, file=file, key=f"materials.{name}", cure=f"at most {MOST_REFLECTED}")
-        return {**self.materials, **own}
+        own = read_table(self.inputs.file(f"recipe file:{table}"))
+        return self.materials | {name: Reflectance(one.diffuse, one.specular, one.roughness) for name, one in own.items()}
 
-    def ground(self, photo: str, neighbour: Placed) -> tuple[Plane, tuple[float, float, float] | None]:
-        """Given with the photo, or what the neighbour rests on; its diffuse reflectance where it is given."""
+    def ground(self, photo: str, neighbour: Placed) -> Ground:
+        """Given with the photo, or what the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
-            return resting_plane(neighbour), None
+            return Ground(resting_plane(neighbour))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
-        return Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
+        return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
     def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo."""
         axis = np.eye(3)["xyz".index(up)]
         if name == BALL:
-            return ball(), (material or self.names[0],), axis
+            return sphere(1.0), (material or self.names[0],), axis
         if is_mesh_file(name):
             wanted = material or self.names[0]
-            return read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], None, wanted, {}, self.crease_deg, NO_LIMITS), (wanted,), axis
+            return read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], None, wanted, {}, self._meshes.crease_deg), (wanted,), axis
         photo, obj = next((photo, obj) for photo, o in self.objects.items() for obj in o.objects if obj.mesh == name)
         placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
-        upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed)[0].normal
+        upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
         return placed.mesh, tuple([material] * len(self.names)) if material else placed.materials, upright
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
         pose = poses.objects[obj.name]
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = np.array(pose.rotation), pose.translation
-        return Placed(obj.name, scaled(self._mesh(obj.mesh, entry, obj.materials), pose.scale), tuple(self.names), world_from_camera_frame(matrix))
+        return Placed(obj.name, scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale), tuple(self.names), world_from_camera_frame(matrix))
 
-    def _mesh(self, name: str, entry: MeshEntry, overrides: dict[str, str]) -> Mesh:
-        key = (name, *sorted(overrides.items()))
-        if key not in self._meshes:
-            file = self.inputs.file(entry.file)
-            self._meshes[key] = read_mesh(file, self.names, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
-        return self._meshes[key]
+    def _masks(self, photo: str) -> dict[str, np.ndarray]:
+        if photo not in self._pixels:
+            self._pixels = {photo: read_exr(self.inputs["masks"] / f"{photo}.exr")}  # one at a time: photos are large
+        return self._pixels[photo]

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Spot, ball, inserted, stood
+from factorlib.render.insertion import NEW, Backdrop, Ground, Spot, inserted, stood
 from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
@@ -28,7 +29,7 @@ def light() -> Lobes:
 def there() -> Placed:
     matrix = np.eye(4)
     matrix[:3, 3] = (0.9, 0, -6.5)
-    return Placed("there", ball(), ("grey",), matrix)
+    return Placed("there", sphere(1.0), ("grey",), matrix)
 
 
 def true_photo(objects, samples=1024):
@@ -44,15 +45,14 @@ def true_photo(objects, samples=1024):
 
 
 def new(material="red") -> Placed:
-    return stood("new", ball(), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
+    return stood("new", sphere(1.0), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
 
 
 @pytest.fixture(scope="module")
 def made():
-    scene = PhotoScene(CAMERA, (there(),), light(), MATERIALS)
     photo = true_photo([there()])
-    covered = np.zeros(photo.shape[:2], bool)
-    return scene, photo, covered, inserted(scene, new(), SPOT, photo, covered, 512)
+    backdrop = Backdrop(PhotoScene(CAMERA, (there(),), light(), MATERIALS), photo, np.zeros(photo.shape[:2], bool))
+    return backdrop, inserted(backdrop, new(), SPOT, Ground(GROUND), 512)
 
 
 def blocks(picture):
@@ -61,7 +61,8 @@ def blocks(picture):
 
 def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
     """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
-    _, photo, _, found = made
+    backdrop, found = made
+    photo = backdrop.photo
     truth = true_photo([there(), new()])
     error, change = np.abs(blocks(found.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
     assert error.mean() < 0.08 * change.mean()
@@ -69,32 +70,29 @@ def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
 
 
 def test_what_no_path_joins_to_the_object_stays_as_it_was(made):
-    _, photo, _, found = made
+    backdrop, found = made
+    photo = backdrop.photo
     sky = photo[0]
     assert np.array_equal(found.composite[0], sky) and (found.shadow[0] == 1).all()
 
 
 def test_the_ground_looks_as_in_the_photo(made):
     """The stripes' reflectances are .2 and .5."""
-    assert 0.2 < found_ground(made) < 0.5
-
-
-def found_ground(made):
-    return made[3].ground.mean()
+    assert 0.2 < made[1].ground.mean() < 0.5
 
 
 def test_twice_the_light_is_twice_the_picture(made):
-    scene, photo, covered, found = made
-    brighter = PhotoScene(CAMERA, scene.objects, scene.light.scaled(2.0), MATERIALS)
-    again = inserted(brighter, new(), SPOT, 2 * photo, covered, 512)
+    backdrop, found = made
+    brighter = PhotoScene(CAMERA, backdrop.scene.objects, backdrop.scene.light.scaled(2.0), MATERIALS)
+    again = inserted(Backdrop(brighter, 2 * backdrop.photo, backdrop.covered), new(), SPOT, Ground(GROUND), 512)
     assert np.allclose(again.composite, 2 * found.composite, rtol=1e-4, atol=1e-6)
 
 
 def test_a_polished_ground_shows_the_object_and_only_there(made):
-    scene, photo, covered, found = made
-    gloss = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
-    polished = inserted(scene, new(), SPOT, photo, covered, 256, gloss=gloss)
-    difference = np.abs(polished.composite - inserted(scene, new(), SPOT, photo, covered, 256).composite).max(axis=-1)
+    backdrop, found = made
+    polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
+    polished, matt = (inserted(backdrop, new(), SPOT, Ground(GROUND, polish=p), 256) for p in (polish, None))
+    difference = np.abs(polished.composite - matt.composite).max(axis=-1)
     rows, columns = np.nonzero(found.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
     assert below.max() > 0.05 and difference[0].max() == 0
@@ -109,9 +107,10 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
     for where in (-8.0, -4.0):
         matrix = 0.3 * np.eye(4)
         matrix[:, 3] = (-0.9 * -where / 6, -0.6 * -where / 6, where, 1)
-        before = Placed("new", ball(), ("grey",), matrix)
+        before = Placed("new", sphere(1.0), ("grey",), matrix)
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
         placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
-        seen.append(inserted(scene, placed, SPOT, photo, np.zeros(photo.shape[:2], bool), 16).coverage.sum())
+        backdrop = Backdrop(scene, photo, np.zeros(photo.shape[:2], bool))
+        seen.append(inserted(backdrop, placed, SPOT, Ground(GROUND), 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import ball, spot_at, spot_beside, stood
+from factorlib.render.insertion import spot_at, spot_beside, stood
 from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.results.materials import Reflectance
 
@@ -39,7 +40,7 @@ def box(width: float, height: float, depth: float) -> Mesh:
 
 @pytest.fixture
 def scene():
-    objects = (placed("left", box(1, 1.4, 0.6), (-0.6, 0, -6)), placed("right", ball(), (1.2, -0.2, -7)))
+    objects = (placed("left", box(1, 1.4, 0.6), (-0.6, 0, -6)), placed("right", sphere(1.0), (1.2, -0.2, -7)))
     return PhotoScene(CAMERA, objects, lobes(), MATERIALS)
 
 

@@ -1,0 +1,64 @@
+"""A path-traced picture: linear radiance times coverage, and coverage; its files and how it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from factorlib.images.exr import write_exr
+from factorlib.images.picture import exposure_of, picture, write_png
+
+Radiance = Float[np.ndarray, "h w 3"]
+Tone = Callable[[Radiance], Radiance]
+
+
+def as_it_is(radiance: Radiance) -> Radiance:
+    """The tone curve of a photo that has none."""
+    return radiance
+
+
+class Traced(msgspec.Struct, frozen=True):
+    """pixels: radiance (linear Rec. 709) times coverage, and coverage, the share of a pixel that is filled;  tone: what a photo would show"""
+
+    pixels: Float[np.ndarray, "h w 4"]
+    tone: Tone = as_it_is
+
+    @property
+    def coverage(self) -> Float[np.ndarray, "h w 1"]:
+        """In [0, 1]."""
+        return np.clip(self.pixels[..., 3:], 0, 1)
+
+    @property
+    def shown(self) -> Radiance:
+        """After the tone curve, of what fills a pixel in part as if it filled all of it."""
+        share = self.pixels[..., 3:]
+        return self.tone(self.pixels[..., :3] / np.where(share > 0, share, 1))
+
+    @property
+    def exposure(self) -> float:
+        """That shows what is covered well."""
+        return exposure_of(self.shown, self.pixels[..., 3] > 0.5)
+
+    def exposed(self) -> Traced:
+        """Times its own exposure, without a tone curve."""
+        return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
+
+    def over(self, photo: Radiance) -> Radiance:
+        """On top of a photo, as the photo would show it."""
+        return (1 - self.coverage) * photo + self.coverage * self.shown
+
+    def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:
+        """8-bit sRGB, transparent where nothing is covered."""
+        return np.concatenate([picture(self.shown, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
+
+    def to_exr(self, path: str | Path) -> None:
+        """Write linear radiance times coverage, and coverage as channel A."""
+        write_exr(path, {channel: self.pixels[..., k] for k, channel in enumerate("RGBA")})
+
+    def to_png(self, path: str | Path, exposure: float = 1.0) -> None:
+        """Write `rgba`; exposure 1 is the photo's."""
+        write_png(path, self.rgba(exposure))
