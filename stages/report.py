@@ -11,14 +11,18 @@ from pathlib import Path
 
 import msgspec
 
-from factorlib.dataset.schema import SetSlice
+from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
+from factorlib.report.appearance import exposures
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.overview import overview
 from factorlib.report.page import page
 from factorlib.report.photos import photo_row, strip
 from factorlib.report.tags import material_tags
+from factorlib.report.viewer import viewed
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
+
+SLICES = {"dataset.light": LightSlice, "dataset.objects": ObjectsSlice}
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,4 +41,5 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
     progress(len(rows), len(rows) + 1, "page")
     write_bytes(out / "figures" / "overview.png", overview(run, rows))
-    write_text(out / "index.html", page(run, rows, tags))
+    lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in SLICES.items())
+    write_text(out / "index.html", page(run, rows, tags, viewed(run, lights, objects, exposures(run))))

@@ -85,6 +85,14 @@ def write_scene(
     write_text(path, scene_xml(view, shapes, materials, light, max_depth))
 
 
+def material_xml(name: str, material: Reflectance) -> str:
+    """A material alone, as XML: a `bsdf` with the id `name`, to which a scene of one's own can refer."""
+    scene = ET.Element("scene")
+    _add_bsdf(scene, material, {"id": name})
+    ET.indent(scene, " ")
+    return ET.tostring(scene[0], encoding="unicode").strip()
+
+
 def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:
     sensor = ET.SubElement(scene, "sensor", type="perspective")
     (cx, cy), (w, h) = view.principal_point, (view.width, view.height)

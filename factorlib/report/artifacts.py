@@ -15,9 +15,11 @@ from jaxtyping import Float
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
+from factorlib.light.lobes import Lobes
 from factorlib.results.exposures import read_exposures
+from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Channels as Factors
-from factorlib.results.materials import MaterialTable, read_materials
+from factorlib.results.materials import MaterialTable, Solved, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -59,6 +61,15 @@ class Artifacts(msgspec.Struct, frozen=True):
     def solved(self) -> MaterialTable:
         """The materials, their gauge and model as solved; without materials where there is no solve."""
         return self._read(read_materials, "solve", "materials.json") or MaterialTable({})
+
+    def exported(self) -> dict[str, Solved]:
+        """The materials in the gauge of the exported lights."""
+        found = self._read(read_materials, "export", "materials.json")
+        return found.materials if found else {}
+
+    def lobes(self) -> dict[str, Lobes]:
+        """The exported lights, by illumination, each in its own frame."""
+        return self._read(read_lobes, "export", "lobes.parquet") or {}
 
     def exposures(self) -> dict[str, Factors]:
         """Factors of photos on their lights."""

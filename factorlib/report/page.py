@@ -12,6 +12,7 @@ import msgspec
 from factorlib.report import text
 from factorlib.report.appearance import balls, exposures, light_row, reflectance_maps
 from factorlib.report.artifacts import Artifacts
+from factorlib.report.choices import choices
 from factorlib.report.cost import cost_of
 from factorlib.report.errors import error_tables
 from factorlib.report.headlines import cautions, headlines
@@ -20,11 +21,13 @@ from factorlib.report.photos import AMPLIFICATION, PhotoRow
 from factorlib.report.plot import Series, line_plot
 from factorlib.report.poses import pose_rows
 from factorlib.report.training import training_of
+from factorlib.report.viewer import Viewed
 from factorlib.results.materials import Channels
 
 STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
 CONTENTS = {
     "summary": "Summary",
+    "relight": "Relight",
     "photos": "Photos",
     "materials": "Materials",
     "appearance": "Materials × lights",
@@ -38,14 +41,21 @@ CONTENTS = {
 }
 
 
-def page(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> str:
-    """The page as HTML, from the artifacts, the photos' rows and the materials' colours."""
+def page(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str], viewed: Viewed | None) -> str:
+    """The page as HTML, from the artifacts, the photos' rows, the materials' colours and what can be relit."""
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     environment.filters |= {name: getattr(text, name) for name in ("number", "significant", "percent", "duration")}
     folder = files("factorlib.report") / "templates"
     environment.loader = jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
+    environment.filters["in_script"] = _in_script
     environment.globals["grouped"] = _grouped
-    return environment.get_template("index.html").render(_context(run, rows, tags))
+    return environment.get_template("index.html").render(_context(run, rows, tags), viewed=viewed)
+
+
+def _in_script(value: msgspec.Struct) -> str:
+    """JSON that no `</script>` in a name can end."""
+    text = msgspec.json.encode(value).decode("utf-8")
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _grouped(head: list[str]) -> list[tuple[str, int]]:
@@ -75,6 +85,7 @@ def _context(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str]) -> dict
         "missing": _by_reason(metrics.reasons),
         "errors": error_tables(metrics, run.set.photos, run.set.materials),
         "gauge": _sorted(solved.gauge),
+        "choices": choices(solved.model),
         "model": _sorted(solved.model),
         "exposures": _shared_exposures(run),
         "plots": _plots(run.convergence()),

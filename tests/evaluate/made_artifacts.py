@@ -14,9 +14,13 @@ import pyarrow.parquet as pq
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, ball_normals, light_of_lat_long
+from factorlib.export.gltf import write_glb
+from factorlib.generate.shapes import sphere
 from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
+from factorlib.light.lobes import Lobes
+from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
 from factorlib.urm.extract import Taken, observations_of_photo
@@ -74,6 +78,9 @@ def make_artifacts(made: Made) -> Inputs:
     truth_files |= {f"truth/{p}_normal.exr": folders["truth"] / f"{p}_normal.exr" for p in made.seen}
     facts = {
         "dataset.materials": materials,
+        "dataset.objects": {
+            p: {"camera": {}, "objects": [{"name": "balls", "mesh": "ball"}], "meshes": {}} for p in made.seen
+        },
         "dataset.light": {p: {"illumination": p, "world_from_camera": None} for p in made.seen},
         "dataset.set": {"name": "made", "materials": materials, "photos": list(made.seen),
                         "meshes": {"ball": {"file": "ball.obj", "parts": None, "material": materials[0]}}},
@@ -154,7 +161,18 @@ def _export_and_render(made: Made, folders, photo, seen, light, light_values, fo
         write_exr(folders["render"] / "reflectance_maps" / photo / f"{name}.exr", {**channels, "observed": observed})
 
 
+def lobes_of(seed: int) -> Lobes:
+    """A broad light and two lamps, in a camera's frame."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=(3, 3)) - [0, 1, 1]
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.5, 60.0, 400.0]), rng.uniform(0.2, 1, (3, 3)) * [[0.5], [2], [8]])
+
+
 def _whole(made: Made, folders: dict, materials: list[str]) -> None:
+    write_lobes(folders["export"] / "lobes.parquet", {photo: lobes_of(k) for k, photo in enumerate(made.seen)})
+    shape = sphere(0.5)
+    halves = msgspec.structs.replace(shape, face_label=1 + (np.arange(len(shape.faces)) % len(materials)).astype(np.int16))
+    write_glb(folders["export"] / "ball.glb", halves, materials, {m: perturbed(TRUE[m], made.error) for m in materials})
     photos = {p: msgspec.json.decode((folders["masks"] / f"{p}.json").read_bytes()) for p in made.seen}
     write_json(folders["masks"] / "photos.json", photos)
     pose = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 4.0], "silhouette_iou": 0.98}

@@ -1,0 +1,490 @@
+// The relighting viewer: a mesh of Lambert + GGX materials in a light of spherical Gaussian lobes, without shadows.
+//
+// Frames: y-up, right-handed.  "ref" is the photo's camera turned y-up; the object stands in it, the light is turned in it,
+// and the eye moves about the object's middle.  Lengths are in radii of the object.
+//
+// Diffuse:  k_d / pi * E(n), the irradiance E read from a small cube map.
+// Specular: k_s * integral of L(i) D G1(i) G1(o) / (4 n.o) di, estimated at half vectors drawn from the visible normals
+//           (Heitz 2018; as spherical caps, Dupuy and Benyoub 2023), for which each sample counts L(i) G1(i).  A sample reads
+//           the light at the mip level whose texels are as large as the solid angle it stands for (Krivanek and Colbert 2008).
+// While something moves, one pass of QUICK samples is shown, of fewer pixels where frames are slow.  After that PASSES of them
+// are averaged, each a little displaced within its pixel, and the texels are those of all these samples together, so that what
+// is shown tends to the integral.
+"use strict";
+(() => {
+const QUICK = 4, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
+const LEAST_ALPHA = 1e-3, OWN = "";
+
+// ── Numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+const times = (a, b) => { // 3x3, row by row
+  const out = new Array(9);
+  for (let i = 0; i < 9; i++) out[i] = a[i - i % 3] * b[i % 3] + a[i - i % 3 + 1] * b[i % 3 + 3] + a[i - i % 3 + 2] * b[i % 3 + 6];
+  return out;
+};
+const transposed = (m) => [m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]];
+const about_y = (angle) => [Math.cos(angle), 0, Math.sin(angle), 0, 1, 0, -Math.sin(angle), 0, Math.cos(angle)];
+const unit = (v) => { const n = Math.hypot(...v); return v.map((x) => x / n); };
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+// The two dimensions of Sobol's sequence, of which any 2^m points from a multiple of 2^m on are spread evenly.
+const sobol = [(v) => v >>> 1, (v) => (v ^ (v >>> 1)) >>> 0].map((next) => (k) => {
+  let sum = 0;
+  for (let v = 2 ** 31; k > 0; k >>= 1, v = next(v)) if (k & 1) sum = (sum ^ v) >>> 0;
+  return sum / 2 ** 32;
+});
+
+// Direction of texel centre (s, t) in [-1, 1] of a face of a cube map, in OpenGL's layout.
+const face_direction = (face, s, t) => unit([[1, -t, -s], [-1, -t, s], [s, 1, t], [s, -1, -t], [s, -t, 1], [-s, -t, -1]][face]);
+
+function each_texel(size, visit) {
+  for (let face = 0, k = 0; face < 6; face++)
+    for (let row = 0; row < size; row++)
+      for (let column = 0; column < size; column++, k++) {
+        const s = (2 * column + 1) / size - 1, t = (2 * row + 1) / size - 1;
+        visit(k, face_direction(face, s, t), 4 / (size * size * Math.pow(1 + s * s + t * t, 1.5)));
+      }
+}
+
+// Sum of lobes w exp(-sharpness |d - axis|^2 / 2) in direction d, into out[3 k ...].
+function add_radiance(lobes, d, out, k) {
+  for (let j = 0; j < lobes.length; j += 7) {
+    const x = d[0] - lobes[j], y = d[1] - lobes[j + 1], z = d[2] - lobes[j + 2], e = 0.5 * lobes[j + 3] * (x * x + y * y + z * z);
+    if (e > 30) continue;
+    const g = Math.exp(-e);
+    out[3 * k] += g * lobes[j + 4]; out[3 * k + 1] += g * lobes[j + 5]; out[3 * k + 2] += g * lobes[j + 6];
+  }
+}
+
+// The light as texels of a cube map, and its irradiance over pi by normal; both over `unit`, so that half floats hold them.
+function drawn_light(light) {
+  const size = light.face, lobes = light.lobes, radiance = new Float32Array(18 * size * size);
+  const coarse = { size: Math.min(size, 32) }, block = size / coarse.size, n = coarse.size;
+  coarse.flux = new Float64Array(18 * n * n); coarse.direction = [];
+  let power = 0;
+  each_texel(size, (k, d, area) => {
+    add_radiance(lobes, d, radiance, k);
+    const face = Math.floor(k / (size * size)), row = Math.floor(k / size) % size, column = k % size;
+    const into = (face * n + Math.floor(row / block)) * n + Math.floor(column / block);
+    for (let c = 0; c < 3; c++) { coarse.flux[3 * into + c] += area * radiance[3 * k + c]; power += area * radiance[3 * k + c]; }
+  });
+  each_texel(n, (k, d) => coarse.direction.push(d));
+  const scale = power > 0 ? power / (12 * Math.PI) : 1, m = IRRADIANCE_FACE, irradiance = new Float32Array(18 * m * m);
+  each_texel(m, (k, normal) => {
+    for (let j = 0; j < coarse.direction.length; j++) {
+      const d = coarse.direction[j], cos = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2];
+      if (cos > 0) for (let c = 0; c < 3; c++) irradiance[3 * k + c] += cos * coarse.flux[3 * j + c] / Math.PI;
+    }
+  });
+  for (const values of [radiance, irradiance]) for (let k = 0; k < values.length; k++) values[k] = Math.min(values[k] / scale, 60000);
+  return { unit: scale, size, radiance, irradiance };
+}
+
+// Points of the unit square for a pass, as cos phi, sin phi, u: each pass is spread evenly, and all of them together are.
+function sample_points(pass) {
+  const out = new Float32Array(3 * PER_PASS), half = 0.5 / (PER_PASS * PASSES);
+  for (let j = 0; j < PER_PASS; j++) {
+    const [u, v] = sobol.map((of) => of(pass * PER_PASS + j) + half), phi = 2 * Math.PI * v;
+    out.set([Math.cos(phi), Math.sin(phi), u], 3 * j);
+  }
+  return out;
+}
+
+// ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+function unpacked(part) {
+  const vertices = new Uint16Array(bytes(part.vertices)), normals = new Int16Array(bytes(part.normals));
+  return { material: part.material, vertices: Float32Array.from(vertices, (v) => v / 32767.5 - 1),
+           normals: Float32Array.from(normals, (v) => v / 32767), triangles: new Uint32Array(bytes(part.triangles)) };
+}
+
+function ball_mesh(rows = 48, columns = 96) {
+  const vertices = [], triangles = [];
+  for (let i = 0; i <= rows; i++)
+    for (let j = 0; j <= columns; j++) {
+      const theta = Math.PI * i / rows, phi = 2 * Math.PI * j / columns;
+      vertices.push(Math.sin(theta) * Math.sin(phi), Math.cos(theta), Math.sin(theta) * Math.cos(phi));
+    }
+  for (let i = 0; i < rows; i++)
+    for (let j = 0; j < columns; j++) {
+      const a = i * (columns + 1) + j, b = a + columns + 1;
+      triangles.push(a, b, a + 1, a + 1, b, b + 1);
+    }
+  const position = new Float32Array(vertices);
+  return { name: "ball", photo: null, rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
+           parts: [{ material: null, vertices: position, normals: position, triangles: new Uint32Array(triangles) }] };
+}
+
+// ── Shaders ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+const MESH_VERTEX = `#version 300 es
+in vec3 position; in vec3 normal;
+uniform mat3 ref_from_object; uniform mat4 clip_from_ref;
+out vec3 at; out vec3 up;
+invariant gl_Position;
+void main() { at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
+const DEPTH = `#version 300 es
+precision highp float; out vec4 colour;
+void main() { colour = vec4(0.0); }`;
+const SHADE = `#version 300 es
+precision highp float; precision highp samplerCube;
+in vec3 at; in vec3 up; out vec4 colour;
+uniform samplerCube radiance, irradiance;
+uniform mat3 light_from_ref; uniform vec3 eye, k_d, k_s, gain;
+uniform float alpha, count, texel;      // of GGX; samples that will be averaged; solid angle of a texel of level 0
+uniform int each;                       // samples of this pass
+uniform vec3 samples[${PER_PASS}];       // cos phi, sin phi, u
+float smith(float c) { return 2.0 * c / (c + sqrt(alpha * alpha + (1.0 - alpha * alpha) * c * c)); }
+void main() {
+  vec3 n = normalize(up), o = normalize(eye - at);
+  float facing = dot(n, o);
+  if (facing < 0.0) { n = -n; facing = -facing; }    // the inside of an open mesh
+  vec3 sum = vec3(0.0);
+  if (max(k_s.r, max(k_s.g, k_s.b)) > 0.0) {
+    facing = max(facing, 1e-3);
+    vec3 t = o - n * dot(n, o); float across = length(t);
+    t = across > 1e-5 ? t / across : normalize(abs(n.y) < 0.9 ? cross(n, vec3(0.0, 1.0, 0.0)) : cross(n, vec3(1.0, 0.0, 0.0)));
+    vec3 b = cross(n, t), local = vec3(sqrt(1.0 - facing * facing), 0.0, facing), stretched = normalize(vec3(local.x * alpha, 0.0, local.z));
+    float seen = smith(facing), a2 = alpha * alpha;
+    mat3 light_from_local = light_from_ref * mat3(t, b, n);
+    for (int k = 0; k < each; k++) {
+      float z = (1.0 - samples[k].z) * (1.0 + stretched.z) - stretched.z, r = sqrt(max(0.0, 1.0 - z * z));
+      vec3 h = vec3(r * samples[k].x, r * samples[k].y, z) + stretched;
+      h = normalize(vec3(h.xy * alpha, max(h.z, 1e-6)));
+      vec3 i = 2.0 * dot(local, h) * h - local;
+      if (i.z <= 0.0) continue;
+      float slope = h.z * h.z * (a2 - 1.0) + 1.0, density = seen * a2 / (3.14159265 * slope * slope) / (4.0 * facing);
+      float level = 0.5 * log2(1.0 / (count * density * texel));
+      sum += smith(i.z) * textureLod(radiance, light_from_local * i, max(level, 0.0)).rgb;
+    }
+    sum *= k_s / float(each);
+  }
+  colour = vec4(gain * (sum + k_d * textureLod(irradiance, light_from_ref * n, 0.0).rgb), 1.0);
+}`;
+const SCREEN_VERTEX = `#version 300 es
+out vec2 uv;
+void main() { uv = vec2(gl_VertexID == 1 ? 2.0 : 0.0, gl_VertexID == 2 ? 2.0 : 0.0); gl_Position = vec4(2.0 * uv - 1.0, 1.0, 1.0); }`;
+const SKY = `#version 300 es
+precision highp float; precision highp samplerCube;
+in vec2 uv; out vec4 colour;
+uniform samplerCube radiance; uniform mat3 light_from_ref, ref_from_eye; uniform vec3 gain; uniform float field;
+void main() { colour = vec4(gain * textureLod(radiance, light_from_ref * ref_from_eye * vec3((2.0 * uv - 1.0) * field, -1.0), 0.0).rgb, 1.0); }`;
+const COPY = `#version 300 es
+precision highp float;
+in vec2 uv; out vec4 colour; uniform sampler2D picture;
+void main() { colour = texture(picture, uv); }`;
+const SHOW = `#version 300 es
+precision highp float;
+in vec2 uv; out vec4 colour;
+uniform sampler2D picture; uniform float exposure, passes;
+vec3 encoded(vec3 v) { return mix(12.92 * v, 1.055 * pow(max(v, 1e-6), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, v)); }
+void main() { vec4 mean = texture(picture, uv) / passes; // radiance times coverage, coverage
+  colour = vec4(encoded(clamp(exposure * mean.rgb / max(mean.a, 1e-6), 0.0, 1.0)) * mean.a, mean.a); }`;
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text); gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(made, shader);
+  }
+  gl.bindAttribLocation(made, 0, "position"); gl.bindAttribLocation(made, 1, "normal");
+  gl.linkProgram(made);
+  const places = {};
+  return { use: () => gl.useProgram(made), at: (name) => places[name] ??= gl.getUniformLocation(made, name) };
+}
+
+// The nearest level alone is read: in software a mixture of two costs twice as much, and the levels are small in the average.
+function cube(gl, format, size, values, mips) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_CUBE_MAP, texture);
+  const rgba = new Float32Array(4 * size * size);
+  for (let face = 0; face < 6; face++) {
+    for (let k = 0; k < size * size; k++) for (let c = 0; c < 3; c++) rgba[4 * k + c] = values[3 * (face * size * size + k) + c];
+    gl.texImage2D(gl.TEXTURE_CUBE_MAP_POSITIVE_X + face, 0, format, size, size, 0, gl.RGBA, gl.FLOAT, rgba);
+  }
+  if (mips) gl.generateMipmap(gl.TEXTURE_CUBE_MAP);
+  gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MIN_FILTER, mips ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  return texture;
+}
+
+// ── The renderer ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+class Renderer {
+  // Throws where the browser has no WebGL 2 or cannot draw into floating point numbers.
+  constructor(canvas, data) {
+    this.canvas = canvas; this.data = data;
+    const gl = this.gl = canvas.getContext("webgl2", { alpha: true, premultipliedAlpha: true, antialias: false });
+    if (!gl) throw new Error("this browser offers no WebGL 2");
+    const float = gl.getExtension("EXT_color_buffer_float"), blend = gl.getExtension("EXT_float_blend");
+    if (!float && !gl.getExtension("EXT_color_buffer_half_float")) throw new Error("this browser cannot draw into floating point numbers");
+    this.format = float && blend ? gl.RGBA32F : gl.RGBA16F;
+    this.texels = float && gl.getExtension("OES_texture_float_linear") ? gl.RGBA32F : gl.RGBA16F; // in software the larger are read faster
+    this.depth = program(gl, MESH_VERTEX, DEPTH); this.shade = program(gl, MESH_VERTEX, SHADE);
+    [this.sky, this.copy, this.show] = [SKY, COPY, SHOW].map((text) => program(gl, SCREEN_VERTEX, text));
+    this.meshes = [...data.meshes.map((mesh) => ({ ...mesh, parts: mesh.parts.map(unpacked) })), ball_mesh()];
+    this.lights = new Map(); this.buffers = new Map(); this.empty = gl.createVertexArray();
+  }
+
+  light(name) {
+    if (!this.lights.has(name)) {
+      const drawn = drawn_light(this.data.lights[name]);
+      this.lights.set(name, { unit: drawn.unit, size: drawn.size, radiance: cube(this.gl, this.texels, drawn.size, drawn.radiance, true),
+                              irradiance: cube(this.gl, this.texels, IRRADIANCE_FACE, drawn.irradiance, false) });
+    }
+    return this.lights.get(name);
+  }
+
+  parts(mesh) {
+    const gl = this.gl;
+    if (!this.buffers.has(mesh)) this.buffers.set(mesh, mesh.parts.map((part) => {
+      const array = gl.createVertexArray();
+      gl.bindVertexArray(array);
+      for (const [k, values] of [part.vertices, part.normals].entries()) {
+        gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+        gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, 3, gl.FLOAT, false, 0, 0);
+      }
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, part.triangles, gl.STATIC_DRAW);
+      return { array, count: part.triangles.length, material: part.material };
+    }));
+    return this.buffers.get(mesh);
+  }
+
+  // Two square pictures: one pass with its depths, and the sum of passes.
+  targets(size) {
+    const gl = this.gl;
+    if (this.made?.size === size) return this.made;
+    for (const old of this.made ? [this.made.one, this.made.sum] : []) { gl.deleteTexture(old.texture); gl.deleteFramebuffer(old.frame); }
+    if (this.made) gl.deleteRenderbuffer(this.made.depth);
+    const [one, sum] = [0, 1].map(() => {
+      const texture = gl.createTexture(), frame = gl.createFramebuffer();
+      gl.bindTexture(gl.TEXTURE_2D, texture); gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, size, size);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, frame); gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+      return { texture, frame };
+    });
+    const depth = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, depth); gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, size, size);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, one.frame); gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+    return this.made = { size, one, sum, depth };
+  }
+
+  // Draw one pass.  count: of samples that will be averaged;  state: of the Viewer
+  draw(state, size, pass, count) {
+    const gl = this.gl, target = this.targets(size), light = this.light(state.photo.light), view = this.camera(state, count > QUICK ? pass : null, size);
+    const light_from_ref = times(state.photo.rotation, about_y(-state.turn)), gain = state.photo.gain.map((g) => g * light.unit);
+    const parts = this.parts(state.mesh);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.one.frame); gl.viewport(0, 0, size, size);
+    gl.clearColor(0, 0, 0, 0); gl.clear(gl.DEPTH_BUFFER_BIT | gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST); gl.disable(gl.BLEND);
+    gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_CUBE_MAP, light.radiance);
+    gl.activeTexture(gl.TEXTURE1); gl.bindTexture(gl.TEXTURE_CUBE_MAP, light.irradiance);
+    const place = (shader) => {
+      shader.use();
+      gl.uniformMatrix3fv(shader.at("ref_from_object"), true, state.mesh.rotation);
+      gl.uniformMatrix4fv(shader.at("clip_from_ref"), true, view.clip_from_ref);
+    };
+    place(this.depth); gl.depthFunc(gl.LEQUAL);
+    for (const part of parts) { gl.bindVertexArray(part.array); gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0); }
+    place(this.shade); gl.depthFunc(gl.EQUAL); // only what is seen is shaded
+    const at = (name) => this.shade.at(name);
+    gl.uniform1i(at("radiance"), 0); gl.uniform1i(at("irradiance"), 1); gl.uniformMatrix3fv(at("light_from_ref"), true, light_from_ref);
+    gl.uniform3fv(at("eye"), view.eye); gl.uniform3fv(at("gain"), gain); gl.uniform3fv(at("samples"), sample_points(pass));
+    gl.uniform1f(at("count"), count); gl.uniform1i(at("each"), Math.min(count, PER_PASS)); gl.uniform1f(at("texel"), 4 * Math.PI / (6 * light.size * light.size));
+    for (const part of parts) {
+      const material = this.data.materials[state.material === OWN ? part.material : state.material];
+      gl.uniform3fv(at("k_d"), material.diffuse); gl.uniform3fv(at("k_s"), material.specular);
+      gl.uniform1f(at("alpha"), Math.max(material.roughness * material.roughness, LEAST_ALPHA));
+      gl.bindVertexArray(part.array); gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
+    }
+    if (!state.sky) return;
+    this.sky.use(); // where the depth is still that of the far plane
+    gl.uniform1i(this.sky.at("radiance"), 0); gl.uniformMatrix3fv(this.sky.at("light_from_ref"), true, light_from_ref);
+    gl.uniformMatrix3fv(this.sky.at("ref_from_eye"), true, view.ref_from_eye); gl.uniform3fv(this.sky.at("gain"), gain);
+    gl.uniform1f(this.sky.at("field"), Math.tan(HALF_FIELD) / state.zoom);
+    gl.bindVertexArray(this.empty); gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Draw a pass and add it to the sum, which pass 0 begins anew.
+  add(state, size, pass) {
+    const gl = this.gl;
+    this.draw(state, size, pass, PER_PASS * PASSES);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.made.sum.frame);
+    if (pass === 0) gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND); gl.blendFunc(gl.ONE, gl.ONE);
+    this.screen(this.copy, this.made.one.texture);
+    gl.disable(gl.BLEND);
+  }
+
+  screen(shader, texture) {
+    const gl = this.gl;
+    gl.disable(gl.DEPTH_TEST);
+    gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_2D, texture);
+    shader.use(); gl.uniform1i(shader.at("picture"), 0);
+    gl.bindVertexArray(this.empty); gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Show the sum of so many passes on the canvas, or without a number the pass that was drawn last.
+  present(state, passes) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null); gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    this.show.use();
+    gl.uniform1f(this.show.at("passes"), passes ?? 1); gl.uniform1f(this.show.at("exposure"), state.photo.exposure * Math.pow(2, state.stops));
+    this.screen(this.show, passes ? this.made.sum.texture : this.made.one.texture);
+  }
+
+  // Radiance times coverage, and coverage, of the finished picture: float32 RGBA, the lowest row first.
+  radiance(state, size) {
+    const gl = this.gl, pixels = new Float32Array(4 * size * size);
+    for (let pass = 0; pass < PASSES; pass++) this.add(state, size, pass);
+    gl.readPixels(0, 0, size, size, gl.RGBA, gl.FLOAT, pixels);
+    return pixels.map((value) => value / PASSES);
+  }
+
+  // The eye and its projections; a pass is displaced within its pixel, null is not.
+  camera(state, pass, size) {
+    const azimuth = Math.atan2(state.mesh.eye[0], state.mesh.eye[2]) + state.azimuth, most = 0.4999 * Math.PI;
+    const elevation = Math.max(-most, Math.min(most, Math.asin(state.mesh.eye[1]) + state.elevation));
+    const back = [Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation), Math.cos(azimuth) * Math.cos(elevation)];
+    const right = unit(cross([0, 1, 0], back)), up = cross(back, right), far = STANDING_BACK + 2, near = STANDING_BACK - 1.5;
+    const f = state.zoom / Math.tan(HALF_FIELD);
+    const [dx, dy] = pass === null ? [0, 0] : sobol.map((of) => 2 * (of(pass) + 0.5 / PASSES - 0.5) / size);
+    const clip_from_ref = [
+      ...right.map((r, k) => f * r - dx * back[k]), dx * STANDING_BACK, ...up.map((u, k) => f * u - dy * back[k]), dy * STANDING_BACK,
+      ...back.map((b) => -b * (far + near) / (far - near)), STANDING_BACK * (far + near) / (far - near) - 2 * far * near / (far - near),
+      ...back.map((b) => -b), STANDING_BACK];
+    return { clip_from_ref, eye: back.map((b) => STANDING_BACK * b), ref_from_eye: transposed([...right, ...up, ...back]) };
+  }
+}
+
+
+// ── The controls ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+class Viewer {
+  constructor(root, data) {
+    this.root = root; this.canvas = root.querySelector("canvas");
+    this.renderer = new Renderer(this.canvas, data); this.data = data;
+    const control = (name) => root.querySelector(`[data-control=${name}]`);
+    this.controls = Object.fromEntries(["object", "material", "light", "turn", "stops", "sky", "reset"].map((name) => [name, control(name)]));
+    const { object, material, light } = this.controls;
+    for (const mesh of data.meshes) object.add(new Option(mesh.name));
+    object.add(new Option("a ball"));
+    for (const name of Object.keys(data.materials)) material.add(new Option(name));
+    for (const photo of data.photos) light.add(new Option(photo.name));
+    for (const each of Object.values(this.controls)) each.addEventListener("input", () => this.changed());
+    this.controls.reset.addEventListener("click", () => this.reset());
+    Object.assign(this, { scale: 1, was_quick: false, seen: false });
+    this.listen();
+    this.reset();
+    new ResizeObserver(() => this.changed()).observe(this.canvas);
+    new IntersectionObserver((entries) => { this.seen = entries.at(-1).isIntersecting; this.changed(); }).observe(this.canvas);
+    document.addEventListener("visibilitychange", () => this.changed());
+  }
+
+  reset() {
+    Object.assign(this, { azimuth: 0, elevation: 0, zoom: 1 });
+    for (const name of ["turn", "stops"]) this.controls[name].value = 0;
+    this.changed();
+  }
+
+  // What is chosen: mesh, material, photo; azimuth, elevation, turn of the light (radians), zoom, stops of exposure, sky.
+  state() {
+    const { object, material, light, turn, stops, sky } = this.controls;
+    const mesh = this.renderer.meshes[object.selectedIndex], own = material.options[0];
+    own.disabled = mesh.parts[0].material === null; // a ball has no material of its own
+    if (own.disabled && material.value === OWN) material.selectedIndex = 1;
+    return { mesh, material: material.value, photo: this.data.photos[light.selectedIndex], azimuth: this.azimuth, elevation: this.elevation,
+             zoom: this.zoom, turn: turn.value * Math.PI / 180, stops: Number(stops.value), sky: sky.checked };
+  }
+
+  changed() {
+    this.pass = -1; // -1: one quick pass is due; then 0 ... PASSES - 1 are averaged
+    this.pending ??= requestAnimationFrame((now) => this.frame(now));
+  }
+
+  frame(now) {
+    this.pending = null;
+    if (document.hidden || !this.seen || this.canvas.clientWidth === 0) return; // nobody sees it
+    const state = this.state(), quick = this.pass < 0;
+    if (quick && this.was_quick) this.adapt(now - this.drawn_at);
+    Object.assign(this, { was_quick: quick, drawn_at: now });
+    const whole = this.canvas.clientWidth * Math.min(window.devicePixelRatio || 1, 2), size = Math.max(64, Math.round(whole * (quick ? this.scale : 1)));
+    if (quick || this.pass + 1 >= PASSES / 2) this.resize(size);
+    if (quick) { this.renderer.draw(state, size, 0, QUICK); this.renderer.present(state); this.tell(state); }
+    else {
+      this.renderer.add(state, size, this.pass);
+      if (this.pass + 1 >= PASSES / 2) this.renderer.present(state, this.pass + 1);
+    }
+    if (++this.pass < PASSES) this.pending = requestAnimationFrame((next) => this.frame(next));
+  }
+
+  // Half as many pixels each way while frames of a movement are slow, and back when they are fast.
+  adapt(milliseconds) {
+    if (milliseconds > SLOW_FRAME) this.scale = Math.max(0.25, this.scale / 2);
+    else if (milliseconds < SLOW_FRAME / 2) this.scale = Math.min(1, this.scale * 2);
+  }
+
+  resize(size) { if (this.canvas.width !== size) this.canvas.width = this.canvas.height = size; }
+
+  tell(state) {
+    const degrees = (angle) => `${Math.round(angle * 180 / Math.PI)}°`;
+    const what = state.material === OWN ? state.mesh.name : `${state.mesh.name} of ${state.material}`;
+    this.canvas.setAttribute("aria-label", `${what} in the light of ${state.photo.name}, seen from ${degrees(state.azimuth)} to the right and ` +
+      `${degrees(state.elevation)} above, the light turned by ${degrees(state.turn)}`);
+    for (const name of ["turn", "stops"]) {
+      const value = Number(this.controls[name].value);
+      this.root.querySelector(`[data-value=${name}]`).textContent = (value > 0 ? "+" : "") + value + (name === "turn" ? "°" : "");
+    }
+  }
+
+  orbit(right, upward) {
+    this.azimuth += right; this.elevation = Math.max(-1.5, Math.min(1.5, this.elevation + upward));
+    this.changed();
+  }
+
+  zoomed(factor) { this.zoom = Math.max(0.3, Math.min(8, this.zoom * factor)); this.changed(); }
+
+  listen() {
+    const canvas = this.canvas, step = Math.PI / 36;
+    const keys = { ArrowLeft: () => this.orbit(-step, 0), ArrowRight: () => this.orbit(step, 0), ArrowUp: () => this.orbit(0, step), ArrowDown: () => this.orbit(0, -step),
+                   "+": () => this.zoomed(1.1), "=": () => this.zoomed(1.1), "-": () => this.zoomed(1 / 1.1), Home: () => this.reset() };
+    canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+      event.preventDefault(); keys[event.key]();
+    });
+    canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); canvas.focus(); });
+    canvas.addEventListener("pointermove", (event) => {
+      if (canvas.hasPointerCapture(event.pointerId)) this.orbit(-event.movementX / canvas.clientWidth * Math.PI, event.movementY / canvas.clientWidth * Math.PI);
+    });
+    canvas.addEventListener("wheel", (event) => { // only after a click, so that the page scrolls past
+      if (document.activeElement !== canvas) return;
+      event.preventDefault(); this.zoomed(Math.exp(-event.deltaY / 500));
+    }, { passive: false });
+    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.pending = 0; }); // 0: no frame is asked for
+    canvas.addEventListener("webglcontextrestored", () => { this.renderer = new Renderer(canvas, this.data); this.pending = null; this.changed(); });
+  }
+
+  // Seconds a quick pass takes at a size, waiting for the last pixel: for measurements.
+  seconds(frames, size) {
+    const gl = this.renderer.gl, state = this.state(), pixel = new Float32Array(4), began = performance.now();
+    for (let k = 0; k < frames; k++) {
+      this.renderer.draw({ ...state, azimuth: state.azimuth + k / frames }, size, 0, QUICK); this.renderer.present(state);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.renderer.made.one.frame); gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, pixel);
+    }
+    return (performance.now() - began) / 1000 / frames;
+  }
+}
+
+const data = JSON.parse(document.getElementById("viewer-data").textContent);
+for (const light of Object.values(data.lights)) light.lobes = new Float32Array(bytes(light.lobes));
+const root = document.getElementById("viewer");
+try {
+  window.viewer = new Viewer(root, data);
+  root.hidden = false; document.getElementById("viewer-missing").hidden = true;
+  window.viewer.changed();
+} catch (error) {
+  document.getElementById("viewer-missing").textContent = `There is no relighting here: ${error.message}. The pictures below need nothing of the kind.`;
+}
+})();

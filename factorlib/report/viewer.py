@@ -1,0 +1,179 @@
+"""What the page's relighting viewer shades: meshes, reflectances and lights, as numbers that a browser reads.
+
+The viewer evaluates the same integral as the pipeline, Lambert + GGX without shadows, in the camera frame turned y-up
+(`YUP_FROM_CAMERA`).  Lights are lobes; the browser draws them into a cube map and integrates over that.  Its texels are
+interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import open3d as o3d
+import trimesh
+from jaxtyping import Float, Int
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.export.environment import sharpened
+from factorlib.light.lobes import Lobes
+from factorlib.report.artifacts import Artifacts
+from factorlib.results.materials import Reflectance
+
+MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
+FACES = (32, 64, 128, 256)  # texels across a face of the cube map
+FINE_ENOUGH = 0.7  # texel over the width 1/√λ of the sharpest lobe
+
+
+class Part(msgspec.Struct, frozen=True):
+    """The triangles of one material, base64 of little-endian numbers.
+
+    vertices: uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle;  normals: int16, times 32767;  triangles: uint32
+    """
+
+    material: str
+    vertices: str
+    normals: str
+    triangles: str
+
+
+class ViewedMesh(msgspec.Struct, frozen=True):
+    """A mesh, and how a photo shows it.
+
+    rotation: y-up camera from object, row by row;  eye: unit, from the object to that camera;  simplified_from: its triangles, where fewer are shown
+    """
+
+    name: str
+    photo: str | None
+    rotation: list[float]
+    eye: list[float]
+    parts: list[Part]
+    simplified_from: int | None = None
+
+
+class ViewedLight(msgspec.Struct, frozen=True):
+    """lobes: base64 float32, 7 a lobe: axis (y-up), sharpness, weight;  face: texels across a face of the cube map they are drawn into"""
+
+    face: int
+    lobes: str
+
+
+class ViewedPhoto(msgspec.Struct, frozen=True):
+    """A photo's light. rotation: y-up light from y-up camera, row by row;  gain: on the light, per channel;  exposure: shows the photo well"""
+
+    name: str
+    light: str
+    rotation: list[float]
+    gain: list[float]
+    exposure: float
+
+
+class Viewed(msgspec.Struct, frozen=True):
+    """All that can be chosen."""
+
+    meshes: list[ViewedMesh]
+    materials: dict[str, Reflectance]
+    lights: dict[str, ViewedLight]
+    photos: list[ViewedPhoto]
+
+
+def viewed(run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]) -> Viewed | None:
+    """lights, objects: slices of the photos;  exposure: by photo.  None where no light or no material was exported."""
+    lobes, table = run.lobes(), run.exported()
+    materials = {name: table[name].reflectance for name in run.set.materials if name in table}
+    if not lobes or not materials:
+        return None
+    photos = [_photo(run, name, lights[name], exposure[name]) for name in run.set.photos if lights[name].illumination in lobes]
+    return Viewed(_meshes(run, objects), materials, {name: _light(found) for name, found in lobes.items()}, photos)
+
+
+def _photo(run: Artifacts, name: str, light: LightSlice, exposure: float) -> ViewedPhoto:
+    world_from_camera = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera)
+    rotation = YUP_FROM_CAMERA @ world_from_camera @ YUP_FROM_CAMERA.T
+    return ViewedPhoto(name, light.illumination, rotation.ravel().tolist(), list(run.exposures().get(name, (1.0,) * 3)), exposure)
+
+
+def _light(lobes: Lobes) -> ViewedLight:
+    texel = FINE_ENOUGH / np.sqrt(lobes.sharpness.max(initial=1.0))
+    face = next((n for n in FACES if spacing_of(n) <= texel), FACES[-1])
+    found = sharpened(lobes, spacing_of(face)).turned(YUP_FROM_CAMERA)
+    table = np.column_stack([found.axis, found.sharpness, found.weight])
+    return ViewedLight(face, _base64(table.astype("<f4")))
+
+
+def spacing_of(face: int) -> float:
+    """Mean angle between texels of a cube map, radians.
+
+    >>> round(spacing_of(64), 4)
+    0.0226
+    """
+    return float(np.sqrt(4 * np.pi / (6 * face**2)))
+
+
+# ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _meshes(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[ViewedMesh]:
+    files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
+    parts = {name: _parts(file) for name, file in files.items()}
+    triangles = {name: sum(len(part.faces) for part in found.values()) for name, found in parts.items()}
+    share = min(1.0, MOST_TRIANGLES / max(1, sum(triangles.values())))
+    return [_mesh(run, name, found, share, objects) for name, found in parts.items()]
+
+
+def _parts(file: Path) -> dict[str, trimesh.Trimesh]:
+    """By material, as `export` names them; vertices and normals as they stand in the file."""
+    geometry = trimesh.load_scene(file, process=False).geometry
+    return {name: geometry[name] for name in sorted(geometry)}
+
+
+def _mesh(run: Artifacts, name: str, parts: Mapping[str, trimesh.Trimesh], share: float, objects: Mapping[str, ObjectsSlice]) -> ViewedMesh:
+    photo, rotation, translation, scale = _pose(run, name, objects)
+    vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
+    toward = -(YUP_FROM_CAMERA @ (rotation @ centre + translation))
+    length = np.linalg.norm(toward)
+    eye = toward / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    found, count = [], sum(len(part.faces) for part in parts.values())
+    for material, part in parts.items():
+        vertex, normal, faces = _simplified(part, share)
+        found.append(_packed(material, (vertex * scale - centre) / radius, normal / scale, faces))
+    turned = YUP_FROM_CAMERA @ rotation
+    return ViewedMesh(name, photo, turned.ravel().tolist(), eye.tolist(), found, count if share < 1 else None)
+
+
+def _pose(run: Artifacts, mesh: str, objects: Mapping[str, ObjectsSlice]) -> tuple:
+    """(photo, rotation, translation, scale) of the first photo that shows the mesh in a pose that is trusted."""
+    poses = run.poses()
+    for photo in run.set.photos:
+        for obj in objects[photo].objects:
+            entry = poses[photo].objects.get(obj.name) if photo in poses else None
+            if obj.mesh == mesh and entry is not None and not entry.left_out:
+                return photo, np.array(entry.rotation), np.array(entry.translation), np.broadcast_to(entry.scale, 3)
+    return None, YUP_FROM_CAMERA.T, np.zeros(3), np.ones(3)
+
+
+def _simplified(part: trimesh.Trimesh, share: float) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices, normals and triangles, of which at most that share is kept, by quadric error."""
+    if share == 1.0:
+        return part.vertices, part.vertex_normals, part.faces
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(part.vertices), o3d.utility.Vector3iVector(part.faces))
+    mesh = mesh.merge_close_vertices(1e-7 * float(np.ptp(part.vertices, axis=0).max()))
+    mesh = mesh.simplify_quadric_decimation(max(16, int(share * len(part.faces)))).compute_vertex_normals()
+    return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), np.asarray(mesh.triangles)
+
+
+def _packed(material: str, unit: Float[np.ndarray, "v 3"], normal: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Part:
+    """unit: positions within [−1, 1]"""
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    vertices = np.rint((np.clip(unit, -1, 1) + 1) * 32767.5).astype("<u2")
+    return Part(material, _base64(vertices), _base64(np.rint(32767 * normal).astype("<i2")), _base64(faces.astype("<u4")))
+
+
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -1,0 +1,276 @@
+"""The relighting viewer and the page's controls: what they are handed, and what a browser makes of it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+
+import msgspec
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import binary_erosion
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.export.gltf import write_glb
+from factorlib.generate.shapes import sphere
+from factorlib.images.picture import picture
+from factorlib.reflection import reflection_operator
+from factorlib.render.reflect import Reflector
+from factorlib.report import viewer
+from factorlib.report.artifacts import Artifacts
+from factorlib.report.forms import forms
+from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
+from tests.report.browser import needs_chromium, opened
+from tests.report.test_page import page_of, run
+
+SIZE = 64
+HALF_FIELD = np.radians(15)
+BACK = 1.04 / np.sin(HALF_FIELD)  # distance of the eye, in radii
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer")
+    inputs, html = run(folder, seen={"day": ["red", "white"], "noon": ["white", "brass"]})
+    return inputs, html, folder / "report" / "index.html"
+
+
+def artifacts(inputs) -> tuple[Artifacts, dict, dict]:
+    facts = inputs.facts
+    lights, objects = (msgspec.convert(facts[f"dataset.{n}"], dict[str, k]) for n, k in {"light": LightSlice, "objects": ObjectsSlice}.items())
+    return Artifacts(inputs.folders, msgspec.convert(facts["dataset.set"], Set), None), lights, objects
+
+
+class Set(msgspec.Struct):
+    name: str
+    materials: list[str]
+    meshes: dict
+    photos: list[str]
+
+
+# ── What is handed over ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def numbers(text: str, kind: str, columns: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind).reshape(-1, columns)
+
+
+def test_meshes_keep_their_shape_and_stand_as_in_the_photo(made):
+    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0}).meshes[0]
+    assert (found.name, found.photo, found.simplified_from) == ("ball", "day", None)
+    assert np.allclose(np.reshape(found.rotation, (3, 3)), YUP_FROM_CAMERA) and np.allclose(found.eye, [0, 0, 1])
+    assert sum(len(numbers(part.triangles, "<u4", 3)) for part in found.parts) == len(sphere().faces)
+    for part in found.parts:
+        vertices, normals = numbers(part.vertices, "<u2", 3) / 32767.5 - 1, numbers(part.normals, "<i2", 3) / 32767
+        assert np.allclose(np.linalg.norm(vertices, axis=1), 1, atol=2e-3)  # the corners of a sphere, about its middle
+        assert np.allclose(vertices, normals, atol=0.01)
+
+
+def test_lights_are_sharpened_by_what_the_cube_map_widens_them():
+    light = viewer._light(lobes_of(0))
+    lobes = numbers(light.lobes, "<f4", 7)
+    assert light.face == 64  # the sharpest lobe is 1/√400 = 2.9° wide, a texel 1.3°
+    assert np.allclose(1 / lobes[:, 3], 1 / lobes_of(0).sharpness - viewer.spacing_of(64) ** 2 / 6)
+
+
+def test_large_meshes_are_simplified_and_the_page_says_so(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer, "MOST_TRIANGLES", 2000)
+    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0}).meshes[0]
+    triangles = sum(len(numbers(part.triangles, "<u4", 3)) for part in found.parts)
+    assert found.simplified_from == len(sphere().faces) and triangles <= 2100
+    assert "is simplified for this page" in page_of(made[0], tmp_path / "simplified")
+
+
+def test_a_name_cannot_end_the_script(made, tmp_path):
+    evil = "</script><script>alert(1)</script>"
+    inputs = made[0]
+    text = (inputs["export"] / "materials.json").read_text()
+    (tmp_path / "export").mkdir()
+    for file in inputs["export"].iterdir():
+        if file.is_file():
+            (tmp_path / "export" / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "export" / "materials.json").write_text(text.replace('"red"', json.dumps(evil)))
+    solved = tmp_path / "solve"
+    solved.mkdir()
+    for file in inputs["solve"].iterdir():
+        (solved / file.name).write_bytes(file.read_bytes().replace(b'"red"', json.dumps(evil).encode()))
+    facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "materials": ["brass", evil, "white"]}}
+    names = ["brass", evil, "white"]
+    write_glb(tmp_path / "export" / "ball.glb", sphere(0.5), names, dict.fromkeys(names, TRUE["red"]))
+    renamed = msgspec.structs.replace(inputs, folders=inputs.folders | {"export": tmp_path / "export", "solve": solved}, facts=facts)
+    html = page_of(renamed, tmp_path / "report")
+    assert html.count("<script") == 3 and "alert(1)</" not in html
+    data = re.search(r'id="viewer-data">(.*?)</script>', html, re.DOTALL).group(1)
+    assert evil in json.loads(data)["materials"]
+
+
+def test_forms_hold_the_numbers():
+    material = TRUE["brass"]
+    found = forms("brass", material)
+    assert json.loads(found["numbers"])["brass"]["roughness"] == 0.25
+    assert json.loads(found["glTF"])["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
+    assert found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">') and "MeshPhysicalMaterial" in found["three.js"]
+
+
+# ── In a browser ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def browser(made):
+    """Not across processes: Playwright's loop lives in this one."""
+    with opened(made[2], viewport={"width": 1440, "height": 900}, permissions=["clipboard-read", "clipboard-write"]) as (page, complaints):
+        page.evaluate(f"viewer.canvas.style.width = '{SIZE}px'")  # software draws slowly
+        yield page, complaints
+
+
+def radiance(page, mesh: int, material: str, photo: str, view: dict) -> np.ndarray:
+    """[SIZE, SIZE, 4], the uppermost row first."""
+    chosen = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stops": 0, **view}
+    script = """([mesh, photo, chosen, size]) => {
+      const {renderer, data} = window.viewer;
+      return Array.from(renderer.radiance({...chosen, mesh: renderer.meshes.at(mesh), photo: data.photos.find((p) => p.name === photo)}, size));
+    }"""
+    found = page.evaluate(script, [mesh, photo, {**chosen, "material": material}, SIZE])
+    return np.array(found).reshape(SIZE, SIZE, 4)[::-1]
+
+
+def ball_seen(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals and views (y-up) of the pixels inside a unit ball's outline, and those pixels."""
+    back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    right = np.cross([0, 1, 0], back) / np.hypot(back[0], back[2])
+    x, y = np.meshgrid(*(((np.arange(SIZE) + 0.5) / SIZE * 2 - 1) * np.tan(HALF_FIELD) * sign for sign in (1, -1)))
+    ray = x[..., None] * right + y[..., None] * np.cross(back, right) - back
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    along = -BACK * ray @ back
+    under = along**2 - BACK**2 + 1
+    inside = binary_erosion(under > 0, iterations=2)
+    hit = BACK * back + (along - np.sqrt(np.maximum(under, 0)))[..., None] * ray
+    return hit[inside], -ray[inside], inside
+
+
+def expected(material: str, photo: int, normals: np.ndarray, views: np.ndarray, turn: float = 0.0) -> np.ndarray:
+    c, s = np.cos(turn), np.sin(turn)
+    light = lobes_of(photo).turned(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ YUP_FROM_CAMERA)
+    return Reflector(reflection_operator("network"), light, 0.0)(perturbed(TRUE[material], 1.0), normals, views)
+
+
+@needs_chromium
+@pytest.mark.parametrize("material, view", [("brass", {}), ("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})])
+def test_it_shows_what_the_pipeline_renders(browser, material, view):
+    """The glossiest material and the roughest; 2 % at the 95th percentile of pixels."""
+    normals, views, inside = ball_seen(view.get("azimuth", 0.0), view.get("elevation", 0.0))
+    found, want = radiance(browser[0], -1, material, "noon", view)[inside], expected(material, 1, normals, views, view.get("turn", 0.0))
+    error = np.abs(found[:, :3] - want).max(axis=1) / want.max(axis=1)
+    assert np.percentile(error, 95) < 0.02 and np.allclose(found[:, 3], 1, atol=1e-5)
+
+
+@needs_chromium
+def test_a_mesh_shows_its_parts_where_they_are(browser):
+    """The set's own ball is cut into three materials by turns: on the whole it is as bright as their mean."""
+    page = browser[0]
+    page.evaluate("viewer.controls.object.selectedIndex = 0")
+    script = """(material) => { const state = {...viewer.state(), material}; viewer.renderer.draw(state, 64, 0, 4);
+      const pixels = new Float32Array(4 * 64 * 64), gl = viewer.renderer.gl;
+      gl.readPixels(0, 0, 64, 64, gl.RGBA, gl.FLOAT, pixels); return pixels.reduce((a, b) => a + b); }"""
+    own, *each = (page.evaluate(script, m) for m in ("", "red", "white", "brass"))
+    assert own == pytest.approx(np.mean(each), rel=0.02)
+
+
+@needs_chromium
+def test_controls_work_by_mouse_and_keys(browser):
+    page, _ = browser
+    page.select_option("[data-control=object]", label="a ball")
+    page.select_option("[data-control=material]", label="brass")
+    page.select_option("[data-control=light]", label="noon")
+    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.startsWith('ball of brass in the light of noon')")
+    page.focus("#viewer canvas")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowUp")
+    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.includes('from 5° to the right and 5° above')")
+    box = page.locator("#viewer canvas").bounding_box()
+    page.mouse.move(box["x"] + 20, box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 30, box["y"] + 20, steps=3)
+    page.mouse.up()
+    page.wait_for_function("!document.querySelector('#viewer canvas').ariaLabel.includes('from 5°')")
+    page.fill("[data-control=turn]", "90")
+    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.endsWith('turned by 90°')")
+    page.click("[data-control=reset]")
+    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.endsWith('turned by 0°')")
+    assert "from 0° to the right" in page.get_attribute("#viewer canvas", "aria-label")
+
+
+@needs_chromium
+def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
+    page, _ = browser
+    page.click("[data-control=reset]")
+    page.evaluate("viewer.canvas.scrollIntoView()")
+    page.wait_for_function(f"viewer.canvas.width === {SIZE} && viewer.pass >= 128", timeout=120000)  # all passes
+    exposure = page.evaluate("viewer.state().photo.exposure")
+    box = page.locator("#viewer canvas").bounding_box()
+    clip = {"x": round(box["x"]), "y": round(box["y"]), "width": SIZE, "height": SIZE}
+    shot = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
+    normals, views, inside = ball_seen(0.0, 0.0)
+    want = picture(expected("brass", 1, normals, views), exposure).astype(float)
+    assert np.median(np.abs(np.asarray(shot).astype(float)[inside] - want)) < 3
+
+
+@needs_chromium
+def test_the_photo_is_laid_over_its_resynthesis_from_the_left(browser):
+    page, _ = browser
+    slider = page.locator(".panels input[type=range]").first
+    assert "day" in slider.get_attribute("aria-label")
+    slider.fill("40")
+    assert page.locator(".cut img + img").first.evaluate("(e) => e.style.clipPath") == "inset(0px 60% 0px 0px)"
+
+
+@needs_chromium
+def test_maps_are_exposed_anew(browser):
+    page, _ = browser
+    page.fill("#maps-stops", "-3")
+    page.wait_for_function("document.querySelectorAll('.map canvas').length === 2")
+
+    def mean() -> float:
+        page.wait_for_timeout(500)
+        return np.asarray(Image.open(io.BytesIO(page.locator(".map canvas").first.screenshot())).convert("RGB")).mean()
+
+    dark = mean()
+    page.fill("#maps-stops", "0")
+    assert mean() > dark + 5
+
+
+@needs_chromium
+def test_a_materials_numbers_are_copied(browser):
+    page, _ = browser
+    page.click('button[aria-label="copy brass as glTF"]')
+    page.wait_for_function("document.getElementById('copied').textContent === 'Copied brass as glTF.'")
+    assert json.loads(page.evaluate("navigator.clipboard.readText()"))["name"] == "brass"
+
+
+@needs_chromium
+def test_the_browser_has_nothing_to_complain_of(browser):
+    """Last: after everything above."""
+    assert browser[1] == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_needs_no_scrolling_sideways(made, scheme):
+    with opened(made[2], viewport={"width": 390, "height": 844}, color_scheme=scheme, has_touch=True, is_mobile=True) as (page, complaints):
+        page.evaluate("viewer.canvas.scrollIntoView()")
+        page.wait_for_function("viewer.pass > 0", timeout=120000)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert page.locator("#viewer canvas").bounding_box()["width"] > 300 and complaints == []
+
+
+@needs_chromium
+def test_without_webgl_it_says_so(made, tmp_path):
+    text = made[2].read_text()
+    (tmp_path / "index.html").write_text(text.replace('canvas.getContext("webgl2"', 'null && ("webgl2"'))
+    with opened(tmp_path / "index.html") as (page, complaints):
+        assert "this browser offers no WebGL 2" in page.inner_text("#viewer-missing")
+        assert not page.is_visible("#viewer") and complaints == []
