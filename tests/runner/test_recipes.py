@@ -60,7 +60,7 @@ def to_run(project, *recipes, targets=("shout",)):
 
 
 def make(project, *recipes, targets=("render",), **more):
-    return verbs.make(project, verbs.Wish("set", list(targets), recipes=list(recipes), **more))
+    return verbs.make(project, verbs.Wish("set", targets and list(targets), recipes=list(recipes), **more))
 
 
 def test_every_recipe_is_a_step_with_a_folder_of_its_own(project):
@@ -125,3 +125,21 @@ def test_clean_forgets_the_pictures_too(project):
 def test_plan_and_why_name_recipes(project, capsys):
     verbs.show_plan(project, verbs.Wish("set", ["render"], recipes=["all"]))
     assert "hello, bye" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("show", [verbs.show_plan, verbs.show_why, verbs.show_status])
+def test_looking_at_recipes_shows_what_they_need_and_no_more(project, capsys, show):
+    show(project, verbs.Wish("set", recipes=["hello"]))
+    shown = capsys.readouterr().out
+    assert "shout" in shown and "upper" in shown and "total" not in shown and "bye" not in shown
+    show(project, verbs.Wish("set"))  # without recipes: the whole pipeline
+    shown = capsys.readouterr().out
+    assert "total" in shown and "shout" not in shown
+
+
+def test_the_whole_pipeline_and_recipes_where_both_are_asked_for(project, capsys):
+    assert make(project, "hello", targets=None) == 0
+    assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
+    assert not (project.build / "set" / "shout" / "bye").exists()
+    named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has none of the results that are named otherwise
