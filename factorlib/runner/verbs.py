@@ -247,7 +247,10 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     if sheet:
         claim(project, seen.home, seen.data.folder)
         path = seen.home.folder / "sheet.png"
-        import_module("factorlib.sheet").write_sheet(seen.data.folder, path)  # by its name, as stages: it imports science
+        from factorlib.runner.screen import shown_if_long
+
+        with shown_if_long("sheet") as report:
+            import_module("factorlib.sheet").write_sheet(seen.data.folder, path, report)  # by its name, as stages: it imports science
         print(f"  contact sheet: {project.shown(path)}")
     return 0
 
