@@ -11,38 +11,12 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
-from factorlib.jsonfile import write_json
-from factorlib.stage import silent
-from stages import export
 from tests.export import made_export
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """As the runner leaves it: build/<dataset> with links to results, beside the data set."""
-    root = tmp_path_factory.mktemp("root")
-    build, dataset = root / "build" / "set", root / "data" / "set"
-    inputs = made_export.make(build)
-    (build / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, build / "export", silent)
-    dataset.mkdir(parents=True)
-    (build / "dataset.txt").write_text("data/set\n")
-    meshes = {}
-    for photo in made_export.MESHES:
-        meshes |= inputs.facts["dataset.objects"][photo]["meshes"]
-    for name, file in inputs.files.items():
-        (dataset / name).write_bytes(file.read_bytes())
-    photos = [
-        {"name": photo, "image": f"{photo}.png", "masks": f"{photo}_mask.png", "objects": [{"name": "chair", "mesh": mesh}]}
-        for photo, mesh in made_export.MESHES.items()
-    ]
-    photos[1] |= {"illumination": "room", "world_from_camera": made_export.WORLD_FROM_CAMERA["side"].tolist()}
-    for photo in photos:
-        for key in ("image", "masks"):
-            (dataset / photo[key]).write_bytes(b"")
-    meshes = {name: {k: v for k, v in mesh.items() if v is not None} for name, mesh in meshes.items()}
-    write_json(dataset / "dataset.yaml", {"format": 1, "materials": made_export.NAMES, "meshes": meshes, "photos": photos})
-    return build
+    return made_export.make_result(tmp_path_factory.mktemp("root"))
 
 
 @pytest.fixture(scope="module")
