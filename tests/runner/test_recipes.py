@@ -25,6 +25,7 @@ def main(params, inputs, out, progress):
     photos = sorted(path.stem for path in inputs["upper"].glob("*.txt"))
     (out / "said.txt").write_text(recipe["word"] + params.mark + more + "".join(photos))
 """
+LOOKED_AT = []
 OVER_RECIPES = '  shout: {inputs: [upper], over: recipe, optional: true, makes: ["said.txt"]}\n'
 
 
@@ -45,8 +46,15 @@ def project(tmp_path):
 
     def read(folder):
         data = toy.read(folder)
-        return type(data)(data.folder, data.photos, data.slice, recipe=reading)
 
+        def faults(files):
+            """A file with the word 'fault' has one; what was looked at is noted."""
+            LOOKED_AT.extend(files)
+            return [InputError("a fault", file=path) for path in files.values() if "fault" in path.read_text()]
+
+        return type(data)(data.folder, data.photos, data.slice, recipe=reading, recipe_faults=faults)
+
+    LOOKED_AT.clear()
     return Project(made.root, Provider(("photo",), read))
 
 
@@ -93,6 +101,20 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     assert to_run(project, "all") == ["shout/hello", "shout/bye"]
     seen = survey(project, "set", ["shout"], [], recipes=["all"])
     assert [p.reasons for p in seen.planned()[-2:]] == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
+
+
+def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_they_are_new(project, capsys):
+    more = project.root / "recipes" / "set" / "more.txt"
+    write(more, "a fault")
+    assert make(project, "all") == 1 and "a fault" in capsys.readouterr().err
+    assert not (project.build / "set").exists()
+    write(more, "…")
+    assert make(project, "all") == 0
+    LOOKED_AT.clear()
+    assert make(project, "all") == 0 and make(project, "all", settings=["shout.mark=x"]) == 0
+    assert said(project, "bye") == "byex…ab" and LOOKED_AT == []
+    write(more, "another fault")
+    assert make(project, "all") == 1 and LOOKED_AT == ["more.txt"]
 
 
 def test_a_path_is_a_recipe_as_well(project, monkeypatch):
