@@ -48,13 +48,14 @@ SAMPLES = 64
 
 
 def load_result(folder: str | Path) -> Result:
-    """The result in build/<dataset>, or in the folder of that name in ./build.
+    """The result in a folder such as build/eames, or called eames in build/; from the current folder, or else from one above it.
 
     Raises InputError where there is none, it is not whole, or its data set is no longer where it was or has other names in it.
     """
-    found = next((path for path in (Path(folder), Path("build") / folder) if os.path.isfile(path / MARK)), None)
+    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # those above too: a notebook runs in its own folder
+    found = next((path for place in places for path in (place / folder, place / "build" / folder) if os.path.isfile(path / MARK)), None)
     if found is None:
-        known = sorted(str(path.parent) for path in Path("build").glob(f"*/{MARK}"))
+        known = next(filter(None, (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)), None)
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
         raise InputError("there is no result here", file=folder, cure=cure)
     missing = [stage for stage in STAGES if not (found / stage).is_dir()]

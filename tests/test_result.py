@@ -57,16 +57,23 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
         assert words in str(error.value)
 
 
-def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, monkeypatch):
+def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder.parent.parent)
     assert factorlib.load_result("set").photos == factorlib.load_result("build/set").photos
     for name, words in [("build/sett", "did you mean 'build/set'"), ("data/set", "build/set"), ("build/set/export", "build/set")]:
         with pytest.raises(InputError, match="there is no result here") as error:
             factorlib.load_result(name)
         assert words in str(error.value)
-    monkeypatch.chdir(folder.parent)
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="make all DATASET=<name> makes one"):
         factorlib.load_result("nothing")
+
+
+def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
+    monkeypatch.chdir(folder.parent.parent / "data" / "set")
+    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(folder)
+    with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
+        factorlib.load_result("../../build/sets")
 
 
 @pytest.fixture
