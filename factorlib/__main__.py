@@ -97,9 +97,9 @@ def switched_on(key: str, option: bool) -> bool:
 
 
 @app.command("all")
-def all_(dataset: Dataset = None, settings: Settings = None, force: Force = False) -> None:
-    """Run the whole pipeline, as far as anything must run."""
-    raise typer.Exit(verbs.make(project(), wish(dataset, None, settings, None, force)))
+def all_(dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
+    """Run the whole pipeline, as far as anything must run, and make the pictures of recipes that are named."""
+    raise typer.Exit(verbs.make(project(), wish(dataset, None, settings, recipe, force)))
 
 
 @app.command()
@@ -114,7 +114,7 @@ def stage(name: str, dataset: Dataset = None, settings: Settings = None, force: 
 def plan(
     stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None
 ) -> None:
-    """What would run."""
+    """What would run; with a recipe and no stage, for its pictures alone."""
     raise typer.Exit(verbs.show_plan(project(), wish(dataset, stages, settings, recipe, force)))
 
 

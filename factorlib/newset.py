@@ -1,8 +1,11 @@
 """A dataset.yaml for photos of one's own: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
 
 The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels, `kitchen_oak.png` or
-`kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels `kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or label_1, label_2, … for labels.
-What no file says (which material a part of a mesh has, which mesh a photo shows) is left as `?`, which `make validate` refuses, and listed.
+`kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels `kitchen_chair1.png` is the silhouette of an
+object.  Materials are the names in those, or label_1, label_2, … for labels.
+
+What no file says (which material a part of a mesh has, which mesh a photo shows) is left as `?`, which `make validate` refuses, and
+listed; so is what must be renamed.
 """
 
 from __future__ import annotations
@@ -15,7 +18,8 @@ from tempfile import TemporaryDirectory
 import msgspec
 import numpy as np
 
-from factorlib.dataset.check import IMAGES, LONGEST_NAME, MESHES
+from factorlib.dataset.check import IMAGES, LONGEST_NAME, MESHES, RESERVED_PHOTOS
+from factorlib.dataset.schema import LEFT_OUT, MAX_MATERIALS
 from factorlib.errors import InputError
 from factorlib.labels.coco import Category
 from factorlib.labels.png import read_values
@@ -23,11 +27,15 @@ from factorlib.meshes.read import read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import write_text
 
-LEFT_OUT, MOST_LABELS, UNKNOWN = 255, 254, "?"
+UNKNOWN = "?"
 
 
 class Found(msgspec.Struct):
-    """masks: by photo, a path or {material: path};  silhouettes: by photo, {object: path};  parts: by mesh;  missing: what is left to do, in words"""
+    """What the files say.
+
+    masks: by photo, a path or {material: path};  silhouettes: by photo, {object: path};  parts: by mesh
+    missing: what is left to do, in words
+    """
 
     photos: dict[str, Path]
     masks: dict[str, str | dict[str, str]]
@@ -70,10 +78,12 @@ def look(photos: Path, masks: Path | None, meshes: Path | None) -> Found:
     if meshes is not None:
         _look_at_meshes(meshes, found)
     found.missing += [f"photo {name}: no mask called {name}.png or {name}_<material>.png" for name in pictures if name not in found.masks]
+    taken = [name for name in pictures if name in RESERVED_PHOTOS]
+    found.missing += [f"photo {name}: write another `name`: a file of the results is called {name}" for name in taken]
     if not found.meshes:
         found.missing.append("there is no mesh: give MESHES=<folder>; rough ones will do")
     if not found.materials:
-        found.missing.append("no mask names a material")
+        found.missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
     return found
 
 
@@ -83,8 +93,13 @@ def _look_at_masks(folder: Path, found: Found) -> None:
     names: dict[str, None] = {}
     if coco:
         found.masks = dict.fromkeys(found.photos, f"masks/{coco[0].relative_to(folder)}")
-        names = dict.fromkeys(category.name for category in _categories(coco[0]))
-        found.missing += [f"masks/{path.name}: a second COCO file is not used" for path in coco[1:]]
+        for category in _categories(coco[0]):
+            names[name := _word(category.name)] = None
+            if name != category.name:
+                file = coco[0].relative_to(folder)
+                letters = "names are made of A-Z a-z 0-9 _ and -"
+                found.missing.append(f"masks/{file}: rename its category {category.name!r} to {name!r}: {letters}")
+        found.missing += [f"masks/{path.relative_to(folder)}: a second COCO file is not used" for path in coco[1:]]
     labels = 0
     for photo in found.photos if not coco else ():
         whole = [path for path in files if path.parent == folder and _name(path) == photo]
@@ -92,7 +107,10 @@ def _look_at_masks(folder: Path, found: Found) -> None:
         each = {name: path for path in mine if (name := _material(path, photo, folder))}
         if whole:
             values = np.unique(read_values(whole[0], photo))
-            labels = max([labels, *(int(value) for value in values if value <= MOST_LABELS)])
+            labels = max([labels, *(int(value) for value in values if value <= MAX_MATERIALS)])
+            if set(values.tolist()) <= {0, LEFT_OUT}:
+                cure = f"the mask of one material is called {photo}_<material>.png"
+                found.missing.append(f"photo {photo}: {whole[0].name} has no label, for {LEFT_OUT} means left out; {cure}")
             found.masks[photo] = f"masks/{whole[0].relative_to(folder)}"
             found.silhouettes[photo] = _written(each, folder)
         elif each:
@@ -134,8 +152,16 @@ def _look_at_meshes(folder: Path, found: Found) -> None:
 
 
 def objects_of(photo: str, found: Found) -> list[str]:
-    """The meshes that a photo shows: the only one there is, or those whose names are in the photo's."""
-    return list(found.meshes) if len(found.meshes) == 1 else [name for name in found.meshes if name in photo]
+    """The meshes that a photo shows: the only one there is, or those whose names are whole words of the photo's."""
+    return list(found.meshes) if len(found.meshes) == 1 else [name for name in found.meshes if _is_word_of(name, photo)]
+
+
+def _is_word_of(name: str, text: str) -> bool:
+    """
+    >>> _is_word_of("chair", "red_chair-2"), _is_word_of("chair", "armchair_2")
+    (True, False)
+    """
+    return re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", text) is not None
 
 
 def _files(folder: Path, suffixes: tuple[str, ...], key: str, deep: bool = False) -> list[Path]:
@@ -148,7 +174,8 @@ def _by_name(files: list[Path], key: str) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in files:
         if (name := _name(path)) in found:
-            raise InputError(f"{path.name} and {found[name].name} would both be called {name!r}", file=path, key=key, cure="rename one of them")
+            words = f"{path.name} and {found[name].name} would both be called {name!r}"
+            raise InputError(words, file=path, key=key, cure="rename one of them")
         found[name] = path
     return found
 
@@ -159,7 +186,15 @@ def _name(path: Path) -> str:
     >>> _name(Path("IMG 0412 (1).jpeg"))
     'IMG_0412_1'
     """
-    return re.sub(r"[^A-Za-z0-9-]+", "_", path.stem).strip("_")[:LONGEST_NAME] or "unnamed"
+    return _word(path.stem)
+
+
+def _word(text: str) -> str:
+    """
+    >>> _word("red shell")
+    'red_shell'
+    """
+    return re.sub(r"[^A-Za-z0-9-]+", "_", text).strip("_")[:LONGEST_NAME] or "unnamed"
 
 
 def _copied(source: Path, target: Path, files: object) -> None:
@@ -172,7 +207,8 @@ def _copied(source: Path, target: Path, files: object) -> None:
 def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
     """dataset.yaml with remarks for whoever edits it."""
     lines = ["# What the files say; `?` is for you to write.  Every key: docs/dataset.md", "format: 1"]
-    lines += [f"materials: [{', '.join(map(_quoted, found.materials))}]    # label k of a mask is the k-th, from 1", "meshes:" if found.meshes else "meshes: {}"]
+    lines.append(f"materials: [{', '.join(map(_quoted, found.materials))}]    # label k of a mask is the k-th, from 1")
+    lines.append("meshes:" if found.meshes else "meshes: {}")
     for name, path in found.meshes.items():
         lines += [f"  {name}:", f"    file: {_quoted(f'meshes/{path.relative_to(meshes)}')}"]
         if len(found.materials) == 1:
@@ -189,10 +225,12 @@ def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
         else:
             lines += ["    masks:", *(f"      {_quoted(material)}: {_quoted(file)}" for material, file in masks.items())]
         objects = objects_of(name, found) or ([UNKNOWN] if found.meshes else [])
-        lines.append("    objects:    # of each: the mesh; another material for a part by `materials: {part: material}`" if objects else "    objects: []")
+        remark = "    # of each: the mesh; another material for a part by `materials: {part: material}`"
+        lines.append(f"    objects:{remark}" if objects else "    objects: []")
         silhouettes = found.silhouettes.get(name, {}) if objects else {}
         for each, mask in silhouettes.items():
-            lines += [f"      - name: {_quoted(each)}", f"        mesh: {_quoted(objects[0] if len(objects) == 1 else UNKNOWN)}", f"        mask: {_quoted(mask)}"]
+            mesh = objects[0] if len(objects) == 1 else UNKNOWN
+            lines += [f"      - name: {_quoted(each)}", f"        mesh: {_quoted(mesh)}", f"        mask: {_quoted(mask)}"]
         for mesh in objects if not silhouettes else ():
             lines += [f"      - name: {_quoted(mesh)}", f"        mesh: {_quoted(mesh)}"]
     return "\n".join(lines) + "\n"
@@ -204,5 +242,6 @@ def _quoted(word: str) -> str:
     >>> _quoted("red"), _quoted("yes"), _quoted("?"), _quoted("1.5")
     ('red', '"yes"', '"?"', '"1.5"')
     """
-    plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", word) and word.lower() not in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
+    special = word.lower() in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
+    plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", word) and not special
     return word if plain else msgspec.json.encode(word).decode()

@@ -2,9 +2,9 @@
 
     r = factorlib.load_result("build/eames")
     r.materials["red"].roughness, r.materials["red"].stderr.roughness
-    r.environment("kitchen").rotated(90).to_exr("kitchen.exr")
+    r.environment("kitchen").rotate(90).to_exr("kitchen.exr")
     r.relight("yellow_chair", "garden")            # a picture, shown by a notebook
-    r.render("terrace", azimuth=40).to_png("terrace.png")
+    r.render(view="terrace", azimuth=40).to_png("terrace.png")
 
 Names that are not there are refused with those that are.  Pictures are path-traced, as those of recipes.
 """
@@ -12,6 +12,7 @@ Names that are not there are refused with those that are.  Pictures are path-tra
 from __future__ import annotations
 
 import html
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -20,7 +21,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.dataset.read import read_dataset
+from factorlib.dataset.read import FILE, read_dataset
+from factorlib.dataset.schema import Dataset
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
@@ -29,6 +31,7 @@ from factorlib.images.hdr import write_hdr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.light.latlong import turned_map
+from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
 from factorlib.render.solved_set import SolvedSet
@@ -36,6 +39,7 @@ from factorlib.render.traced import Traced, as_it_is
 from factorlib.report.png import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs
+from factorlib.yamlfile import convert
 
 T = TypeVar("T")
 STAGES, SLICES = ("masks", "align", "export"), ("materials", "objects", "light", "ground")
@@ -44,29 +48,54 @@ SAMPLES = 64
 
 
 def load_result(folder: str | Path) -> Result:
-    """The result in build/<dataset>, or in the folder of that name in ./build.
+    """The result in a folder such as build/eames, or called eames in build/; from the current folder, or else from one above it.
 
-    Raises InputError where there is none, or its data set is no longer where it was.
+    Raises InputError where there is none, it is not whole, or its data set is no longer where it was or has other names in it.
     """
-    found = next((path for path in (Path(folder), Path("build") / folder) if (path / MARK).is_file()), None)
+    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # those above too: a notebook runs in its own folder
+    found = next((path for place in places for path in (place / folder, place / "build" / folder) if os.path.isfile(path / MARK)), None)
     if found is None:
-        known = sorted(str(path.parent) for path in Path("build").glob(f"*/{MARK}"))
+        known = next(filter(None, (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)), None)
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
         raise InputError("there is no result here", file=folder, cure=cure)
     missing = [stage for stage in STAGES if not (found / stage).is_dir()]
     if missing:
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=f"make export DATASET={found.name}")
     dataset = read_dataset(_dataset_of(found))
+    solved = SolvedSet(_inputs(found, dataset))
+    _check_names(dataset, solved, found)
+    return Result(found, solved)
+
+
+def _inputs(found: Path, dataset: Dataset) -> Inputs:
+    """What the stage `recipes` is handed."""
     slices = {name: dataset_slice(dataset, name) for name in SLICES}
     files = {file: dataset.folder / file for each in slices.values() for file in each.files}
     folders = {stage: (found / stage).resolve() for stage in STAGES}
-    return Result(found, SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files)))
+    return Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files)
 
 
 def _dataset_of(folder: Path) -> Path:
-    """dataset.txt is relative to the checkout, whose build/ the folder lies in, where the data set lies in it."""
+    """dataset.txt is relative to the checkout that the folder lies in, where the data set lies in it."""
     words = (folder / MARK).read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
-    return folder.resolve().parent.parent / words
+    for parent in folder.resolve().parents:
+        if os.path.isfile(parent / words / FILE):
+            return parent / words
+    cure = "put it back; or run it again from where it is: make all DATASET=<its folder>"
+    raise InputError(f"its data set {words!r} is not there any more", file=folder / MARK, cure=cure)
+
+
+def _check_names(dataset: Dataset, solved: SolvedSet, folder: Path) -> None:
+    """InputError where dataset.yaml names a material, photo or object that was not there when the result was made."""
+    missing = [f"material {name!r}" for name in solved.names if name not in solved.table.materials]
+    for photo, each in solved.objects.items():
+        if photo not in solved.poses:
+            missing.append(f"photo {photo!r}")
+        else:
+            missing += [f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in solved.poses[photo].objects]
+    if missing:
+        found = f"the result is of an earlier {FILE}: it has no {', no '.join(missing)}"
+        raise InputError(found, file=folder, cure=f"make all DATASET={dataset.folder.name}")
 
 
 class UnknownName(InputError, KeyError):
@@ -80,8 +109,8 @@ class Named(Mapping[str, T]):
         self._what, self._table = what, table
 
     def __getitem__(self, name: str) -> T:
-        if name not in self._table:
-            raise UnknownName(f"there is no {self._what} {name!r}", cure=did_you_mean(name, self._table))
+        if not isinstance(name, str) or name not in self._table:
+            raise UnknownName(f"there is no {self._what} {name!r}", cure=did_you_mean(str(name), self._table))
         return self._table[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -121,19 +150,31 @@ class Result:
         return Environment(read_rgb_exr(path).astype(float))
 
     def render(
-        self, photo: str, azimuth: float = 0.0, elevation: float = 0.0, zoom: float = 1.0, width: int | None = None, samples: int = SAMPLES
+        self, view: str, azimuth: float = 0.0, elevation: float = 0.0, zoom: float = 1.0, width: int | None = None, samples: int = SAMPLES
     ) -> Picture:
-        """The objects of a photo in its light, from another side: angles in degrees about the objects' middle."""
-        scene = resized(self._solved.scene(self._photo(photo)), width)
+        """The objects of a photo, in its light, as its camera sees them or from another side.
+
+        view: the photo's name;  azimuth (to the right), elevation (up): degrees by which the camera is moved about the objects' middle
+        zoom: factor on their size;  width: of the picture, in pixels; the photo's where None;  samples: per pixel
+        Raises InputError for an unknown photo and for numbers out of range.
+        """
+        photo = self._photo(view)
+        _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
+        scene = resized(self._solved.scene(photo), width)
         return Picture(traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)), self._solved.tone(photo))
 
-    def relight(self, name: str, light: str | Environment, width: int | None = None, samples: int = SAMPLES) -> Picture:
-        """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`."""
+    def relight(self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES) -> Picture:
+        """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`.
+
+        Raises InputError for an unknown object or photo, a file that is no light map, and numbers out of range.
+        """
         photo, one = self._object(name)
+        light = str(light) if isinstance(light, Path) else light
+        _check(schema.Relight, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        return Picture(traced, self._solved.tone(light) if light in self.photos else as_it_is)
+        return Picture(traced, self._solved.tone(light) if isinstance(light, str) and light in self.photos else as_it_is)
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
@@ -150,7 +191,7 @@ class Result:
     def _light(self, light: str | Environment) -> Light:
         if isinstance(light, Environment):
             return light.lat_long
-        if is_light_file(light):
+        if isinstance(light, str) and is_light_file(light):
             return read_light_map(Path(light))
         return self._solved.light(self._photo(light))
 
@@ -161,6 +202,12 @@ class Result:
         rows = "".join(_row(name, material) for name, material in self.materials.items())
         head = "".join(f"<th>{word}</th>" for word in ("material", "diffuse", "specular", "roughness"))
         return f"<p>{html.escape(str(self.folder))}: photos {html.escape(', '.join(self.photos))}</p><table><tr>{head}</tr>{rows}</table>"
+
+
+def _check(kind: type, **numbers: float | None) -> None:
+    """Of arguments, by the bounds of the recipes that have the same: InputError for one out of range."""
+    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in numbers.items()}
+    convert(plain, kind, kind.__name__.lower())
 
 
 def _row(name: str, material: Solved) -> str:
@@ -183,7 +230,7 @@ class Environment(msgspec.Struct, frozen=True):
 
     lat_long: Float[np.ndarray, "h w 3"]
 
-    def rotated(self, degrees: float) -> Environment:
+    def rotate(self, degrees: float) -> Environment:
         """Turned about the upright axis: what was toward the viewer goes to the right (+x) at 90°."""
         return Environment(turned_map(self.lat_long, rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))))
 

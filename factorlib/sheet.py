@@ -35,14 +35,16 @@ Pixels = UInt8[np.ndarray, "h w 3"]
 
 
 def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
-    """The sheet of the dataset in `folder` as a PNG; report: photos done, and in all."""
+    """The sheet of the dataset in `folder` as a PNG; report: how many pieces are done of how many, two a photo."""
     dataset = read_dataset(folder)
-    photos = dataset.spec.photos
-    pictures = [_photo(dataset, photo) for photo in photos]
+    photos, pictures = dataset.spec.photos, []
+    for done, photo in enumerate(photos):
+        report(done, 2 * len(photos))
+        pictures.append(_photo(dataset, photo))
     colours = _colours(dataset.spec.materials, pictures)
     rows = [_legend(dataset.spec.materials, colours)]
     for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
-        report(done, len(photos))
+        report(len(photos) + done, 2 * len(photos))
         named = [(photo.name, image), ("labels", _coloured(image, labels, colours))]
         named += [(obj.name, drawn(_mesh(dataset, obj), colours)) for obj in photo.objects]
         rows.append(_beside([_titled(title, pixels) for title, pixels in named]))

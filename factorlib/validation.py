@@ -1,4 +1,4 @@
-"""What can be seen of a dataset's files before anything runs: photos against their masks, meshes against their parts.
+"""What can be seen of files before anything runs: photos against their masks, meshes against their parts, what recipes name.
 
 These are the checks that the stages make of what they read first, by the same functions; of photos only headers are read.
 The runner loads this module by its name, as it loads stages: it knows no science, and a run with nothing to do must not
@@ -12,15 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import open_photo
 from factorlib.labels import read_labels, read_objects
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.parts import part_labels
 from factorlib.meshes.read import read_parts
+from factorlib.recipe.schema import is_light_file
 from factorlib.yamlfile import convert
 
 Check = Callable[[], object]
@@ -46,6 +49,19 @@ class Validation:
             self._done.add(what)
             try:
                 check()
+            except InputError as error:
+                found.append(error)
+        return found
+
+    def recipe_faults(self, files: dict[str, Path]) -> list[InputError]:
+        """What is wrong with the lights and meshes that a recipe names: files by how it writes them; tables were read with it."""
+        found = []
+        for path in files.values():
+            try:
+                if is_light_file(path.name):
+                    read_light_map(path)
+                elif path.suffix.lower() in MESHES:
+                    read_parts(path)
             except InputError as error:
                 found.append(error)
         return found

@@ -1,5 +1,6 @@
 """`factorlib.load_result`: what was solved, in Python."""
 
+import shutil
 import subprocess
 import sys
 
@@ -11,38 +12,12 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
-from factorlib.jsonfile import write_json
-from factorlib.stage import silent
-from stages import export
 from tests.export import made_export
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """As the runner leaves it: build/<dataset> with links to results, beside the data set."""
-    root = tmp_path_factory.mktemp("root")
-    build, dataset = root / "build" / "set", root / "data" / "set"
-    inputs = made_export.make(build)
-    (build / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, build / "export", silent)
-    dataset.mkdir(parents=True)
-    (build / "dataset.txt").write_text("data/set\n")
-    meshes = {}
-    for photo in made_export.MESHES:
-        meshes |= inputs.facts["dataset.objects"][photo]["meshes"]
-    for name, file in inputs.files.items():
-        (dataset / name).write_bytes(file.read_bytes())
-    photos = [
-        {"name": photo, "image": f"{photo}.png", "masks": f"{photo}_mask.png", "objects": [{"name": "chair", "mesh": mesh}]}
-        for photo, mesh in made_export.MESHES.items()
-    ]
-    photos[1] |= {"illumination": "room", "world_from_camera": made_export.WORLD_FROM_CAMERA["side"].tolist()}
-    for photo in photos:
-        for key in ("image", "masks"):
-            (dataset / photo[key]).write_bytes(b"")
-    meshes = {name: {k: v for k, v in mesh.items() if v is not None} for name, mesh in meshes.items()}
-    write_json(dataset / "dataset.yaml", {"format": 1, "materials": made_export.NAMES, "meshes": meshes, "photos": photos})
-    return build
+    return made_export.make_result(tmp_path_factory.mktemp("root"))
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +37,77 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
         (lambda: result.environment("frnt"), "did you mean 'front'"),
         (lambda: result.relight("chiar", "front"), "did you mean 'chair'"),
         (lambda: result.relight("chair", "sde"), "did you mean 'side'"),
+        (lambda: result.relight("chair", None), "known are: 'front', 'side'"),
+        (lambda: result.relight("chair", tmp_path / "none.hdr"), "none.hdr"),
+        (lambda: result.relight(3, "side"), "known are: 'chair', 'front/chair', 'side/chair'"),
         (lambda: result.render("nothing"), "known are: 'front', 'side'"),
+        (lambda: result.render(view=None), "known are: 'front', 'side'"),
+        (lambda: result.scene("sid"), "did you mean 'side'"),
+        (lambda: result.materials[["red"]], "did you mean 'red'"),
+        (lambda: result.render("front", width=0), "width: expected `int` >= 8"),
+        (lambda: result.render("front", zoom=np.float64(0)), "zoom: expected `float` > 0"),
+        (lambda: result.relight("chair", "side", samples=0), "samples: expected `int` >= 1"),
         (lambda: factorlib.load_result(tmp_path), "there is no result here"),
+        (lambda: factorlib.load_result("a\0b"), "there is no result here"),
+        (lambda: factorlib.load_result(300 * "a"), "there is no result here"),
         (lambda: factorlib.nothing, "has no attribute 'nothing'"),
     ]:
         with pytest.raises((InputError, AttributeError)) as error:
             ask()
         assert words in str(error.value)
+
+
+def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder.parent.parent)
+    assert factorlib.load_result("set").photos == factorlib.load_result("build/set").photos
+    for name, words in [("build/sett", "did you mean 'build/set'"), ("data/set", "build/set"), ("build/set/export", "build/set")]:
+        with pytest.raises(InputError, match="there is no result here") as error:
+            factorlib.load_result(name)
+        assert words in str(error.value)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="make all DATASET=<name> makes one"):
+        factorlib.load_result("nothing")
+
+
+def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
+    monkeypatch.chdir(folder.parent.parent / "data" / "set")
+    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(folder)
+    with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
+        factorlib.load_result("../../build/sets")
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """Of the checkout; cp -rL of the result lies beside build/."""
+    shutil.copytree(folder.parent.parent, tmp_path / "root")
+    shutil.copytree(tmp_path / "root" / "build" / "set", tmp_path / "root" / "before")
+    return tmp_path / "root"
+
+
+def test_a_copy_of_a_result_is_one(copy):
+    assert factorlib.load_result(copy / "before").photos == ["front", "side"]
+
+
+def renamed(file, old, new):
+    file.write_text(file.read_text().replace(old, new))
+
+
+@pytest.mark.parametrize(
+    "break_, words",
+    [
+        (lambda root: shutil.rmtree(root / "build/set/export"), ["export is missing", "make export DATASET=set"]),
+        (lambda root: (root / "data/set").rename(root / "data/moved"), ["data set 'data/set' is not there any more", "make all DATASET="]),
+        (lambda root: (root / "build/set/dataset.txt").write_text(""), ["dataset.txt", "is not there any more"]),
+        (lambda root: renamed(root / "data/set/dataset.yaml", '"unseen"', '"new"'), ["earlier dataset.yaml", "no material 'new'", "make all DATASET=set"]),
+        (lambda root: renamed(root / "data/set/dataset.yaml", '"name": "front"', '"name": "hall"'), ["no photo 'hall'"]),
+        (lambda root: renamed(root / "data/set/dataset.yaml", '"name": "chair"', '"name": "stool"'), ["no object 'front/stool', no object 'side/stool'"]),
+    ],
+)
+def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, break_, words):
+    break_(copy)
+    with pytest.raises(InputError) as error:
+        factorlib.load_result(copy / "build" / "set")
+    assert all(word in str(error.value) for word in words), str(error.value)
 
 
 def test_environments_are_the_exported_ones_turned_and_written(result, folder, tmp_path):
@@ -81,7 +120,7 @@ def test_environments_are_the_exported_ones_turned_and_written(result, folder, t
     assert np.array_equal(read_rgb_exr(tmp_path / "room.exr"), light.lat_long.astype(np.float32))
     spot = factorlib.result.Environment(np.zeros((16, 32, 3)))
     spot.lat_long[8, 16] = 1  # toward the viewer
-    assert spot.rotated(90).lat_long.sum(axis=(0, 2)).argmax() in (7, 8)  # +x is a quarter from the left
+    assert spot.rotate(90).lat_long.sum(axis=(0, 2)).argmax() in (7, 8)  # +x is a quarter from the left
 
 
 def test_pictures_are_those_of_the_photo(result, tmp_path):
@@ -97,7 +136,7 @@ def test_pictures_are_those_of_the_photo(result, tmp_path):
 def test_an_object_in_another_light_is_that_lights_colour(result, tmp_path):
     red = factorlib.result.Environment(np.broadcast_to([1.0, 0.0, 0.0], (16, 32, 3)).copy())
     red.to_exr(tmp_path / "red.exr")
-    for light in (red, str(tmp_path / "red.exr")):
+    for light in (red, tmp_path / "red.exr", str(tmp_path / "red.exr")):
         pixels = result.relight("front/chair", light, samples=2).pixels
         assert pixels[..., 0].max() > 0 and not pixels[..., 1:3].any()
     assert result.relight("chair", "side", samples=1).pixels[..., :3].any()

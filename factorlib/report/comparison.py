@@ -9,6 +9,7 @@ from pathlib import Path
 import jinja2
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.picture import exposure_of, picture
@@ -20,6 +21,7 @@ from factorlib.results.materials import MaterialTable, Solved, read_materials
 from factorlib.results.photos import read_photos
 
 STAGES = ("masks", "align", "urm", "train", "solve", "export", "render", "evaluate")
+PHOTOS, MATERIALS = "masks/photos.json", "export/materials.json"  # without which there is nothing to compare
 WIDTH = 480  # pixels of a picture
 PARTS = ("diffuse", "specular", "roughness")
 
@@ -49,7 +51,7 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
     InputError where one holds no whole result, or they have no material or photo in common.
     """
     runs = [_run(folder) for folder in (first, second)]
-    tables = [read_materials(folder / "export" / "materials.json", f"make export DATASET={folder.name}") for folder in (first, second)]
+    tables = [read_materials(folder / MATERIALS, f"make export DATASET={_dataset_of(folder)}") for folder in (first, second)]
     photos = [name for name in runs[0].set.photos if name in runs[1].set.photos]
     materials = [name for name in tables[0].materials if name in tables[1].materials]
     if not photos and not materials:
@@ -78,10 +80,18 @@ class _Set(msgspec.Struct, frozen=True):
 
 
 def _run(folder: Path) -> Artifacts:
-    file = folder / "masks" / "photos.json"
-    if not file.is_file():
-        raise InputError("there is no whole result here", file=folder, cure=f"make all DATASET={folder.name}")
-    return Artifacts({stage: folder / stage for stage in STAGES}, _Set(folder.name, [], list(read_photos(file))))
+    """InputError where the data set was not run as far as `export`."""
+    for file in (PHOTOS, MATERIALS):
+        if not (folder / file).is_file():
+            found = f"there is no whole result here: the stage {file.partition('/')[0]!r} has made no {Path(file).name}"
+            raise InputError(found, file=folder, cure=f"make all DATASET={_dataset_of(folder)}")
+    return Artifacts({stage: folder / stage for stage in STAGES}, _Set(folder.name, [], list(read_photos(folder / PHOTOS))))
+
+
+def _dataset_of(folder: Path) -> str:
+    """The data set whose result it is: a copy may be called otherwise."""
+    mark = folder / "dataset.txt"
+    return Path(mark.read_text(encoding="utf-8", errors="replace").strip()).name if mark.is_file() else folder.name
 
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
@@ -92,16 +102,27 @@ def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
 
 
 def _rows(tables: list[MaterialTable], names: list[str]) -> list[MaterialRow]:
-    """After the factor per channel that observations leave free: the second's reflectances are brought to the first's sum."""
-    factor = [1.0] * 3
-    if names:
-        sums = [np.sum([np.add(t.materials[n].diffuse, t.materials[n].specular) for n in names], axis=0) for t in tables]
-        factor = np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0).tolist()
-    return [_row(name, part, *(table.materials[name] for table in tables), factor) for name in names for part in PARTS]
+    """After the factors that observations leave free, one per channel and group of materials that both results link:
+    each group's reflectances of the second are brought to the first's sum."""
+    factor = {name: _factor(tables, group) for group in _linked(tables, names) for name in group}
+    return [_row(name, part, *(table.materials[name] for table in tables), factor[name]) for name in names for part in PARTS]
 
 
-def _row(name: str, part: str, first: Solved, second: Solved, factor: list[float]) -> MaterialRow:
-    scale = np.array(factor) if part != "roughness" else np.ones(1)
+def _linked(tables: list[MaterialTable], names: list[str]) -> list[list[str]]:
+    """Materials that lie in one connected component of the first result, and in one of the second."""
+    groups: dict[tuple[int, ...], list[str]] = {}
+    for name in names:
+        groups.setdefault(tuple(table.gauge.component.get(name, 0) for table in tables), []).append(name)
+    return list(groups.values())
+
+
+def _factor(tables: list[MaterialTable], group: list[str]) -> Float[np.ndarray, "3"]:
+    sums = [np.sum([np.add(table.materials[name].diffuse, table.materials[name].specular) for name in group], axis=0) for table in tables]
+    return np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0)
+
+
+def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.ndarray, "3"]) -> MaterialRow:
+    scale = factor if part != "roughness" else np.ones(1)
     values = [np.atleast_1d(getattr(first, part)), np.atleast_1d(getattr(second, part)) * scale]
     errors = [np.atleast_1d(getattr(first.stderr, part)), np.atleast_1d(getattr(second.stderr, part)) * scale]
     together = np.hypot(*errors)

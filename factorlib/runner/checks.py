@@ -1,4 +1,4 @@
-"""Looking at a dataset's files before anything runs: a fault in the last photo is reported before the first is worked on.
+"""Looking at files before anything runs: a fault in the last photo, or in a recipe, is reported before the first is worked on.
 
 What there is to look at, and how, the dataset's provider knows; here is which files a run has not used yet.
 """
@@ -14,15 +14,17 @@ from factorlib.runner.survey import Survey
 
 
 def new_faults(seen: Survey, planned: list[Planned]) -> list[InputError]:
-    """Of the files that steps are to read which have no result of them yet, each fault once; a dataset all of whose files
-    have been used costs nothing."""
+    """Of the files that steps are to read which have no result of them yet, each fault once; files of the dataset and of recipes
+    that have all been used cost nothing."""
     return faults(seen, [p.step for p in planned if p.status != "current" and _is_new(seen, p.step)])
 
 
 def faults(seen: Survey, steps: Iterable[Step]) -> list[InputError]:
-    """Of all files that the steps read; where several stages take a slice, by the parameters of the first."""
+    """Of all files that the steps read, those of their recipes too; where several stages take a slice, by the parameters of the first."""
     found, done = {}, set()
     for step in steps:
+        if step.recipe is not None:
+            found |= {str(fault): fault for fault in seen.data.recipe_faults(seen.recipes[step.recipe].files)}
         stage = seen.spec.pipeline.stages[step.stage]
         for slice_ in stage.slices:
             if (slice_, step.photo) not in done:
@@ -33,10 +35,10 @@ def faults(seen: Survey, steps: Iterable[Step]) -> list[InputError]:
 
 
 def _is_new(seen: Survey, step: Step) -> bool:
-    """Whether the step's part of the dataset is another than that of its last result."""
+    """Whether the step's part of the dataset, or a file of its recipe, is another than that of its last result."""
     before = seen.previous.get(str(step))
-    return before is None or _of_dataset(before) != _of_dataset(seen.records[step])
+    return before is None or _of_files(before) != _of_files(seen.records[step])
 
 
-def _of_dataset(record: Record) -> Record:
-    return {name: value for name, value in record.items() if name.startswith(("file:", f"facts:{DATASET}"))}
+def _of_files(record: Record) -> Record:
+    return {name: value for name, value in record.items() if name.startswith(("file:", "recipe file:", f"facts:{DATASET}"))}

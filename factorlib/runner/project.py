@@ -6,7 +6,7 @@ import importlib
 import os
 import stat
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -41,6 +41,11 @@ class Recipe(msgspec.Struct, frozen=True):
     files: dict[str, Path]
 
 
+def nothing_in_files(files: dict[str, Path]) -> list[InputError]:
+    """Stands in where a data set does not look at the files of recipes: no faults."""
+    return []
+
+
 def no_recipes(path: Path) -> Recipe:
     """Stands in where a data set knows no recipes."""
     raise InputError("this data set knows no recipes", file=path)
@@ -52,6 +57,7 @@ class Data(msgspec.Struct, frozen=True):
     recipe: reads a recipe for this data set; InputError where it asks for what is not there
     faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes it
             and the file in which these stand
+    recipe_faults: of the files that a recipe names
     """
 
     folder: Path
@@ -59,6 +65,7 @@ class Data(msgspec.Struct, frozen=True):
     slice: Callable[[str, str | None], Slice]
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = nothing_to_look_at
     recipe: Callable[[Path], Recipe] = no_recipes
+    recipe_faults: Callable[[dict[str, Path]], list[InputError]] = nothing_in_files
 
 
 class Provider(msgspec.Struct, frozen=True):
@@ -86,20 +93,22 @@ def photo_sets() -> Provider:
             found = read_recipe(file, dataset)
             return Recipe(msgspec.to_builtins(found), files_of(found, file))
 
-        return Data(dataset.folder, photos, lambda name, photo: dataset_slice(dataset, name, photo), _looking_at(dataset), recipe)
+        look = _looking_at(dataset)
+        slices = partial(dataset_slice, dataset)
+        return Data(dataset.folder, photos, slices, lambda *of: look().faults(*of), recipe, lambda files: look().recipe_faults(files))
 
     return Provider(SLICES, read)
 
 
-def _looking_at(dataset: Any) -> Callable[..., list[InputError]]:
-    """`factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
+def _looking_at(dataset: Any) -> Callable[[], Any]:
+    """Gives the `Validation` of `factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
 
     @cache
     def validation() -> Any:
         """Made when it is first asked for, for it imports much."""
         return importlib.import_module("factorlib.validation").Validation(dataset)
 
-    return lambda *arguments: validation().faults(*arguments)
+    return validation
 
 
 class Project(msgspec.Struct, frozen=True):

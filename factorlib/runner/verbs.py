@@ -70,16 +70,16 @@ def surveyed(project: Project, wish: Wish) -> Survey:
 def _make(project: Project, wish: Wish) -> int:
     started = time.perf_counter()
     seen = surveyed(project, wish)
-    targets = seen.spec.targets
+    whole = wish.targets is None
     planned = seen.planned()
     if all(p.status == "current" for p in planned):
         remember(seen)
         print(f"{seen.data.folder.name}: nothing to do, all {len(seen.records)} steps are current")
-        _name_results(seen, targets)
+        _name_results(seen, whole)
         return 0
     if found := new_faults(seen, planned):
         return _refused(seen, found)
-    return _run(seen, targets, started)
+    return _run(seen, whole, started)
 
 
 def check_stage(project: Project, name: str, verbs: list[str]) -> None:
@@ -89,7 +89,7 @@ def check_stage(project: Project, name: str, verbs: list[str]) -> None:
         raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
 
 
-def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
+def _run(seen: Survey, whole: bool, started: float) -> int:
     from factorlib.runner.run import Refused, run
     from factorlib.runner.screen import display_for
 
@@ -111,35 +111,43 @@ def _run(seen: Survey, targets: list[str] | None, started: float) -> int:
     print(
         f"{seen.data.folder.name}: {words.count(tally.ran)} run, {len(seen.records) - len(tally.ran)} current, {time.perf_counter() - started:.1f} s"
     )
-    _name_results(seen, targets)
+    _name_results(seen, whole)
     return 0
 
 
-def _name_results(seen: Survey, targets: list[str] | None) -> None:
-    if targets is not None:
-        for name in targets:
-            print(f"  {name}: {seen.project.shown(seen.home.folder / name)}{'/' + next(iter(seen.recipes)) if len(seen.recipes) == 1 else ''}")
-        return
-    for label, path in results(seen):
+def _name_results(seen: Survey, whole: bool) -> None:
+    """Of the whole pipeline what a user looks at first, else the folder of each stage; pictures of recipes either way."""
+    for label, path in results(seen) if whole else ():
         shown = seen.project.shown(path)
         print(f"  {label}: {shown}" + ("/*.exr" if path.is_dir() else ""))
+    for name in seen.spec.targets or ():
+        over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
+        if over_recipes or not whole:
+            folder = seen.home.folder / name
+            print(f"  {name}: {seen.project.shown(folder / next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else folder)}")
 
 
 def show_plan(project: Project, wish: Wish) -> int:
     """Print what would run."""
-    print("\n".join(words.plan_lines(surveyed(project, wish).planned())))
+    print("\n".join(words.plan_lines(_looked_at(project, wish).planned())))
     return 0
 
 
 def show_why(project: Project, wish: Wish) -> int:
     """Print why each step would run."""
-    print("\n".join(words.why_lines(surveyed(project, wish).planned())))
+    print("\n".join(words.why_lines(_looked_at(project, wish).planned())))
     return 0
+
+
+def _looked_at(project: Project, wish: Wish) -> Survey:
+    """The survey of what is wanted, without running it: where recipes are named and no stage, of the recipes alone."""
+    targets = [RENDER] if wish.recipes and wish.targets is None else wish.targets
+    return surveyed(project, msgspec.structs.replace(wish, targets=targets))
 
 
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = surveyed(project, wish)
+    seen = _looked_at(project, wish)
     print("\n".join(words.status_lines(seen.planned(), lambda p: is_running(seen, p), lambda p: warnings_of(seen, p))))
     return 0
 
@@ -200,7 +208,8 @@ def compare(project: Project, first: Path, second: Path) -> int:
     for folder, named in zip(folders, (first, second), strict=True):
         if not Home(folder).keys_file.is_file():
             known = [str(home.folder.name) for home in made_homes(project)]
-            raise InputError("there is no result here", file=named, key="compare", cure=did_you_mean(str(named), known))
+            cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
+            raise InputError("there is no result here", file=named, key="compare", cure=cure)
     changes = _changes(Store(project.build / "store"), *map(Home, folders))
     page = import_module("factorlib.report.comparison").comparison(*folders, changes)  # by its name, as stages: it imports science
     path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
@@ -238,7 +247,10 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     if sheet:
         claim(project, seen.home, seen.data.folder)
         path = seen.home.folder / "sheet.png"
-        import_module("factorlib.sheet").write_sheet(seen.data.folder, path)  # by its name, as stages: it imports science
+        from factorlib.runner.screen import shown_if_long
+
+        with shown_if_long("sheet") as report:
+            import_module("factorlib.sheet").write_sheet(seen.data.folder, path, report)  # by its name, as stages: it imports science
         print(f"  contact sheet: {project.shown(path)}")
     return 0
 

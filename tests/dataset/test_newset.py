@@ -7,8 +7,10 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import LEFT_OUT, MAX_MATERIALS
 from factorlib.errors import InputError
 from factorlib.newset import new_dataset
+from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\ng shell\nf 1 2 3\nf 1 3 4\ng legs\nf 1 2 4\nf 2 3 4\n"
@@ -116,3 +118,64 @@ def test_two_photos_of_one_name_are_refused(folders):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folders / "photos" / "kitchen.png")
     with pytest.raises(InputError, match="would both be called 'kitchen'"):
         made(folders)
+
+
+def test_labels_end_where_what_is_left_out_begins(folders):
+    mask(folders / "masks" / "kitchen.png", [0, MAX_MATERIALS, LEFT_OUT])
+    _, spec = made(folders)
+    assert spec["materials"][-1] == f"label_{MAX_MATERIALS}" and len(spec["materials"]) == MAX_MATERIALS
+
+
+@pytest.mark.parametrize("name", ["photos", "poses"])
+def test_a_photo_whose_name_the_results_take_is_listed(folders, name):
+    (folders / "photos" / "kitchen.jpg").rename(folders / "photos" / f"{name}.jpg")
+    for photo in (name, "IMG_0412"):
+        mask(folders / "masks" / f"{photo}_shell.png", [0, 255])
+        mask(folders / "masks" / f"{photo}_legs.png", [255, 0])
+    missing, _ = made(folders)
+    assert missing == [f"photo {name}: write another `name`: a file of the results is called {name}"]
+    file = folders / "data" / "mine" / "dataset.yaml"
+    with pytest.raises(InputError, match="rename the photo"):
+        read_dataset(file)
+    file.write_text(file.read_text().replace(f"name: {name}", "name: hall"))  # and that is all
+    assert read_dataset(file).photo("hall").image == f"photos/{name}.jpg"
+
+
+def test_coco_categories_that_are_no_names_are_to_be_renamed(folders):
+    outlines = [{"id": k, "image_id": k, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 5]]} for k in (0, 1)]
+    images = [{"id": k, "file_name": photo} for k, photo in enumerate(("kitchen.jpg", "IMG 0412.png"))]
+    coco = {"images": images, "annotations": outlines, "categories": [{"id": 1, "name": "red shell"}, {"id": 2, "name": "legs"}]}
+    (folders / "masks" / "all.json").write_text(json.dumps(coco))
+    (folders / "meshes" / "chair.obj").write_text(OBJ.replace("g shell", "g red_shell"))
+    missing, spec = made(folders)
+    assert missing == ["masks/all.json: rename its category 'red shell' to 'red_shell': names are made of A-Z a-z 0-9 _ and -"]
+    assert spec["materials"] == ["red_shell", "legs"]
+    dataset = read_dataset(folders / "data" / "mine")
+    arguments = "photo", None, {}, folders / "pipeline.yaml"
+    assert ["category 'red shell' is no material" in str(fault) for fault in Validation(dataset).faults(*arguments)] == [True, True]
+    file = folders / "data" / "mine" / "masks" / "all.json"
+    file.write_text(file.read_text().replace("red shell", "red_shell"))
+    assert Validation(dataset).faults(*arguments) == []
+
+
+def test_where_no_mask_names_a_material_that_is_said_and_refused(folders):
+    missing = new_dataset(folders / "data" / "mine", folders / "photos", None, folders / "meshes")
+    assert "no mask names a material: write the names in `materials`, label k of a mask the k-th" in missing
+    with pytest.raises(InputError, match="0 materials"):
+        read_dataset(folders / "data" / "mine")
+
+
+def test_a_mask_without_labels_is_listed(folders):
+    mask(folders / "masks" / "kitchen.png", [0, 255])
+    mask(folders / "masks" / "IMG_0412.png", [0, 1])
+    missing, _ = made(folders)
+    assert missing == ["photo kitchen: kitchen.png has no label, for 255 means left out; the mask of one material is called kitchen_<material>.png"]
+
+
+def test_a_mesh_is_shown_where_its_name_is_a_whole_word_of_the_photos(folders):
+    for photo in ("armchair.jpg", "red_chair-2.jpg"):
+        (folders / "photos" / "kitchen.jpg").with_name(photo).write_bytes((folders / "photos" / "kitchen.jpg").read_bytes())
+    (folders / "meshes" / "stool.obj").write_text(OBJ)
+    _, spec = made(folders)
+    shown = {photo["name"]: [each["mesh"] for each in photo["objects"]] for photo in spec["photos"]}
+    assert shown == {"IMG_0412": ["?"], "armchair": ["?"], "kitchen": ["?"], "red_chair-2": ["chair"]}

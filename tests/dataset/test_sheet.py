@@ -1,5 +1,8 @@
 """The contact sheet: every photo, its labels and its meshes, in one picture."""
 
+import io
+import re
+
 import numpy as np
 import pytest
 
@@ -8,7 +11,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.picture import read_png
 from factorlib.meshes.mesh import Mesh
-from factorlib.runner import verbs
+from factorlib.runner import bars, screen, verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, SIDE, drawn, write_sheet
 
@@ -21,7 +24,7 @@ def test_a_row_for_each_photo_with_its_labels_and_meshes(tmp_path):
     sheet = read_png(tmp_path / "sheet.png")
     row = MESH_SIDE + HEAD + MARGIN
     assert sheet.shape == (HEAD + 2 * MARGIN + 6 * max(row, 180 + HEAD + MARGIN), 2 * (240 + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
-    assert SIDE == 320 and done == [(k, 6) for k in range(6)]
+    assert SIDE == 320 and done == [(k, 12) for k in range(12)]
     write_sheet(EAMES, tmp_path / "again.png")
     assert (tmp_path / "sheet.png").read_bytes() == (tmp_path / "again.png").read_bytes()
 
@@ -39,14 +42,41 @@ def test_a_mesh_is_drawn_upright_in_the_colours_of_its_labels():
     assert rasterise(mesh, Camera(8, 8, 8.0, (4, 4)), Pose(np.diag([1.0, -1, -1]), np.array([0, 0, 4.0]))).label[3, 4] == 1
 
 
+def checkout(folder):
+    (folder / "data").mkdir()
+    (folder / "pipeline.yaml").write_text((LIBRARY / "pipeline.yaml").read_text())
+    (folder / "stages").symlink_to(LIBRARY / "stages")
+    return Project(folder, photo_sets())
+
+
 def test_validate_writes_it_only_when_asked(tmp_path, capsys):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "pipeline.yaml").write_text((LIBRARY / "pipeline.yaml").read_text())
-    (tmp_path / "stages").symlink_to(LIBRARY / "stages")
-    project = Project(tmp_path, photo_sets())
+    project = checkout(tmp_path)
     assert verbs.validate(project, str(EAMES), []) == 0 and not (tmp_path / "build" / "eames" / "sheet.png").exists()
     assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
     assert (tmp_path / "build" / "eames" / "sheet.png").is_file() and "contact sheet" in capsys.readouterr().out
+
+
+def test_validate_shows_how_far_a_sheet_is_once_it_takes_long(tmp_path, capsys, monkeypatch):
+    project = checkout(tmp_path)
+    monkeypatch.setattr(screen, "PATIENCE", 1e9)
+    assert verbs.validate(project, str(EAMES), [], sheet=True) == 0 and capsys.readouterr().err == ""
+    monkeypatch.setattr(screen, "PATIENCE", 0.0)
+    assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
+    begun, ended = capsys.readouterr().err.splitlines()
+    assert begun.startswith("sheet ") and re.fullmatch(r"sheet +[0-9.]+ s", ended)
+
+
+def test_on_a_terminal_a_bar_is_drawn(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    seen = []
+    monkeypatch.setattr(screen, "PATIENCE", 0.0)
+    monkeypatch.setattr(bars.Bars, "progress", lambda self, step, done, total, text: seen.append((str(step), done, total)))
+    with screen.shown_if_long("sheet", Terminal()) as report:
+        report(1, 4)
+    assert seen == [("sheet", 1, 4)]
 
 
 def test_a_faulty_set_is_refused_as_ever(tmp_path):

@@ -1,4 +1,4 @@
-"""Small inputs of `export` and `render`, made by hand: two objects in two photos, a light of coloured lobes, and solved numbers.
+"""Small inputs of `export`, `render` and `recipes`, and a whole small result, made by hand: two objects in two photos, a light of coloured lobes, and solved numbers.
 
 The first photo shows a ball, principal point off centre; the second an ellipsoid of two materials far off the
 axis, turned, in a light fixed to the world.  The meshes are fine enough that their facets do not show.
@@ -19,7 +19,8 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import write_lobes
-from factorlib.stage import Inputs
+from factorlib.stage import Inputs, silent
+from stages import export
 
 NAMES = ["red", "brass", "unseen"]
 MATERIALS = {
@@ -95,11 +96,42 @@ def make(folder: Path) -> Inputs:
     return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
 
 
-def of_photo(inputs: Inputs, exported: Path, photo: str) -> Inputs:
-    """The inputs of `render` for one photo; the networks are the shipped ones."""
+def make_exported(folder: Path) -> Inputs:
+    """The same, and what `export` makes of it, at a small size: the inputs of `recipes`."""
+    inputs = make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
+    return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
 
+
+def make_result(root: Path, name: str = "set") -> Path:
+    """build/<name> of a checkout at `root` as the runner leaves it, beside its data set data/<name>."""
+    build, dataset = root / "build" / name, root / "data" / name
+    inputs = make_exported(build)
+    dataset.mkdir(parents=True)
+    (build / "dataset.txt").write_text(f"data/{name}\n")
+    meshes = {}
+    for photo in MESHES:
+        meshes |= inputs.facts["dataset.objects"][photo]["meshes"]
+    for file, path in inputs.files.items():
+        (dataset / file).write_bytes(path.read_bytes())
+    photos = [
+        {"name": photo, "image": f"{photo}.png", "masks": f"{photo}_mask.png", "objects": [{"name": "chair", "mesh": mesh}]}
+        for photo, mesh in MESHES.items()
+    ]
+    photos[1] |= {"illumination": "room", "world_from_camera": WORLD_FROM_CAMERA["side"].tolist()}
+    for photo in photos:
+        for key in ("image", "masks"):
+            (dataset / photo[key]).write_bytes(b"")
+    meshes = {mesh: {k: v for k, v in entry.items() if v is not None} for mesh, entry in meshes.items()}
+    write_json(dataset / "dataset.yaml", {"format": 1, "materials": NAMES, "meshes": meshes, "photos": photos})
+    return build
+
+
+def of_photo(inputs: Inputs, photo: str) -> Inputs:
+    """Of what `make_exported` returns, the inputs of `render` for one photo; the networks are the shipped ones."""
     facts = {**inputs.facts, "dataset.light": inputs.facts["dataset.light"][photo]}
-    return Inputs({**inputs.folders, "export": exported, "train": SHIPPED}, facts, inputs.files, photo)
+    return Inputs({**inputs.folders, "train": SHIPPED}, facts, inputs.files, photo)
 
 
 def _light_facts(photo: str) -> dict:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from faults.mesh_files import DATA, OBJ, gltf_header
 from PIL import Image
 from runner import toy
 
+from factorlib.dataset.check import MESHES
 from factorlib.errors import InputError
+from factorlib.images.exr import write_rgb_exr
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider, photo_sets
 
@@ -199,6 +202,40 @@ def test_ten_photos_take_less_than_a_second(tmp_path, size):
     started = time.process_time()
     assert [fault for slice_ in ("photo", "objects") for fault in data.faults(slice_, None, {}, tmp_path)] == []
     assert time.process_time() - started < 1.0
+
+
+# ---- the files that recipes name --------------------------------------------------------------------------------------
+
+
+VERTICES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+OF_RECIPES = {
+    "not_a_map.hdr": (b"no map", "not readable as an image"),
+    "square.exr": (np.ones((8, 8, 3)), "no lat-long map.*\n.*twice its height"),
+    "black.exr": (np.zeros((8, 16, 3)), "the map is black"),
+    "holes.exr": (np.full((8, 16, 3), np.nan), "are no numbers"),
+    "faceless.obj": (VERTICES, "mesh without faces"),
+    "flat.obj": (VERTICES + b"f 1 1 2\n", "every face has zero area"),
+    "cut.ply": (b"ply\nformat ascii 1.0\n", "has no header of a PLY"),
+}
+
+
+@pytest.mark.parametrize("name", OF_RECIPES)
+def test_a_file_of_a_recipe_is_refused_before_anything_runs(project, folder, capsys, name):
+    content, words = OF_RECIPES[name]
+    write_rgb_exr(folder / name, content) if isinstance(content, np.ndarray) else (folder / name).write_bytes(content)
+    wanted = f"mesh: {name}\nkind: insert" if Path(name).suffix in MESHES else f"lights: [{name}]\nkind: relight"
+    (folder / "own.yaml").write_text(wanted)
+    wish = verbs.Wish(str(folder), ["render"], recipes=[str(folder / "own.yaml")])
+    code, said = said_by(lambda: verbs.make(project, wish), capsys)
+    assert code == 1 and re.search(words, said, re.DOTALL) and str(folder / name) in said and "\n  " in said, said
+    assert not list((project.root / "build").glob("set/*")), "something was run"
+
+
+def test_good_files_of_recipes_have_no_faults(folder):
+    write_rgb_exr(folder / "light.exr", np.ones((8, 16, 3)))
+    files = {name: folder / name for name in ("light.exr", "meshes/a.obj", "meshes/b.gltf")}
+    files["own.json"] = folder / "nothing_looks_at_tables.json"
+    assert photo_sets().read(folder).recipe_faults(files) == []
 
 
 # ---- what is looked at before a run -----------------------------------------------------------------------------------

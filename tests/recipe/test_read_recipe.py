@@ -1,5 +1,6 @@
 """Recipes: what is written is read, what is not there is named, and every recipe that comes with the project is good."""
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -9,6 +10,7 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.recipe.read import files_of, read_recipe
 from factorlib.recipe.schema import KINDS, Insert, recipe_of
+from factorlib.recipe.table import read_table
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
 from factorlib.runner.project import LIBRARY
 
@@ -79,3 +81,12 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     recipe = read_recipe(path, dataset)
     assert isinstance(recipe, Insert) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
+
+
+def test_the_table_and_the_insertion_in_the_docs_are_good(dataset, tmp_path):
+    text = (LIBRARY / "docs" / "recipes.md").read_text()
+    (table,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    (insertion,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "own.json").write_text(table)
+    assert list(read_table(tmp_path / "own.json")) == ["gold"]
+    assert isinstance(read_recipe(written(tmp_path, insertion), dataset), Insert)

@@ -17,7 +17,7 @@ from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
-from stages import export, render
+from stages import render
 from tests.export import made_export
 
 FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
@@ -25,16 +25,12 @@ FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made")
-    inputs = made_export.make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
-    return inputs, folder / "export"
+    return made_export.make_exported(tmp_path_factory.mktemp("made"))
 
 
 def run(made, photo, out):
     out.mkdir()
-    render.main(FAST, made_export.of_photo(*made, photo), out, silent)
+    render.main(FAST, made_export.of_photo(made, photo), out, silent)
     return out
 
 
@@ -49,10 +45,9 @@ def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
 
 @pytest.mark.parametrize("photo", ["front", "side"])
 def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(made, tmp_path, photo):
-    inputs, _ = made
     world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()["front" if photo == "front" else "room"]
     normal = torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])  # in the light's own frame
-    solved = read_materials(inputs["solve"] / "materials.json").materials
+    solved = read_materials(made["solve"] / "materials.json").materials
     out = run(made, photo, tmp_path / "out")
     for name in made_export.NAMES:
         expected = reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
@@ -61,7 +56,7 @@ def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(
 
 def test_resynthesis_is_black_outside_the_mask_and_lit_inside(made, tmp_path):
     picture = read_rgb_exr(run(made, "front", tmp_path / "out") / "resynthesis" / "front.exr")
-    inside = read_exr(made[0]["masks"] / "front.exr")["label"] > 0
+    inside = read_exr(made["masks"] / "front.exr")["label"] > 0
     assert picture.shape == (made_export.HEIGHT, made_export.WIDTH, 3)
     np.testing.assert_array_equal(picture.max(-1) > 0, inside)
 
@@ -75,8 +70,7 @@ def test_observed_normals_are_those_of_the_photo(made, tmp_path):
 
 
 def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
-    inputs, exported = made
-    lobes = exported / "lobes.parquet"
+    lobes = made["export"] / "lobes.parquet"
     before = lobes.read_bytes()
     try:
         write_lobes(lobes, {"front": no_lobes()})
@@ -88,9 +82,8 @@ def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
 
 
 def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(made, tmp_path):
-    inputs, _ = made
     straight = run(made, "front", tmp_path / "straight")
-    file = inputs["solve"] / "materials.json"
+    file = made["solve"] / "materials.json"
     before, solved = file.read_bytes(), read_json(file)
     try:
         write_json(file, solved | {"model": {"tone": {"front": {"exponent": 1.5, "pivot": 0.3}, "side": {"exponent": 2.0, "pivot": 1.0}}}})
@@ -105,12 +98,11 @@ def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(ma
 
 def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     """In the gauge of the solve: the factor that `export` took from the reflectances does not weaken it."""
-    inputs, exported = made
-    label = read_exr(inputs["masks"] / "front.exr")["label"]
+    label = read_exr(made["masks"] / "front.exr")["label"]
     y, x = np.nonzero(label > 0)
     n = len(x)
     visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(np.uint8)  # the lower half is hidden, by nothing known
-    geometry = read_exr(inputs["align"] / "front.exr")
+    geometry = read_exr(made["align"] / "front.exr")
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     seen = Observations(
         normal=normal, view=view, radiance=np.full((n, 3), 0.3), clipped=np.zeros((n, 3), bool), material=np.zeros(n, int),
@@ -119,18 +111,18 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     )  # fmt: skip
     (tmp_path / "urm").mkdir()
     write_observations(tmp_path / "urm" / "front.parquet", seen)
-    file, pictures = inputs["solve"] / "materials.json", {}
+    file, pictures = made["solve"] / "materials.json", {}
     before, solved = file.read_bytes(), read_json(file)
     try:
         for bounces in (True, False):
             write_json(file, solved | {"model": {"self_shadowing": True, "interreflection": bounces}})
-            of = made_export.of_photo(inputs, exported, "front")
+            of = made_export.of_photo(made, "front")
             (tmp_path / str(bounces)).mkdir()
             render.main(FAST, Inputs({**of.folders, "urm": tmp_path / "urm"}, of.facts, of.files, "front"), tmp_path / str(bounces), silent)
             pictures[bounces] = read_rgb_exr(tmp_path / str(bounces) / "resynthesis" / "front.exr")[y, x]
     finally:
         file.write_bytes(before)
-    assert read_materials(exported / "materials.json").gauge.export_factor < 1
+    assert read_materials(made["export"] / "materials.json").gauge.export_factor < 1
     red, sent = made_export.MATERIALS["red"], bounced_light(seen, seen.radiance)
     expected = np.array(red["diffuse"]) * sent[:, :3] + np.array(red["specular"]) * sent[:, 3:]
     np.testing.assert_allclose(pictures[True] - pictures[False], expected, rtol=1e-3, atol=1e-4)

@@ -11,7 +11,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.report.comparison import comparison
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved, write_materials
 from factorlib.results.photos import PhotoFacts
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, Provider
@@ -21,10 +21,12 @@ ERROR = StandardErrors((0.01,) * 3, (0.01,) * 3, 0.02)
 EVIL = "<script>alert(1)</script>"
 
 
+def material(factor=1.0, roughness=0.3):
+    return solved(Reflectance((0.3 * factor, 0.2 * factor, 0.1 * factor), (0.05 * factor,) * 3, roughness), ERROR)
+
+
 def result(folder, roughness=0.3, factor=1.0, light=1.0, names=("red", EVIL), photo="kitchen"):
-    materials = {
-        name: solved(Reflectance((0.3 * factor, 0.2 * factor, 0.1 * factor), (0.05 * factor,) * 3, roughness), ERROR) for name in names
-    }
+    materials = {name: material(factor, roughness) for name in names}
     write_json(folder / "masks" / "photos.json", {photo: PhotoFacts(8, 8, 1, (8, 8), illumination=photo)})
     write_materials(folder / "export" / "materials.json", MaterialTable(materials))
     for place in ("export/illumination", "render/resynthesis"):
@@ -61,6 +63,28 @@ def test_differences_are_in_standard_errors_after_the_free_factor(folders):
     assert "solve: parameter lobes: 32 -&gt; 64" in page
 
 
+def with_components(folder, factors, component):
+    result(folder, names=tuple(factors))
+    table = MaterialTable({name: material(factor) for name, factor in factors.items()}, Gauge(component=component))
+    write_materials(folder / "export" / "materials.json", table)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "first, second, equal",
+    [
+        ({"red": 0, "blue": 1}, {"red": 1, "blue": 0}, True),  # two components in both, whatever their numbers
+        ({"red": 0, "blue": 0}, {"red": 0, "blue": 1}, True),  # linked in the first alone: the second's factors are free
+        ({"red": 0, "blue": 0}, {"red": 0, "blue": 0}, False),  # linked in both: their ratio is observed
+    ],
+)
+def test_every_component_has_a_factor_of_its_own(folders, first, second, equal):
+    page = comparison(
+        with_components(folders[0], {"red": 1.0, "blue": 1.0}, first), with_components(folders[1], {"red": 0.5, "blue": 2.0}, second), []
+    )
+    assert all(v == 0 for row in apart(page) for v in row) == equal
+
+
 def test_names_are_names(folders):
     page = comparison(result(folders[0]), result(folders[1]), None)
     assert EVIL not in page and html.escape(EVIL) in page and "no longer has the records" in page
@@ -77,9 +101,16 @@ def test_what_only_one_has_is_named_and_nothing_in_common_is_refused(folders):
     result(folders[1], names=("other",), photo="garden")
     with pytest.raises(InputError, match="no photo and no material in common"):
         comparison(*folders, [])
-    shutil.rmtree(folders[1] / "masks")
-    with pytest.raises(InputError, match="no whole result"):
+
+
+@pytest.mark.parametrize("missing", ["masks", "export"])
+def test_a_result_that_is_not_whole_is_refused_with_the_stage_and_the_cure(folders, missing):
+    result(folders[0]), result(folders[1])
+    shutil.rmtree(folders[1] / missing)
+    (folders[1] / "dataset.txt").write_text("data/chairs\n")  # b is a copy
+    with pytest.raises(InputError, match="no whole result") as error:
         comparison(*folders, [])
+    assert f"the stage {missing!r}" in str(error.value) and "make all DATASET=chairs" in str(error.value) and str(folders[1]) in str(error.value)
 
 
 def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
@@ -95,5 +126,11 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     assert verbs.compare(project, tmp_path / "before", project.build / "set") == 0
     page = (project.build / "compare" / "before-set" / "index.html").read_text()
     assert html.escape("upper: parameter times: 1 (the default) -> 2") in page and page.count("<li>") == 1
-    with pytest.raises(InputError, match="there is no result here"):
+    with pytest.raises(InputError, match="there is no result here\n  known are: 'set'"):
         verbs.compare(project, tmp_path / "before", tmp_path / "nothing")
+
+
+def test_where_nothing_was_run_the_command_says_what_to_run(tmp_path):
+    project = Project(toy.make_project(tmp_path / "root").root, Provider(("photo",), toy.read))
+    with pytest.raises(InputError, match="make all DATASET=<name> makes one"):
+        verbs.compare(project, tmp_path / "a", tmp_path / "b")

@@ -25,6 +25,7 @@ def main(params, inputs, out, progress):
     photos = sorted(path.stem for path in inputs["upper"].glob("*.txt"))
     (out / "said.txt").write_text(recipe["word"] + params.mark + more + "".join(photos))
 """
+LOOKED_AT = []
 OVER_RECIPES = '  shout: {inputs: [upper], over: recipe, optional: true, makes: ["said.txt"]}\n'
 
 
@@ -45,8 +46,15 @@ def project(tmp_path):
 
     def read(folder):
         data = toy.read(folder)
-        return type(data)(data.folder, data.photos, data.slice, recipe=reading)
 
+        def faults(files):
+            """A file with the word 'fault' has one; what was looked at is noted."""
+            LOOKED_AT.extend(files)
+            return [InputError("a fault", file=path) for path in files.values() if "fault" in path.read_text()]
+
+        return type(data)(data.folder, data.photos, data.slice, recipe=reading, recipe_faults=faults)
+
+    LOOKED_AT.clear()
     return Project(made.root, Provider(("photo",), read))
 
 
@@ -60,7 +68,7 @@ def to_run(project, *recipes, targets=("shout",)):
 
 
 def make(project, *recipes, targets=("render",), **more):
-    return verbs.make(project, verbs.Wish("set", list(targets), recipes=list(recipes), **more))
+    return verbs.make(project, verbs.Wish("set", targets and list(targets), recipes=list(recipes), **more))
 
 
 def test_every_recipe_is_a_step_with_a_folder_of_its_own(project):
@@ -95,6 +103,20 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     assert [p.reasons for p in seen.planned()[-2:]] == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
 
 
+def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_they_are_new(project, capsys):
+    more = project.root / "recipes" / "set" / "more.txt"
+    write(more, "a fault")
+    assert make(project, "all") == 1 and "a fault" in capsys.readouterr().err
+    assert not (project.build / "set").exists()
+    write(more, "…")
+    assert make(project, "all") == 0
+    LOOKED_AT.clear()
+    assert make(project, "all") == 0 and make(project, "all", settings=["shout.mark=x"]) == 0
+    assert said(project, "bye") == "byex…ab" and LOOKED_AT == []
+    write(more, "another fault")
+    assert make(project, "all") == 1 and LOOKED_AT == ["more.txt"]
+
+
 def test_a_path_is_a_recipe_as_well(project, monkeypatch):
     write(project.root / "mine" / "own.yaml", '{"word": "own"}')
     monkeypatch.chdir(project.root)
@@ -125,3 +147,21 @@ def test_clean_forgets_the_pictures_too(project):
 def test_plan_and_why_name_recipes(project, capsys):
     verbs.show_plan(project, verbs.Wish("set", ["render"], recipes=["all"]))
     assert "hello, bye" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("show", [verbs.show_plan, verbs.show_why, verbs.show_status])
+def test_looking_at_recipes_shows_what_they_need_and_no_more(project, capsys, show):
+    show(project, verbs.Wish("set", recipes=["hello"]))
+    shown = capsys.readouterr().out
+    assert "shout" in shown and "upper" in shown and "total" not in shown and "bye" not in shown
+    show(project, verbs.Wish("set"))  # without recipes: the whole pipeline
+    shown = capsys.readouterr().out
+    assert "total" in shown and "shout" not in shown
+
+
+def test_the_whole_pipeline_and_recipes_where_both_are_asked_for(project, capsys):
+    assert make(project, "hello", targets=None) == 0
+    assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
+    assert not (project.build / "set" / "shout" / "bye").exists()
+    named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has none of the results that are named otherwise

@@ -12,7 +12,7 @@ from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
 from factorlib.stage import Inputs, silent
-from stages import export, recipes
+from stages import recipes
 from tests.export import made_export
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
@@ -20,11 +20,7 @@ ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("recipes")
-    inputs = made_export.make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
-    return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
+    return made_export.make_exported(tmp_path_factory.mktemp("made"))
 
 
 def drawn(made, out, recipe, **files):
