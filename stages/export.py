@@ -1,7 +1,8 @@
 """What was solved, in the forms that other programs read.
 
 Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
-scenes/<photo>.xml with their meshes and lights, the same scenes for Blender, materials.mtlx and <mesh>.glb.
+scenes/<photo>.xml with their meshes and lights, the same scenes for Blender, materials.mtlx and <mesh>.glb, and losses.json: what is lost on
+the way to other programs.
 """
 
 import logging
@@ -18,6 +19,7 @@ from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectsSlice
 from factorlib.export.blender import ExposedMap, write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
+from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
@@ -62,6 +64,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_lobes(out / "lobes.parquet", lobes)
     materials = reflectances(table)
     write_materialx(out / "materials.mtlx", materials)
+    write_losses(out / "losses.json", materials)
     progress(1, 4, "lights")
     _write_lights(out, lobes, params)
     _write_coverage(out, inputs["solve"], lobes, params)
