@@ -99,7 +99,7 @@ def test_light_of_one_texel_gives_the_radiance_it_should(balls, name):
     assert lit.sum() >= 15
     error = np.abs(found[lit] / expected[lit] - 1)
     assert np.median(error) < 0.01 and np.percentile(error, 90) < 0.05
-    assert not found[(ni == 0) & binary_erosion(ni == 0, np.ones((5, 5)))].any()  # the light itself is not shown
+    assert found[binary_erosion(ni == 0, np.ones((5, 5)))].max() < 0.01 * found.max()  # nor is the light itself shown
 
 
 @pytest.mark.long
@@ -125,7 +125,7 @@ def exported(tmp_path_factory):
 
 
 @pytest.mark.long
-def test_round_trip_shows_what_mitsuba_shows(exported, record_property):
+def test_round_trip_shows_what_mitsuba_shows(exported):
     inputs, out = exported
     photos = list(made_export.MESHES)
     found = in_blender.rendered(out / "scenes", photos, 256)
@@ -134,7 +134,7 @@ def test_round_trip_shows_what_mitsuba_shows(exported, record_property):
         expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
         mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
         error = np.abs(found[photo][mask][:, :3] / expected[mask] - 1)
-        record_property(f"{photo}: median and 95th percentile of the difference", (np.median(error), np.percentile(error, 95)))
+        print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
         assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
         assert found[photo][mask][:, 3].min() == 1.0
 
