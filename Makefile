@@ -16,7 +16,7 @@ all plan why status graph params new compare validate verify clean gc $(STAGES):
 	@$(PY) -m factorlib "$$GOAL"
 
 setup: .venv/ready
-	@:
+	@[ -z "$$EXTRAS" ] || $(PY) -I factorlib/setup.py extras
 
 .venv/ready: requirements.lock factorlib/setup.py
 	@for python in $${PYTHON:+"$$PYTHON"} python3.11 python3.12 python3; do \
@@ -66,6 +66,7 @@ help:
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
+	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX'
 
 .DEFAULT:
 	@test -e .venv/ready || $(MAKE) setup

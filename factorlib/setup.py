@@ -3,6 +3,7 @@
 Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
+    .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="blender interchange": extras of pyproject.toml, into .venv)
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import tomllib
 import urllib.request
 import venv
 from pathlib import Path
@@ -44,6 +46,15 @@ def main() -> None:
     subprocess.run([VENV / "bin" / "python", "-c", "import open3d, torch, mitsuba, OpenImageIO, pycolmap"], check=True, cwd="/")
     READY.write_text(state)
     say("the environment is ready")
+
+
+def install_extras() -> None:
+    """EXTRAS of pyproject.toml, each package alone: .venv has what they need, and bpy would ask for an older NumPy."""
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    asked = os.environ.get("EXTRAS", "").replace(",", " ").split()
+    if unknown := [name for name in asked if name not in known]:
+        sys.exit(f"set-up: there is no extra {unknown[0]!r} in pyproject.toml; there are {', '.join(known)}")
+    pip("install", "--no-deps", *(package for name in asked for package in known[name]))
 
 
 def say(text: str) -> None:
@@ -150,4 +161,4 @@ def command_for(missing: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    install_extras() if sys.argv[1:] == ["extras"] else main()

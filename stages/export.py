@@ -1,7 +1,8 @@
 """What was solved, in the forms that other programs read.
 
 Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
-scenes/<photo>.xml with their meshes and lights, materials.mtlx and <mesh>.glb.
+scenes/<photo>.xml with their meshes and lights, the same scenes for Blender, materials.mtlx and <mesh>.glb, and losses.json: what is lost on
+the way to other programs.
 """
 
 import logging
@@ -15,8 +16,10 @@ import OpenImageIO as oiio
 from factorlib.conventions import lat_long_directions
 from factorlib.dataset import schema
 from factorlib.dataset.schema import LightSlice, MeshEntry, ObjectsSlice
+from factorlib.export.blender import ExposedMap, write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
+from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
@@ -61,6 +64,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_lobes(out / "lobes.parquet", lobes)
     materials = reflectances(table)
     write_materialx(out / "materials.mtlx", materials)
+    write_losses(out / "losses.json", materials)
     progress(1, 4, "lights")
     _write_lights(out, lobes, params)
     _write_coverage(out, inputs["solve"], lobes, params)
@@ -69,14 +73,18 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         write_glb(out / f"{name}.glb", files.read.mesh(name, mesh), names, materials)
     progress(3, 4, "scenes")
+    write_script(out / "scenes")
     poses, max_depth = read_poses(inputs["align"] / "poses.json"), ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, light in lights.items():
         view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
         shapes = [
             shape for obj in objects[photo].objects for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
         ]
-        environment = _environment(out, photo, light, lobes[light.illumination], np.array(exposures.get(photo, [1.0] * 3)), params)
+        exposure = np.array(exposures.get(photo, [1.0] * 3))
+        environment = _environment(out, photo, light, lobes[light.illumination], exposure, params)
         write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment, max_depth)
+        exposed = ExposedMap(f"../illumination/{light.illumination}.exr", exposure, environment.camera_from_light)
+        write_scene_json(out / "scenes" / f"{photo}.json", view, shapes, materials, exposed, max_depth)
     progress(4, 4)
 
 

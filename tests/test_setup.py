@@ -29,3 +29,19 @@ def test_another_python_is_refused(monkeypatch):
 def test_an_index_that_does_not_answer_is_not_used():
     assert not setup.answers("http://localhost:9/none/")
     assert not setup.answers("no address")
+
+
+def test_extras_are_installed_alone(monkeypatch):
+    called = []
+    monkeypatch.setattr(setup, "pip", lambda *words: called.append(words))
+    monkeypatch.setenv("EXTRAS", "blender, interchange")
+    setup.install_extras()
+    ((command, alone, *packages),) = called
+    assert (command, alone) == ("install", "--no-deps")
+    assert [package.split("=")[0].split(">")[0] for package in packages] == ["bpy", "MaterialX"]
+
+
+def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
+    monkeypatch.setenv("EXTRAS", "blunder")
+    with pytest.raises(SystemExit, match=r"'blunder'.*blender, interchange"):
+        setup.install_extras()

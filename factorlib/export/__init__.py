@@ -1,1 +1,1 @@
-"""Results in the forms that other programs read: lat-long EXRs, Mitsuba scenes, MaterialX, glTF."""
+"""Results in the forms that other programs read: lat-long EXRs, scenes for Mitsuba and Blender, MaterialX, glTF, and what is lost there."""

@@ -1,9 +1,15 @@
-"""Materials as MaterialX 1.39, with the nodes of its physically based shading library.
+"""Materials as MaterialX 1.39: with the nodes of its physically based shading library, and as its standard surface.
 
 k_d/π is `oren_nayar_diffuse_bsdf` of roughness 0, exactly.  k_s D G/(4 …) is `generalized_schlick_bsdf` with color0 =
 color90 = k_s/w: GGX of the same α and no Fresnel.  A `mix` of weight w adds them, as Mitsuba's `blendbsdf` does.
+
+Programs without these nodes take `standard_surface`.  Its specular layer is a dielectric, whose Fresnel term is next to one at every angle
+where the index of refraction is very large, and which leaves 1 − specular for the diffuse part.  So
+
+    specular = max k_s,  specular_color = k_s / max k_s,  specular_IOR = 10⁴,  base_color = k_d / (1 − max k_s)
+
 Different from what was solved: MaterialX's renderers shadow with the height-correlated Smith term and give back the
-energy of multiple scattering, so rough speculars come out a few percent brighter.
+energy of multiple scattering (`factorlib.export.viewers`, measured by `factorlib.export.loss`).
 """
 
 from __future__ import annotations
@@ -12,23 +18,34 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
 
+NO_FRESNEL = 1e4  # index of refraction: F0 = 0.9996
+
 
 def write_materialx(path: str | Path, materials: Mapping[str, Reflectance]) -> None:
-    """Write one `surfacematerial` per material, under its own name."""
+    """Write two `surfacematerial` per material: m_<name>, and m_<name>_standard_surface for programs without the nodes of the first."""
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
-        _add_material(document, f"m_{name.replace('-', '_')}", name, material)
+        prefix = f"m_{name.replace('-', '_')}"
+        _add_material(document, prefix, name, material)
+        _add_standard_surface(document, f"{prefix}_standard_surface", f"{name}, standard surface", material)
     ET.indent(document, " ")
     write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n")
 
 
-def _add_material(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
+def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:
+    """Weight w of the specular part, and the colours k_d/(1 − w) and k_s/w of the parts."""
     weight = max(material.specular) / material.total if material.total > 0 else 0.0
     diffuse = [v / (1 - weight) if weight < 1 else 0.0 for v in material.diffuse]
-    specular = [v / weight if weight > 0 else 0.0 for v in material.specular]
+    return weight, np.array(diffuse), np.array([v / weight if weight > 0 else 0.0 for v in material.specular])
+
+
+def _add_material(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
+    weight, diffuse, specular = mixture(material)
     _add(document, "oren_nayar_diffuse_bsdf", f"{prefix}_diffuse", "BSDF", color=diffuse, roughness=0.0)
     schlick = _add(document, "generalized_schlick_bsdf", f"{prefix}_specular", "BSDF", color0=specular, color90=specular)
     _input(schlick, "roughness", "vector2", value=f"{material.alpha!r}, {material.alpha!r}")
@@ -37,16 +54,28 @@ def _add_material(document: ET.Element, prefix: str, name: str, material: Reflec
     _input(mix, "fg", "BSDF", nodename=f"{prefix}_specular")
     _input(mix, "bg", "BSDF", nodename=f"{prefix}_diffuse")
     _input(_add(document, "surface", f"{prefix}_surface", "surfaceshader"), "bsdf", "BSDF", nodename=f"{prefix}_bsdf")
+    _add_surface_material(document, prefix, name)
+
+
+def _add_standard_surface(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
+    brightest = max(material.specular)
+    base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
+    numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
+    _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", base=1.0, base_color=base, specular_color=tint, **numbers)
+    _add_surface_material(document, prefix, name)
+
+
+def _add_surface_material(document: ET.Element, prefix: str, name: str) -> None:
     shader = _add(document, "surfacematerial", prefix, "material")
     shader.set("uiname", name)
     _input(shader, "surfaceshader", "surfaceshader", nodename=f"{prefix}_surface")
 
 
-def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | list[float]) -> ET.Element:
+def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | np.ndarray) -> ET.Element:
     node = ET.SubElement(document, category, name=name, type=kind)
     for key, value in inputs.items():
-        if isinstance(value, float):
-            _input(node, key, "float", value=repr(value))
+        if np.ndim(value) == 0:
+            _input(node, key, "float", value=repr(float(value)))
         else:
             _input(node, key, "color3", value=", ".join(repr(float(v)) for v in value))
     return node

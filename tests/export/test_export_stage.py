@@ -50,9 +50,11 @@ def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_p
 
 def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
-    expected = {"materials.json", "exposures.json", "lobes.parquet", "materials.mtlx", "ball.glb", "egg.glb"}
-    expected |= {f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")} | {f"scenes/{name}.xml" for name in ("front", "side")}
-    expected |= {f"scenes/light/{name}.exr" for name in ("front", "room")}
+    expected = {"materials.json", "exposures.json", "lobes.parquet", "materials.mtlx", "losses.json", "ball.glb", "egg.glb"}
+    expected |= {f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")} | {
+        f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json")
+    }
+    expected |= {"scenes/blender.py"} | {f"scenes/light/{name}.exr" for name in ("front", "room")}
     expected |= {f"scenes/meshes/{name}.ply" for name in ("ball.red", "egg.red", "egg.brass")}
     assert set(first) == expected
     assert first == second

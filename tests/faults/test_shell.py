@@ -25,7 +25,7 @@ TRIES = [
     f"x #\\\n| touch {PWNED}",
     f"$(info $(shell touch {PWNED}))",
 ]
-VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "OTHER"]
+VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
 OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
 ODD = "it's $(touch pwned) \"two\" `touch pwned` \\ ;&|<>*?~ $HOME %s é\n#last"
 

@@ -1,0 +1,162 @@
+"""How other programs reflect light from the exported files: what each documents of its reflection model, as BRDFs.
+
+All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, and in what the specular part leaves for the diffuse one:
+
+    solved               k_d/π + k_s D V,  V = G1(n·i) G1(n·o) / (4 (n·i)(n·o))      (`factorlib.reflection.brdf`)
+    blender              V of the height-correlated Smith term (Heitz 2014, eq. 99), as Cycles' Glossy BSDF "GGX"
+    glb                  glTF 2.0, appendix B, with KHR_materials_specular: Schlick's F to F90 = specularFactor, diffuse × (1 − max F)
+    glb_correlated       the same with the height-correlated term, as most viewers draw it
+    glb_plain            the same in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1
+    mtlx                 MaterialX' own GLSL shaders: height-correlated, times 1 + F (1 − E)/E, E the albedo for F = 1 (Turquin 2019)
+    mtlx_standard_surface  the same; the specular layer leaves 1 − specular · (its albedo for white) for the diffuse one
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.export.gltf import DIELECTRIC, EXTENSION, gltf_material
+from factorlib.export.materialx import mixture
+from factorlib.results.materials import Reflectance
+
+ALBEDO_NODES, ALBEDO_SAMPLES = 64, 4096  # cosines of the albedo's table; half vectors
+GOLDEN = (5**0.5 - 1) / 2
+
+
+class Angles(msgspec.Struct, frozen=True):
+    """Cosines between normal n, direction to the light i, to the viewer o, and half vector h; of one shape."""
+
+    ni: Float[np.ndarray, "*n"]
+    no: Float[np.ndarray, "*n"]
+    nh: Float[np.ndarray, "*n"]
+    oh: Float[np.ndarray, "*n"]
+
+
+class Parts(msgspec.Struct, frozen=True):
+    """A BRDF, 1/steradian: diffuse + D(n·h) · lobe, per channel."""
+
+    diffuse: Float[np.ndarray, "*n 3"]
+    lobe: Float[np.ndarray, "*n 3"]
+
+
+Model = Callable[[Reflectance, Angles], Parts]
+
+
+def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """GGX D, 1/steradian."""
+    return alpha**2 / (np.pi * ((alpha**2 - 1) * nh**2 + 1) ** 2)
+
+
+def solved(material: Reflectance, angles: Angles) -> Parts:
+    """The model of the solve."""
+    return _parts(angles, material.diffuse, material.specular, separable(material.alpha, angles))
+
+
+def blender(material: Reflectance, angles: Angles) -> Parts:
+    """Diffuse BSDF + Glossy BSDF in Cycles."""
+    return _parts(angles, material.diffuse, material.specular, correlated(material.alpha, angles))
+
+
+def glb(material: Reflectance, angles: Angles) -> Parts:
+    """glTF's reference BRDF."""
+    return _gltf(material, angles, separable(material.alpha, angles))
+
+
+def glb_correlated(material: Reflectance, angles: Angles) -> Parts:
+    """glTF with the height-correlated shadowing term."""
+    return _gltf(material, angles, correlated(material.alpha, angles))
+
+
+def glb_plain(material: Reflectance, angles: Angles) -> Parts:
+    """glTF's reference BRDF where the extension is not known."""
+    return _gltf(material, angles, separable(material.alpha, angles), extension=False)
+
+
+def mtlx(material: Reflectance, angles: Angles) -> Parts:
+    """The nodes of `factorlib.export.materialx`."""
+    weight, diffuse, specular = mixture(material)
+    escaped = 1 / albedo(material.alpha, angles.no) - 1
+    brighter = 1 + specular * escaped[..., None]
+    return _parts(angles, (1 - weight) * diffuse, weight * specular * brighter, correlated(material.alpha, angles))
+
+
+def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
+    """The standard surface of `factorlib.export.materialx`, whose F is 1: there E · (1 + (1 − E)/E) = 1."""
+    brighter = 1 / albedo(material.alpha, angles.no)
+    return _parts(angles, material.diffuse, np.multiply.outer(brighter, material.specular), correlated(material.alpha, angles))
+
+
+MODELS: dict[str, Model] = {
+    model.__name__: model for model in (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface)
+}
+
+
+# terms ---------------------------------------------------------------------------------------------------------------
+
+
+def separable(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
+    """G1(n·i) G1(n·o) / (4 (n·i)(n·o)), finite at the horizon."""
+    return 1 / ((angles.ni + _root(alpha, angles.ni)) * (angles.no + _root(alpha, angles.no)))
+
+
+def correlated(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
+    """The height-correlated Smith term over 4 (n·i)(n·o)."""
+    return 0.5 / (angles.no * _root(alpha, angles.ni) + angles.ni * _root(alpha, angles.no))
+
+
+def _root(alpha: float, cosine: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)
+
+
+def albedo(alpha: float, no: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """E: what a height-correlated GGX of F = 1 reflects of a constant light, by n·o; interpolated in a table."""
+    return np.interp(no, *_albedo_table(alpha))
+
+
+@cache
+def _albedo_table(alpha: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    nodes = (np.arange(ALBEDO_NODES) + 1) / ALBEDO_NODES
+    angles, weight = mirrored(alpha, nodes, ALBEDO_SAMPLES)
+    return nodes, (weight * correlated(alpha, angles)).mean(axis=-1)
+
+
+def spread(count: int) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    """Points spread evenly over [0, 1] × [0, π] (Fibonacci's lattice); azimuths beyond π are mirror images."""
+    index = np.arange(count)
+    return (index + 0.5) / count, np.pi * (index * GOLDEN % 1)
+
+
+def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Angles, Float[np.ndarray, "n s"]]:
+    """Directions i for views at n·o = `no`, mirrored at `count` half vectors spread by D(n·h) n·h.
+
+    The mean of weight · lobe is ∫ D · lobe · n·i di; weight = 4 (n·i)(o·h)/(n·h), zero below the horizon.
+    """
+    u, phi = spread(count)
+    nh = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+    oh = no[:, None] * nh + np.sqrt(1 - no[:, None] ** 2) * np.sqrt(1 - nh**2) * np.cos(phi)
+    ni = 2 * oh * nh - no[:, None]
+    weight = np.where((oh > 0) & (ni > 0), 4 * ni * oh / nh, 0.0)
+    shape = weight.shape
+    return Angles(ni.clip(0), np.broadcast_to(no[:, None], shape), np.broadcast_to(nh, shape), oh.clip(0)), weight
+
+
+def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "*n"], extension: bool = True) -> Parts:
+    """From the numbers in the file."""
+    entry = gltf_material(material)
+    base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
+    told = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
+    f90 = told["specularFactor"]
+    f0 = f90 * np.minimum(DIELECTRIC * np.array(told["specularColorFactor"]), 1)
+    fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
+    return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
+
+
+def _parts(angles: Angles, diffuse: np.ndarray | tuple, specular: np.ndarray | tuple, visibility: Float[np.ndarray, "*n"]) -> Parts:
+    """diffuse: an albedo;  specular: F."""
+    shape = (*angles.no.shape, 3)
+    return Parts(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))

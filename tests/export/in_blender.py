@@ -1,0 +1,39 @@
+"""Blender, in a process of its own: its libraries do not get on with others of the same names."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorlib.images.exr import read_exr
+
+MISSING = 'Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH'
+
+
+def rendered(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> dict[str, np.ndarray]:
+    """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
+    jobs = [[photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos]
+    code = f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
+    done = subprocess.run(_command(scenes, code), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return {photo: _rgba(scenes / f"{photo}.blender.exr") for photo in photos}
+
+
+def _command(scenes: Path, code: str) -> list[str]:
+    if importlib.util.find_spec("bpy"):
+        return [sys.executable, "-W", "ignore", "-c", code]
+    if program := shutil.which("blender"):
+        return [program, "--background", "--python-exit-code", "1", "--python-expr", code]
+    pytest.skip(MISSING)
+
+
+def _rgba(path: Path) -> np.ndarray:
+    channels = read_exr(path)
+    return np.stack([channels[name] for name in "RGBA"], axis=-1)
