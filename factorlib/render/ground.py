@@ -1,7 +1,8 @@
 """The plane that a photo's objects stand on: given with the photo, or that on which an object would rest.
 
 A rigid object comes to rest on a facet of its convex hull (Goldberg et al., "Part pose statistics", 1999; `trimesh` computes how
-likely each is from a random drop).  Of the facets that look down in the photo, the likeliest is taken: people photograph things upright.
+likely each is from a random drop).  Of the facets that look down in the photos of the object, taken together, the likeliest is
+taken: people photograph things upright, a tall one from below and a low one from above.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.render.photo_scene import Placed
 
-MOST_TILT_DEG = 50.0  # of the upright axis against the camera's: photos look down on things, and are held askew
+MOST_TILT_DEG = 50.0  # of the upright axis against the cameras', on the mean: photos look down on things, and are held askew
 
 
 class Plane(msgspec.Struct, frozen=True):
@@ -35,18 +36,23 @@ class Plane(msgspec.Struct, frozen=True):
         return np.where((distance > 0) & (down < 0), distance, np.nan)[:, None] * rays
 
 
-def resting_plane(placed: Placed) -> Plane:
-    """The plane that an object rests on; InputError where it could rest on none that looks upright in the photo."""
-    vertices = placed.vertices
-    hull = trimesh.convex.convex_hull(vertices - vertices.mean(axis=0))
-    poses, chances = trimesh.poses.compute_stable_poses(hull, n_samples=1)
-    normals = poses[:, 2, :3]  # z of the resting pose, in the world
-    upright = normals[:, 1] > np.cos(np.radians(MOST_TILT_DEG))
+def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
+    """The plane that an object rests on in the world; InputError where it could rest on none that looks upright in the photos.
+
+    uprights: the unit upward axes of the cameras that see the object, in its own frame; by default that of this photo
+    """
+    rotation = placed.world_from_object[:3, :3]
+    rotation = rotation / np.cbrt(np.linalg.det(rotation))
+    uprights = rotation.T[:, 1][None] if uprights is None else uprights
+    vertices = placed.mesh.vertices
+    poses, chances = trimesh.poses.compute_stable_poses(trimesh.convex.convex_hull(vertices - vertices.mean(axis=0)), n_samples=1)
+    normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
+    upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
-        found = f"the object '{placed.name}' rests on no side that looks down in the photo"
+        found = f"the object '{placed.name}' rests on no side that looks down in its photos"
         raise InputError(found, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
-    normal = normals[np.argmax(np.where(upright, chances, -1))]
-    lowest = vertices[np.argmin(vertices @ normal)]
+    normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
+    lowest = placed.vertices[np.argmin(placed.vertices @ normal)]
     return Plane(normal / np.linalg.norm(normal), lowest)
 
 

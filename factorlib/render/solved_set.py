@@ -114,7 +114,8 @@ class SolvedSet:
         """Given with the photo, or what the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
-            return Ground(resting_plane(neighbour))
+            mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
+            return Ground(resting_plane(neighbour, self._uprights(mesh)))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
         return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
@@ -130,6 +131,12 @@ class SolvedSet:
         placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
         upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
         return placed.mesh, tuple([material] * len(self.names)) if material else placed.materials, upright
+
+    def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
+        """The upward axes of the cameras of all objects of that mesh, in its frame."""
+        seen = [self.poses[photo].objects[obj.name] for photo, o in self.objects.items() for obj in o.objects if obj.mesh == mesh]
+        trusted = [pose for pose in seen if not pose.left_out] or seen
+        return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
         pose = poses.objects[obj.name]

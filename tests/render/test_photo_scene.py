@@ -99,6 +99,14 @@ def test_a_box_stands_on_its_largest_side_that_looks_down():
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
 
 
+def test_what_a_steep_photo_leaves_open_other_photos_of_the_object_decide():
+    steep = rotation_of_vector(np.radians(60) * np.array([1.0, 0, 0]))
+    tower = placed("tower", box(1, 4, 1), (0, 0, -9), rotation=steep)
+    assert np.allclose(resting_plane(tower).normal, steep @ [0, 0, -1], atol=1e-6)  # as if it lay
+    uprights = np.stack([rotation_of_vector(np.radians(d) * np.array([1.0, 0, 0])).T @ [0, 1, 0] for d in (60, 0, 10)])
+    assert np.allclose(resting_plane(tower, uprights).normal, steep @ [0, 1, 0], atol=1e-6)
+
+
 def test_an_object_that_stands_on_no_side_is_refused():
     askew = rotation_of_vector(np.radians(54.7) * np.array([1.0, 0, -1.0]) / 2**0.5)  # a cube on its corner
     with pytest.raises(InputError, match="rests on no side"):

@@ -17,6 +17,7 @@ for (const panels of document.querySelectorAll(".panels")) {
   const moved = () => { over.style.clipPath = `inset(0 ${100 - slider.value}% 0 0)`; };
   slider.addEventListener("input", moved);
   cut.after(slider);
+  cut.parentElement.querySelector("figcaption").append(" – slide to lay the photo over it");
   moved();
 }
 
