@@ -62,6 +62,7 @@ help:
 	@echo 'make bench-solve                     the joint solve: speed against error, to build/bench/solve'
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
+	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
 	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'

@@ -11,25 +11,24 @@ import msgspec
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import binary_erosion
 
+from benchmarks.browser import CHROMIUM, opened
+from benchmarks.viewer import ball_seen, error, rendered, shown
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.picture import picture
-from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import Reflector
 from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.forms import forms
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
-from tests.report.browser import needs_chromium, opened
 from tests.report.test_page import page_of, run
 
 SIZE = 64
-HALF_FIELD = np.radians(15)
-BACK = 1.04 / np.sin(HALF_FIELD)  # distance of the eye, in radii
+needs_chromium = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page"
+)
 
 
 @pytest.fixture(scope="module")
@@ -127,45 +126,14 @@ def browser(made):
         yield page, complaints
 
 
-def radiance(page, mesh: int, material: str, photo: str, view: dict) -> np.ndarray:
-    """[SIZE, SIZE, 4], the uppermost row first."""
-    chosen = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stops": 0, **view}
-    script = """([mesh, photo, chosen, size]) => {
-      const {renderer, data} = window.viewer;
-      return Array.from(renderer.radiance({...chosen, mesh: renderer.meshes.at(mesh), photo: data.photos.find((p) => p.name === photo)}, size));
-    }"""
-    found = page.evaluate(script, [mesh, photo, {**chosen, "material": material}, SIZE])
-    return np.array(found).reshape(SIZE, SIZE, 4)[::-1]
-
-
-def ball_seen(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals and views (y-up) of the pixels inside a unit ball's outline, and those pixels."""
-    back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    right = np.cross([0, 1, 0], back) / np.hypot(back[0], back[2])
-    x, y = np.meshgrid(*(((np.arange(SIZE) + 0.5) / SIZE * 2 - 1) * np.tan(HALF_FIELD) * sign for sign in (1, -1)))
-    ray = x[..., None] * right + y[..., None] * np.cross(back, right) - back
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    along = -BACK * ray @ back
-    under = along**2 - BACK**2 + 1
-    inside = binary_erosion(under > 0, iterations=2)
-    hit = BACK * back + (along - np.sqrt(np.maximum(under, 0)))[..., None] * ray
-    return hit[inside], -ray[inside], inside
-
-
-def expected(material: str, photo: int, normals: np.ndarray, views: np.ndarray, turn: float = 0.0) -> np.ndarray:
-    c, s = np.cos(turn), np.sin(turn)
-    light = lobes_of(photo).turned(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ YUP_FROM_CAMERA)
-    return Reflector(reflection_operator("network"), light, 0.0)(perturbed(TRUE[material], 1.0), normals, views)
-
-
 @needs_chromium
 @pytest.mark.parametrize("material, view", [("brass", {}), ("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})])
 def test_it_shows_what_the_pipeline_renders(browser, material, view):
     """The glossiest material and the roughest; 2 % at the 95th percentile of pixels."""
-    normals, views, inside = ball_seen(view.get("azimuth", 0.0), view.get("elevation", 0.0))
-    found, want = radiance(browser[0], -1, material, "noon", view)[inside], expected(material, 1, normals, views, view.get("turn", 0.0))
-    error = np.abs(found[:, :3] - want).max(axis=1) / want.max(axis=1)
-    assert np.percentile(error, 95) < 0.02 and np.allclose(found[:, 3], 1, atol=1e-5)
+    normals, views, inside = ball_seen(view.get("azimuth", 0.0), view.get("elevation", 0.0), SIZE)
+    found = shown(browser[0], -1, material, "noon", view, SIZE)[inside]
+    want = rendered(lobes_of(1), perturbed(TRUE[material], 1.0), normals, views, view.get("turn", 0.0))
+    assert np.percentile(error(found[:, :3], want), 95) < 0.02 and np.allclose(found[:, 3], 1, atol=1e-5)
 
 
 @needs_chromium
@@ -214,8 +182,8 @@ def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     box = page.locator("#viewer canvas").bounding_box()
     clip = {"x": round(box["x"]), "y": round(box["y"]), "width": SIZE, "height": SIZE}
     shot = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
-    normals, views, inside = ball_seen(0.0, 0.0)
-    want = picture(expected("brass", 1, normals, views), exposure).astype(float)
+    normals, views, inside = ball_seen(0.0, 0.0, SIZE)
+    want = picture(rendered(lobes_of(1), perturbed(TRUE["brass"], 1.0), normals, views), exposure).astype(float)
     assert np.median(np.abs(np.asarray(shot).astype(float)[inside] - want)) < 3
 
 

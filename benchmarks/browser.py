@@ -1,4 +1,4 @@
-"""A page in headless Chromium, drawn in software; tests skip where there is no Chromium."""
+"""A page in headless Chromium, drawn in software."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
 ]  # fmt: skip
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page")
 
 
 @cache
 def chromium():
-    """One browser for all tests of a process: Playwright allows no second."""
+    """One browser a process: Playwright allows no second."""
     from playwright.sync_api import sync_playwright
 
     playwright = sync_playwright().start()
