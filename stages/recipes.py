@@ -91,6 +91,9 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     polish = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness) if any(recipe.ground.specular) else None
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
+    if not ground.plane.seen_from_above:
+        found = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
+        raise InputError(found, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
     known = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's alone
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:

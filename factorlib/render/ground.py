@@ -24,6 +24,11 @@ class Plane(msgspec.Struct, frozen=True):
     normal: Float[np.ndarray, "3"]
     point: Float[np.ndarray, "3"]
 
+    @property
+    def seen_from_above(self) -> bool:
+        """Whether the camera, at the origin, is on the side of the objects."""
+        return float(self.point @ self.normal) < 0
+
     def onto(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The points of the plane nearest to `points`."""
         return points - ((points - self.point) @ self.normal)[:, None] * self.normal

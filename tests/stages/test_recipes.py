@@ -113,3 +113,10 @@ def test_a_photo_that_cannot_be_drawn_is_left_out_with_a_warning_where_nobody_na
     none = Inputs(made.folders, {**made.facts, "dataset.objects": dict.fromkeys(objects, objects["front"])}, made.files)
     with pytest.raises(InputError, match="no objects"):
         drawn(none, tmp_path / "none", schema.Resynthesis())
+
+
+def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
+    grounds = {**made.facts["dataset.ground"], "front": {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}}  # y is down
+    below = Inputs(made.folders, {**made.facts, "dataset.ground": grounds}, made.files)
+    with pytest.raises(InputError, match="'front' was taken from below"):
+        drawn(below, tmp_path / "out", schema.Insert(photos=["front"], samples=1))
