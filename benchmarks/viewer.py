@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
 from benchmarks.browser import opened
-from benchmarks.markdown import ROOT, table
+from benchmarks.markdown import ROOT, refresh, table
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
@@ -67,7 +67,7 @@ def error(found: Float[np.ndarray, "n 3"], wanted: Float[np.ndarray, "n 3"]) -> 
 
 
 def main(build: Path) -> None:
-    """Print the two tables."""
+    """Print the two tables, and write them into docs/formats.md where they are of data/eames."""
     materials = reflectances(read_materials(build / "export/materials.json"))
     lights = read_lobes(build / "export/lobes.parquet")
     normals, views, inside = ball_seen(0.0, 0.0)
@@ -81,13 +81,18 @@ def main(build: Path) -> None:
                 for photo, light in photos.items()
             ])  # fmt: skip
             rows.append([material, f"{reflectance.roughness:.2f}", *(f"{100 * e:.2f} %" for e in np.percentile(errors, [50, 95, 100]))])
-        print(table(["material", "roughness", "median", "95th percentile", "worst"], rows), flush=True)
+        errors_of = table(["material", "roughness", "median", "95th percentile", "worst"], rows)
+        print(errors_of, flush=True)
         times = []
         for size in (512, 256, 128):
             page.evaluate(f"viewer.seconds(3, {size})")
             seconds = page.evaluate(f"Array.from({{length: {FRAMES}}}, () => viewer.seconds(1, {size}))")
             times.append([f"{size}²", f"{1000 * min(seconds):.0f} ms", f"{1000 * np.median(seconds):.0f} ms"])
-        print(table(["pixels", "smallest", "median"], times))
+    times_of = table(["pixels", "smallest", "median"], times)
+    print(times_of)
+    if build.name == "eames":
+        text = f"{errors_of}\n\nA frame, of {FRAMES}:\n\n{times_of}"
+        refresh(ROOT / "docs/formats.md", {"viewer": text}, "benchmarks.viewer")
 
 
 if __name__ == "__main__":

@@ -27,14 +27,19 @@ NO_FRESNEL = 1e4  # index of refraction: F0 = 0.9996
 
 
 def write_materialx(path: str | Path, materials: Mapping[str, Reflectance]) -> None:
-    """Write two `surfacematerial` per material: m_<name>, and m_<name>_standard_surface for programs without the nodes of the first."""
+    """Write the text of `materialx`."""
+    write_text(path, materialx(materials))
+
+
+def materialx(materials: Mapping[str, Reflectance]) -> str:
+    """A document of two `surfacematerial` per material: m_<name>, and m_<name>_standard_surface for programs without the nodes of the first."""
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
         prefix = f"m_{name.replace('-', '_')}"
         _add_material(document, prefix, name, material)
         _add_standard_surface(document, f"{prefix}_standard_surface", f"{name}, standard surface", material)
     ET.indent(document, " ")
-    write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n")
+    return '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
 
 
 def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:

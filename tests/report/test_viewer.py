@@ -113,6 +113,8 @@ def test_forms_hold_the_numbers():
     assert json.loads(found["numbers"])["brass"]["roughness"] == 0.25
     assert json.loads(found["glTF"])["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
     assert found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">') and "MeshPhysicalMaterial" in found["three.js"]
+    compile(found["Blender"], "console", "exec")
+    assert "0.05, 0.04, 0.02, 1" in found["Blender"] and 'name="m_brass"' in found["MaterialX"]
 
 
 # ── In a browser ─────────────────────────────────────────────────────────────────────────────────────────────────────
