@@ -32,8 +32,8 @@ class LightRow(msgspec.Struct, frozen=True):
     """An environment map: `white` is the radiance shown as white, `peak` the brightest texel in units of it.
 
     overflow: share of the sphere that is brighter than white, outlined; energy: its share of the light.
-    known: share of the sphere where the light's standard error is below its mean radiance; known_uri: that error as grey,
-    white where it is nil, black where it is many times the mean.
+    known: share of the sphere where the standard error is below the radiance there, or below the mean radiance where that is larger;
+    known_uri: that error as grey, white where it is nil, mid-grey where it is as large, black where it is many times that.
     """
 
     name: str
@@ -122,7 +122,8 @@ def light_row(run: Artifacts, name: str, photos: list[str], errors: dict[str, di
     brightest, area = radiance.max(axis=-1) * exposure, lat_long_solid_angles(*radiance.shape[:2])[:, None]
     over, energy = brightest > 1, radiance.sum(axis=-1) * area
     true, known = run.true_illumination(name), run.coverage(name)
-    error = None if known is None else known.mean(axis=-1)
+    mean = float((radiance * area[..., None]).sum() / (3 * area.sum() * radiance.shape[1]))
+    error = None if known is None else known.mean(axis=-1) / np.maximum(1, radiance.mean(axis=-1) / max(mean, 1e-30))
     return LightRow(
         name=name, photos=photos, white=1 / exposure, peak=float(brightest.max()),
         uri=data_uri(_outlined(picture(radiance, exposure), over)), dark_uri=data_uri(picture(radiance, exposure / 16)),

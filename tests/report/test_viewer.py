@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import shutil
 
 import msgspec
 import numpy as np
@@ -14,12 +15,14 @@ from PIL import Image
 
 from benchmarks.browser import CHROMIUM, opened
 from benchmarks.viewer import ball_seen, error, rendered, shown
-from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
+from factorlib.images.exr import write_rgb_exr
 from factorlib.images.picture import picture
 from factorlib.report import viewer
+from factorlib.report.appearance import light_row
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.forms import forms
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
@@ -244,3 +247,17 @@ def test_without_webgl_it_says_so(made, tmp_path):
     with opened(tmp_path / "index.html") as (page, complaints):
         assert "this browser offers no WebGL 2" in page.inner_text("#viewer-missing")
         assert not page.is_visible("#viewer") and complaints == []
+
+
+def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
+    """An error of twice the mean radiance is small where the light is brighter than that."""
+    run_, _, _ = artifacts(made[0])
+    shutil.copytree(made[0]["export"], tmp_path / "export")
+    run_ = msgspec.structs.replace(run_, folders={**run_.folders, "export": tmp_path / "export"})
+    light = run_.illumination("day")
+    (tmp_path / "export" / "coverage").mkdir()
+    write_rgb_exr(tmp_path / "export" / "coverage" / "day.exr", np.full_like(light, 2.0))
+    area = lat_long_solid_angles(*light.shape[:2])[:, None] * np.ones(light.shape[1])
+    grey = light.mean(axis=-1)
+    bright = grey > 2 * (grey * area).sum() / (4 * np.pi)
+    assert light_row(run_, "day", ["day"], None).known == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3) and bright.any()
