@@ -1,5 +1,4 @@
 // What the page does beside the viewer: cut between photo and re-synthesis, expose the maps, copy a material's numbers.
-"use strict";
 (() => {
 document.documentElement.classList.add("scripted");
 
@@ -25,22 +24,15 @@ for (const panels of document.querySelectorAll(".panels")) {
 
 const ROWS = 128, COLUMNS = 256;
 const drawn = new Map();
-const lights = (() => {
-  const text = document.getElementById("viewer-data");
-  return text ? JSON.parse(text.textContent).lights : {};
-})();
+const lights = viewer_data?.lights ?? {};
 
 // Radiance by texel, y up: the middle of the picture is +z, +x a quarter of the width from the left.
 function lat_long(light) {
-  const lobes = new Float32Array(Uint8Array.from(atob(light.lobes), (c) => c.charCodeAt(0)).buffer), out = new Float32Array(3 * ROWS * COLUMNS);
+  const out = new Float32Array(3 * ROWS * COLUMNS);
   for (let row = 0, k = 0; row < ROWS; row++)
     for (let column = 0; column < COLUMNS; column++, k++) {
       const theta = Math.PI * (row + 0.5) / ROWS, phi = Math.PI * (1 - 2 * (column + 0.5) / COLUMNS), s = Math.sin(theta);
-      const x = s * Math.sin(phi), y = Math.cos(theta), z = s * Math.cos(phi);
-      for (let j = 0; j < lobes.length; j += 7) {
-        const e = 0.5 * lobes[j + 3] * ((x - lobes[j]) ** 2 + (y - lobes[j + 1]) ** 2 + (z - lobes[j + 2]) ** 2);
-        if (e < 30) for (let c = 0, g = Math.exp(-e); c < 3; c++) out[3 * k + c] += g * lobes[j + 4 + c];
-      }
+      add_radiance(light.lobes, s * Math.sin(phi), Math.cos(theta), s * Math.cos(phi), out, k);
     }
   return out;
 }

@@ -10,14 +10,12 @@
 // While something moves, one pass of QUICK samples is shown, of fewer pixels where frames are slow.  After that PASSES of them
 // are averaged, each a little displaced within its pixel, and the texels are those of all these samples together, so that what
 // is shown tends to the integral.
-"use strict";
 (() => {
 const QUICK = 4, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
 const LEAST_ALPHA = 1e-3, OWN = "";
 
 // ── Numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 const times = (a, b) => { // 3x3, row by row
   const out = new Array(9);
   for (let i = 0; i < 9; i++) out[i] = a[i - i % 3] * b[i % 3] + a[i - i % 3 + 1] * b[i % 3 + 3] + a[i - i % 3 + 2] * b[i % 3 + 6];
@@ -46,16 +44,6 @@ function each_texel(size, visit) {
       }
 }
 
-// Sum of lobes w exp(-sharpness |d - axis|^2 / 2) in direction d, into out[3 k ...].
-function add_radiance(lobes, d, out, k) {
-  for (let j = 0; j < lobes.length; j += 7) {
-    const x = d[0] - lobes[j], y = d[1] - lobes[j + 1], z = d[2] - lobes[j + 2], e = 0.5 * lobes[j + 3] * (x * x + y * y + z * z);
-    if (e > 30) continue;
-    const g = Math.exp(-e);
-    out[3 * k] += g * lobes[j + 4]; out[3 * k + 1] += g * lobes[j + 5]; out[3 * k + 2] += g * lobes[j + 6];
-  }
-}
-
 // The light as texels of a cube map, and its irradiance over pi by normal; both over `unit`, so that half floats hold them.
 function drawn_light(light) {
   const size = light.face, lobes = light.lobes, radiance = new Float32Array(18 * size * size);
@@ -63,7 +51,7 @@ function drawn_light(light) {
   coarse.flux = new Float64Array(18 * n * n); coarse.direction = [];
   let power = 0;
   each_texel(size, (k, d, area) => {
-    add_radiance(lobes, d, radiance, k);
+    add_radiance(lobes, ...d, radiance, k);
     const face = Math.floor(k / (size * size)), row = Math.floor(k / size) % size, column = k % size;
     const into = (face * n + Math.floor(row / block)) * n + Math.floor(column / block);
     for (let c = 0; c < 3; c++) { coarse.flux[3 * into + c] += area * radiance[3 * k + c]; power += area * radiance[3 * k + c]; }
@@ -477,11 +465,10 @@ class Viewer {
   }
 }
 
-const data = JSON.parse(document.getElementById("viewer-data").textContent);
-for (const light of Object.values(data.lights)) light.lobes = new Float32Array(bytes(light.lobes));
 const root = document.getElementById("viewer");
+if (!viewer_data) return;
 try {
-  window.viewer = new Viewer(root, data);
+  window.viewer = new Viewer(root, viewer_data);
   root.hidden = false; document.getElementById("viewer-missing").hidden = true;
   window.viewer.changed();
 } catch (error) {
