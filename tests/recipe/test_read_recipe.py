@@ -13,9 +13,11 @@ from factorlib.recipe.schema import KINDS, Insert, recipe_of
 from factorlib.recipe.table import read_table
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
 from factorlib.runner.project import LIBRARY
+from factorlib.yamlfile import load_yaml, read_yaml
 
 EAMES = LIBRARY / "data" / "eames"
-RECIPES = sorted((LIBRARY / "recipes").rglob("*.yaml"))
+RECIPES = sorted((LIBRARY / "recipes").glob("*.yaml")) + sorted((LIBRARY / "recipes" / "eames").glob("*.yaml"))
+OF_OTHER_SETS = sorted(set((LIBRARY / "recipes").rglob("*.yaml")) - set(RECIPES))  # sets that do not come with the project
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +35,11 @@ def written(folder: Path, text: str) -> Path:
 def test_recipes_that_come_with_the_project_are_good_and_survive_the_way_to_a_stage(path, dataset):
     recipe = read_recipe(path, dataset)
     assert recipe_of(msgspec.to_builtins(recipe)) == recipe
+
+
+@pytest.mark.parametrize("path", OF_OTHER_SETS, ids=lambda path: path.stem)
+def test_recipes_of_other_sets_are_of_a_kind_and_its_fields(path):
+    assert read_yaml(path, KINDS[load_yaml(path)["kind"]])
 
 
 def test_every_kind_has_a_recipe_that_comes_with_the_project(dataset):
