@@ -74,6 +74,7 @@ def test_exposure_is_intensity_times_colour_and_no_light_has_a_colour_too():
 @pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
 def test_shader_reflects_what_was_solved_at_normal_incidence(material):
     found = shader_inputs(material)
+    assert (found["useSpecularWorkflow"] == 0) == (material is METAL)
     if found["useSpecularWorkflow"]:
         f0, diffuse = found["specularColor"], found["diffuseColor"] * (1 - found["specularColor"])
     else:
