@@ -67,7 +67,7 @@ help:
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
-	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX'
+	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
 
 .DEFAULT:
 	@test -e .venv/ready || $(MAKE) setup

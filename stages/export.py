@@ -1,8 +1,8 @@
 """What was solved, in the forms that other programs read.
 
-Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that Mitsuba needs,
-scenes/<photo>.xml with their meshes and lights, the same scenes for Blender, materials.mtlx and <mesh>.glb, and losses.json: what is lost on
-the way to other programs.
+Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that
+Mitsuba needs, scenes/<photo>.xml with their meshes and lights, the same scenes for Blender and as OpenUSD, materials.mtlx and <mesh>.glb,
+and losses.json: what is lost on the way to other programs.
 """
 
 import logging
@@ -23,6 +23,7 @@ from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
+from factorlib.export.usd import SUFFIX, write_usd_mesh, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.images.hdr import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
@@ -85,6 +86,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment, max_depth)
         exposed = ExposedMap(f"../illumination/{light.illumination}.exr", exposure, environment.camera_from_light)
         write_scene_json(out / "scenes" / f"{photo}.json", view, shapes, materials, exposed, max_depth)
+        write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", view, shapes, materials, exposed)
     progress(4, 4)
 
 
@@ -163,6 +165,8 @@ class MeshFiles:
             stem = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
             mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
             for label in mesh.labels:
-                write_ply(self.scenes / f"{stem}.{self.materials[label - 1]}.ply", submesh(mesh, label))
+                part, file = submesh(mesh, label), self.scenes / f"{stem}.{self.materials[label - 1]}"
+                write_ply(f"{file}.ply", part)
+                write_usd_mesh(f"{file}{SUFFIX}", part)
             self._stems[key] = stem
         return self._stems[key]

@@ -38,7 +38,7 @@ def test_extras_are_installed_alone(monkeypatch):
     setup.install_extras()
     ((command, alone, *packages),) = called
     assert (command, alone) == ("install", "--no-deps")
-    assert [package.split("=")[0].split(">")[0] for package in packages] == ["bpy", "MaterialX"]
+    assert [package.split("=")[0].split(">")[0] for package in packages] == ["bpy", "MaterialX", "usd-core"]
 
 
 def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.viewers import MODELS, Angles, Model, distribution, mirrored, solved, spread
+from factorlib.export.viewers import MODELS, Angles, Model, distribution, filed, mirrored, solved, spread
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 
@@ -42,7 +42,7 @@ def losses(material: Reflectance) -> dict[str, Loss]:
     """Of each of `viewers.MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     true = ball(material, solved)
-    return {name: _loss(ball(material, model), true) for name, model in MODELS.items()}
+    return {name: _loss(ball(filed(name, material), model), true) for name, model in MODELS.items()}
 
 
 def _loss(shown: list[np.ndarray], true: list[np.ndarray]) -> Loss:

@@ -97,7 +97,7 @@ def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:
     sensor = ET.SubElement(scene, "sensor", type="perspective")
     (cx, cy), (w, h) = view.principal_point, (view.width, view.height)
     offset = {"principal_point_offset_x": (w / 2 - cx) / w, "principal_point_offset_y": (h / 2 - cy) / h}
-    near, far = _clip_distances(shapes)
+    near, far = clip_distances(shapes)
     field = float(np.degrees(2 * np.arctan(w / (2 * view.focal_px))))
     _values(sensor, float={"fov": field, **offset, "near_clip": near, "far_clip": far}, string={"fov_axis": "x"})
     ET.SubElement(ET.SubElement(sensor, "transform", name="to_world"), "lookat", origin="0, 0, 0", target="0, 0, -1", up="0, 1, 0")
@@ -107,7 +107,7 @@ def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:
     _values(ET.SubElement(sensor, "sampler", type="multijitter"), integer={"sample_count": "$spp"})
 
 
-def _clip_distances(shapes: Sequence[Shape]) -> tuple[float, float]:
+def clip_distances(shapes: Sequence[Shape]) -> tuple[float, float]:
     """Near and far, of the objects' distances: generous, for the meshes' extents are not known here."""
     distances = [float(np.linalg.norm(shape.cam_from_object[:3, 3])) for shape in shapes] or [1.0]
     return 1e-3 * min(distances), 1e3 * max(distances)

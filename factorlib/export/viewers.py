@@ -9,6 +9,7 @@ All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, a
     glb_plain            the same in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1
     mtlx                 MaterialX' own GLSL shaders: height-correlated, times 1 + F (1 − E)/E, E the albedo for F = 1 (Turquin 2019)
     mtlx_standard_surface  the same; the specular layer leaves 1 − specular · (its albedo for white) for the diffuse one
+    usd                  UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader; V, not specified, as solved
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from jaxtyping import Float
 
 from factorlib.export.gltf import DIELECTRIC, EXTENSION, gltf_material
 from factorlib.export.materialx import mixture
+from factorlib.export.usd import shader_inputs, with_roughness_of_file
 from factorlib.results.materials import Reflectance
 
 ALBEDO_NODES, ALBEDO_SAMPLES = 64, 4096  # cosines of the albedo's table; half vectors
@@ -91,9 +93,25 @@ def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
     return _parts(angles, material.diffuse, np.multiply.outer(brighter, material.specular), correlated(material.alpha, angles))
 
 
+def usd(material: Reflectance, angles: Angles) -> Parts:
+    """UsdPreviewSurface, from the numbers in the file; roughness: the material's, which `filed` has made the file's."""
+    told = shader_inputs(material)
+    base = told["diffuseColor"]
+    if not told["useSpecularWorkflow"]:  # a metal
+        return _parts(angles, np.zeros(3), base, separable(material.alpha, angles))
+    f0 = told["specularColor"]
+    fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, 1 - f0)
+    return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
+
+
 MODELS: dict[str, Model] = {
-    model.__name__: model for model in (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface)
+    model.__name__: model for model in (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface, usd)
 }
+
+
+def filed(name: str, material: Reflectance) -> Reflectance:
+    """The material with the roughness that the file of a model of `MODELS` gives it."""
+    return with_roughness_of_file(material) if name == usd.__name__ else material
 
 
 # terms ---------------------------------------------------------------------------------------------------------------

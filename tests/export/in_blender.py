@@ -21,12 +21,17 @@ def rendered(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> 
     """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
     jobs = [[photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos]
     code = f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
-    done = subprocess.run(_command(scenes, code), capture_output=True, text=True, check=False)
+    run(code)
+    return {photo: rgba(scenes / f"{photo}.blender.exr") for photo in photos}
+
+
+def run(code: str) -> None:
+    """Python in Blender; skips the test where there is none."""
+    done = subprocess.run(_command(code), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    return {photo: _rgba(scenes / f"{photo}.blender.exr") for photo in photos}
 
 
-def _command(scenes: Path, code: str) -> list[str]:
+def _command(code: str) -> list[str]:
     if importlib.util.find_spec("bpy"):
         return [sys.executable, "-W", "ignore", "-c", code]
     if program := shutil.which("blender"):
@@ -34,6 +39,7 @@ def _command(scenes: Path, code: str) -> list[str]:
     pytest.skip(MISSING)
 
 
-def _rgba(path: Path) -> np.ndarray:
+def rgba(path: Path) -> np.ndarray:
+    """[rows, columns, 4] of an EXR."""
     channels = read_exr(path)
     return np.stack([channels[name] for name in "RGBA"], axis=-1)

@@ -52,10 +52,10 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
     expected = {"materials.json", "exposures.json", "lobes.parquet", "materials.mtlx", "losses.json", "ball.glb", "egg.glb"}
     expected |= {f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")} | {
-        f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json")
+        f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json", "usda")
     }
     expected |= {"scenes/blender.py"} | {f"scenes/light/{name}.exr" for name in ("front", "room")}
-    expected |= {f"scenes/meshes/{name}.ply" for name in ("ball.red", "egg.red", "egg.brass")}
+    expected |= {f"scenes/meshes/{name}.{kind}" for name in ("ball.red", "egg.red", "egg.brass") for kind in ("ply", "usda")}
     assert set(first) == expected
     assert first == second
 
@@ -75,9 +75,11 @@ def test_another_choice_of_materials_for_a_mesh_gets_its_own_files(inputs, tmp_p
         "objects": [{"name": "chair", "mesh": "egg", "materials": {"upper": "unseen", "lower": "unseen"}}]
     }
     out = run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
-    assert {p.name for p in (out / "scenes" / "meshes").iterdir()} == {"egg.unseen.ply", "egg.2.red.ply", "egg.2.brass.ply"}
+    meshes = {f"{name}.{kind}" for name in ("egg.unseen", "egg.2.red", "egg.2.brass") for kind in ("ply", "usda")}
+    assert {p.name for p in (out / "scenes" / "meshes").iterdir()} == meshes
     assert "egg.unseen.ply" in (out / "scenes" / "front.xml").read_text()
     assert "egg.2.red.ply" in (out / "scenes" / "side.xml").read_text()
+    assert "@./meshes/egg.2.red.usda@" in (out / "scenes" / "side.usda").read_text()
 
 
 def test_a_coloured_exposure_has_a_map_of_its_own(inputs, tmp_path):

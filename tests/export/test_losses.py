@@ -17,7 +17,7 @@ COLOURED = Reflectance((0.2, 0.3, 0.4), (0.5, 0.2, 0.05), 0.4)
 LAMBERTIAN = Reflectance((0.4, 0.3, 0.2), (0, 0, 0), 0.6)
 BLACK = Reflectance((0, 0, 0), (0, 0, 0), 0.5)
 MIRROR = Reflectance((0.1, 0.2, 0.3), (0.5, 0.4, 0.3), 0.0)
-WITH_EXTENSION = [name for name in MODELS if name != "glb_plain"]
+WITHOUT_FRESNEL = [name for name in MODELS if name not in ("glb_plain", "usd")]
 
 
 def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
@@ -59,8 +59,18 @@ def test_the_solved_model_is_the_operators():
 @pytest.mark.parametrize("material", [LAMBERTIAN, BLACK], ids=["lambertian", "black"])
 def test_without_specular_part_nothing_is_lost_but_by_viewers_that_add_one(material):
     found = loss.losses(material)
-    assert all(found[name] == loss.Loss(0.0, 0.0) for name in WITH_EXTENSION)
+    assert all(found[name] == loss.Loss(0.0, 0.0) for name in WITHOUT_FRESNEL)
     assert np.isfinite(found["glb_plain"].mean) and found["glb_plain"].mean > 0.01
+    assert 0 < found["usd"].mean < (0.005 if material is LAMBERTIAN else 2)
+
+
+def test_usd_bends_what_has_both_parts_and_neither_metals_nor_what_is_seen_along_the_light():
+    assert loss.losses(Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7))["usd"] == loss.Loss(0.0, 0.0)
+    assert loss.losses(GREY)["usd"].worst > 0.05
+    along = Angles(np.array([0.7]), np.array([0.7]), np.array([0.7]), np.ones(1))  # h = i = o: no Fresnel
+    found, expected = viewers.usd(COLOURED, along), viewers.solved(COLOURED, along)
+    np.testing.assert_allclose(found.diffuse, expected.diffuse, rtol=1e-9)
+    np.testing.assert_allclose(found.lobe, expected.lobe, rtol=1e-9)
 
 
 def test_a_grey_specular_part_has_no_fresnel_in_gltf():

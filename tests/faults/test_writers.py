@@ -17,6 +17,7 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.export.materialx import write_materialx
+from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
@@ -74,6 +75,7 @@ WRITERS = {
     "export: PLY": ("a.ply", lambda path: write_ply(path, mesh())),
     "export: glTF": ("a.glb", lambda path: write_glb(path, mesh(), ["red", "wood"], GLOSS)),
     "export: MaterialX": ("a.mtlx", lambda path: write_materialx(path, GLOSS)),
+    "export: USD": ("a.usda", lambda path: write_usd_mesh(path, mesh())),
     "export and report: text": ("a.html", lambda path: write_text(path, "a page " * 500)),
     "generate: JPEG": ("a.jpg", lambda path: write_codes(path, CODES, {"Compression": "jpeg:95"})),
     "generate: 16 bits": ("a.png", lambda path: write_codes(path, CODES.astype(np.uint16) * 257, {})),

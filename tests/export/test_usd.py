@@ -1,0 +1,221 @@
+"""Scenes as OpenUSD: text that is checked as text, and what the USD library reads of it."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.export.blender import ExposedMap
+from factorlib.export.mitsuba import Shape, View
+from factorlib.export.usd import identifiers, scene_text, shader_inputs, write_usd_mesh
+from factorlib.images.exr import read_rgb_exr
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import submesh
+from factorlib.meshes.read import read_mesh
+from factorlib.results.lobes import read_lobes
+from factorlib.results.materials import Reflectance, read_materials
+from factorlib.stage import silent
+from stages import export
+from tests.export import made_export
+
+ROWS = 256
+PHOTOS = list(made_export.MESHES)
+GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.45)
+METAL = Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7)
+LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.2)
+MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
+
+
+# as text -------------------------------------------------------------------------------------------------------------
+
+ODD = ["3 chairs", "a-b", "a_b", 'say "hi"\\\n', "стул"]
+
+
+def text_of(objects, materials, file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
+    """A scene in which every object has every material."""
+    place = np.arange(16.0).reshape(4, 4)
+    place[3] = [0, 0, 0, 1]
+    shapes = [Shape(f"{name}.{material}", file, material, place, False) for name in objects for material in materials]
+    light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
+    return scene_text(View(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+
+
+def test_names_that_are_no_identifiers_are_shown_and_get_one_of_their_own():
+    text = text_of(ODD, ["red-1", "red_1", "2"])
+    objects = re.findall(r'def Xform "([^"]*)" \(\n +displayName = (.*)\n', text)
+    assert [json.loads(shown) for _, shown in objects] == ["a_b", "3 chairs", "a-b", 'say "hi"\\\n', "стул"]
+    assert all(re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) for name in re.findall(r'def \w+ "([^"\n]*)"', text))
+    assert len({name for name, _ in objects}) == len(ODD)
+    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == set(re.findall(r'def Material "(\w+)"', text))
+
+
+def test_a_name_that_is_an_identifier_is_kept_whatever_stands_before_it():
+    assert identifiers(["a b", "a-b", "a_b", "a b"]) == {"a_b": "a_b", "a b": "a_b_2", "a-b": "a_b_3"}
+
+
+def test_the_same_scene_is_the_same_text_and_a_file_may_have_the_sign_that_quotes_files():
+    assert text_of(["chair"], ["red"]) == text_of(["chair"], ["red"])
+    assert "references = @./meshes/a.usda@" in text_of(["chair"], ["red"])
+    assert "references = @@@./meshes/a@b.usda@@@" in text_of(["chair"], ["red"], "meshes/a@b.ply")
+
+
+def test_matrices_are_written_for_rows_and_turned_y_up():
+    turned = "((0.0, -4.0, -8.0, 0.0), (1.0, -5.0, -9.0, 0.0), (2.0, -6.0, -10.0, 0.0), (3.0, -7.0, -11.0, 1.0))"
+    assert f"matrix4d xformOp:transform = {turned}" in text_of(["chair"], ["red"])
+
+
+def test_exposure_is_intensity_times_colour_and_no_light_has_a_colour_too():
+    assert "inputs:color = (1.0, 0.5, 0.25)" in (text := text_of(["a"], ["red"])) and "inputs:intensity = 2.0" in text
+    assert "inputs:color = (1.0, 1.0, 1.0)" in (text := text_of(["a"], ["red"], exposure=(0, 0, 0))) and "inputs:intensity = 0.0" in text
+
+
+@pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
+def test_shader_reflects_what_was_solved_at_normal_incidence(material):
+    found = shader_inputs(material)
+    assert (found["useSpecularWorkflow"] == 0) == (material is METAL)
+    if found["useSpecularWorkflow"]:
+        f0, diffuse = found["specularColor"], found["diffuseColor"] * (1 - found["specularColor"])
+    else:
+        f0, diffuse = found["diffuseColor"], np.zeros(3)
+        assert found["metallic"] == 1
+    np.testing.assert_allclose(f0, material.specular)
+    np.testing.assert_allclose(diffuse, material.diffuse)
+    assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
+
+
+def test_numbers_of_a_mesh_are_those_of_float32(tmp_path):
+    rng = np.random.default_rng(0)
+    faces = np.arange(9, dtype=np.int32).reshape(3, 3)
+    mesh = Mesh(rng.normal(size=(9, 3)) * 1e3, faces, rng.normal(size=(9, 3)), np.ones(3, np.int16), open=True)
+    write_usd_mesh(tmp_path / "m.usda", mesh)
+    text = (tmp_path / "m.usda").read_text()
+    points = np.array(json.loads(re.search(r"points = (.*)", text)[1].replace("(", "[").replace(")", "]")))
+    np.testing.assert_array_equal(points.astype(np.float32), mesh.vertices.astype(np.float32))
+    assert "faceVertexIndices = [0, 1, 2, 3, 4, 5, 6, 7, 8]" in text and "doubleSided = 1" in text
+
+
+# as the USD library reads it -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pxr():
+    return pytest.importorskip("pxr", reason=MISSING)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("usd")
+    inputs = made_export.make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(height=ROWS, mitsuba_height=8), inputs, folder / "export", silent)
+    return inputs, folder / "export"
+
+
+def opened(exported, photo):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(exported[1] / "scenes" / f"{photo}.usda"))
+
+
+def world_of(prim) -> np.ndarray:
+    """world_from_prim, for columns."""
+    from pxr import UsdGeom
+
+    return np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_usds_own_validators_find_nothing(pxr, exported, photo):
+    validation = pytest.importorskip("pxr.UsdValidation", reason="this OpenUSD has no validators")
+    stage = opened(exported, photo)
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    assert [error.GetErrorAsString() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert stage.Flatten().ExportToString() and not stage.GetCompositionErrors()
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_vertices_stand_where_the_pose_puts_them(pxr, exported, photo):
+    from pxr import UsdGeom
+
+    stage, name, pose = opened(exported, photo), made_export.MESHES[photo], made_export.POSES[photo]
+    entry = exported[0].facts["dataset.objects"][photo]["meshes"][name]
+    mesh = read_mesh(exported[0].files[f"{name}.obj"], made_export.NAMES, entry["parts"])
+    for label in mesh.labels:
+        part = submesh(mesh, label)
+        prim = stage.GetPrimAtPath(f"/scene/objects/chair/{made_export.NAMES[label - 1]}")
+        found, place = UsdGeom.Mesh(prim), world_of(prim)
+        points, normals = (np.array(attribute.Get()) for attribute in (found.GetPointsAttr(), found.GetNormalsAttr()))
+        expected = pose.apply(part.vertices) @ YUP_FROM_CAMERA
+        np.testing.assert_allclose(points @ place[:3, :3].T + place[:3, 3], expected, atol=2e-6)
+        np.testing.assert_allclose(normals, part.normals, atol=1e-6)
+        np.testing.assert_array_equal(np.array(found.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
+        assert set(found.GetFaceVertexCountsAttr().Get()) == {3} and found.GetNormalsInterpolation() == "vertex"
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_camera_sees_points_in_the_pixels_of_the_photo(pxr, exported, photo):
+    from pxr import Gf, UsdGeom, UsdRender
+
+    stage, camera = opened(exported, photo), made_export.CAMERAS[photo]
+    settings = UsdRender.Settings.GetStageRenderSettings(stage)
+    width, height = settings.GetResolutionAttr().Get()
+    assert (width, height) == (camera.width, camera.height)
+    (target,) = settings.GetCameraRel().GetTargets()
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath(target)).GetCamera().frustum
+    seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+    for point in np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 6], (20, 3)):
+        x, y, _ = seen.Transform(Gf.Vec3d(*(YUP_FROM_CAMERA @ point).tolist()))
+        np.testing.assert_allclose([(1 + x) / 2 * width, (1 - y) / 2 * height], camera.project(point), atol=1e-4)
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_meshes_are_bound_to_the_exported_materials(pxr, exported, photo):
+    from pxr import UsdGeom, UsdShade
+
+    table = read_materials(exported[1] / "materials.json").materials
+    stage = opened(exported, photo)
+    meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    assert {prim.GetName() for prim in meshes} == {"front": {"red"}, "side": {"red", "brass"}}[photo]
+    for prim in meshes:
+        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        assert bound.GetPrim().GetDisplayName() == prim.GetDisplayName() == prim.GetName()
+        shader, _, _ = bound.ComputeSurfaceSource()
+        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+        for key, value in shader_inputs(table[prim.GetName()]).items():
+            np.testing.assert_allclose(np.array(shader.GetInput(key).Get()), value, rtol=1e-6)
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
+    """By the layout that OpenUSD's DomeLight documents: OpenEXR's, latitude up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
+    from pxr import UsdLux
+
+    stage = opened(exported, photo)
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/scene/light"))
+    file = dome.GetTextureFileAttr().Get().resolvedPath
+    assert dome.GetTextureFormatAttr().Get() == "latlong" and file
+    found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
+    name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
+    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)  # camera frame
+    directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
+    x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
+    rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
+    expected = light.radiance(directions)
+    assert expected.max() > 3 * np.median(expected)
+    np.testing.assert_allclose(found[rows.astype(int), columns.astype(int)], expected, rtol=0.25, atol=0.01 * expected.max())
+
+
+def test_odd_names_and_files_are_read(pxr, tmp_path):
+    from pxr import Usd
+
+    write_usd_mesh(tmp_path / "a@b.usda", Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.eye(3), np.ones(1, np.int16)))
+    (tmp_path / "s.usda").write_text(text_of(ODD, ["red-1", "red_1", "2"], "a@b.ply"))
+    stage = Usd.Stage.Open(str(tmp_path / "s.usda"))
+    names = [prim.GetDisplayName() for prim in stage.GetPrimAtPath("/scene/objects").GetChildren()]
+    assert set(names) == set(ODD) and len(names) == len(ODD)
+    parts = [part for prim in stage.GetPrimAtPath("/scene/objects").GetChildren() for part in prim.GetChildren()]
+    assert {part.GetDisplayName() for part in parts} == {"red-1", "red_1", "2"}
+    assert len(parts) == 15 and all(part.GetAttribute("points").Get() for part in parts)
