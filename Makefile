@@ -55,7 +55,7 @@ help:
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=…]               forget the results of a dataset, or of all'
-	@echo 'make gc                              delete results that no dataset names any more'
+	@echo 'make gc                              show results that no dataset names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'

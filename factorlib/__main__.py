@@ -192,9 +192,10 @@ def clean(dataset: Dataset = None) -> None:
 
 
 @app.command()
-def gc() -> None:
-    """Delete results in the store that are current for no dataset."""
-    raise typer.Exit(verbs.collect(project()))
+def gc(force: Annotated[bool, typer.Option("--force", help="without asking; as FORCE=1")] = False) -> None:
+    """Show which results in the store are current for no dataset, and delete them; a terminal is asked first, but for --force."""
+    ask = sys.stdin.isatty() and not switched_on("FORCE", force)
+    raise typer.Exit(verbs.collect(project(), lambda: not ask or typer.confirm("delete them?")))
 
 
 @app.command()

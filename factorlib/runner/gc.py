@@ -15,6 +15,8 @@ from factorlib.runner.project import Project
 from factorlib.runner.store import Store
 from factorlib.runner.tenancy import alone
 
+LEFT_OVER = "left over"  # what was damaged, and files without a key
+
 
 class Gone(msgspec.Struct, frozen=True):
     """What was deleted, and what is left beside it, for the runner did not make it."""
@@ -35,26 +37,65 @@ class Freed(msgspec.Struct, frozen=True):
     bytes: int
 
 
+class Unneeded(msgspec.Struct, frozen=True):
+    """Results of one stage that no dataset's last run needs.
+
+    bytes: of files that nothing else needs;  oldest, newest: when they were kept, seconds since 1970
+    """
+
+    stage: str
+    results: int
+    bytes: int
+    oldest: float
+    newest: float
+
+
+class _Dead(msgspec.Struct, frozen=True):
+    """What may go from a store: files of keys, trees of results, and everything else."""
+
+    keys: list[Path]
+    trees: list[Path]
+    rest: list[Path]
+
+
+def unneeded(project: Project) -> list[Unneeded]:
+    """What `collect` would delete now, by stage, the largest first; what has no stage any more is `left over`."""
+    store = Store(project.build / "store")
+    dead = _dead(project, store)
+    sizes = {path.name: _size(path) for path in dead.trees}
+    found: dict[str, list[tuple[float, int]]] = {}
+    for path in dead.keys:
+        entry = store.entry(path.stem)
+        stage = entry.record.get("stage", LEFT_OVER) if entry else LEFT_OVER
+        found.setdefault(stage, []).append((path.stat().st_mtime, sizes.pop(entry.output, 0) if entry else 0))
+    if sizes:
+        kept = [(path.stat().st_mtime, sizes[path.name]) for path in dead.trees if path.name in sizes]
+        found.setdefault(LEFT_OVER, []).extend(kept)
+    groups = [Unneeded(s, len(r), sum(b for _, b in r), min(t for t, _ in r), max(t for t, _ in r)) for s, r in found.items()]
+    return sorted(groups, key=lambda group: (-group.bytes, group.stage))
+
+
 def collect(project: Project) -> Freed:
     """Delete every result that is not current for some dataset; refused while a run goes on."""
     store = Store(project.build / "store")
     with alone(store):
-        homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
-        keys = {key for home in homes for key in home.keys().values()}
-        trees = {entry.output for key in keys if (entry := store.entry(key))}
-        views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
-        unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-        dead = [p for p in store.trees.glob("*") if p.name not in trees] + [p for p in store.views.glob("*") if p.name not in views]
-        rest = (
-            [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
-            + list(store.locks.glob("*"))
-            + list(store.unfinished.glob("*"))
-        )
-        dead += list(store.damaged.glob("*"))
-        freed = sum(_size(path) for path in dead if path.parent in (store.trees, store.damaged))  # views only link to trees
-        for path in unused + dead + rest:
+        dead = _dead(project, store)
+        freed = sum(_size(path) for path in dead.trees)
+        for path in dead.keys + dead.trees + dead.rest:
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-    return Freed(len(unused), freed)
+    return Freed(len(dead.keys), freed)
+
+
+def _dead(project: Project, store: Store) -> _Dead:
+    homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
+    keys = {key for home in homes for key in home.keys().values()}
+    trees = {entry.output for key in keys if (entry := store.entry(key))}
+    views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
+    unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
+    rest = [p for p in store.views.glob("*") if p.name not in views]  # they only link to trees
+    rest += [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
+    rest += [*store.locks.glob("*"), *store.unfinished.glob("*")]
+    return _Dead(unused, [p for p in store.trees.glob("*") if p.name not in trees] + list(store.damaged.glob("*")), rest)
 
 
 def forget(project: Project, home: Home) -> Gone:

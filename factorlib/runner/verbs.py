@@ -7,6 +7,7 @@ import os
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -276,10 +277,16 @@ def clean(project: Project, dataset: str | None) -> int:
     return 0
 
 
-def collect(project: Project) -> int:
-    """Delete results in the store that no data set names."""
+def collect(project: Project, agreed: Callable[[], bool]) -> int:
+    """Show which results in the store no data set names, and delete them where that is `agreed`, which is asked after they are shown."""
     from factorlib.runner.gc import collect as delete_unused
+    from factorlib.runner.gc import unneeded
 
+    found = unneeded(project)
+    print("\n".join(words.unneeded_lines(found, time.time())))
+    if found and not agreed():
+        print("nothing was deleted")
+        return 0
     freed = delete_unused(project)
     print(f"deleted {freed.results} results that nothing names any more, {freed.bytes / 1e6:.1f} MB")
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from msgspec import structs
 
@@ -12,6 +13,9 @@ from factorlib.runner.params import Parameter
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.verify import Verdict
+
+if TYPE_CHECKING:
+    from factorlib.runner.gc import Unneeded
 
 SHOWN = 8  # reasons of one step that are written out
 
@@ -122,3 +126,22 @@ def count(steps: list[Step]) -> str:
     '1 step'
     """
     return "1 step" if len(steps) == 1 else f"{len(steps)} steps"
+
+
+def unneeded_lines(found: list[Unneeded], now: float) -> list[str]:
+    """A line a stage: how many results nothing names, what they take, and how old they are."""
+    ages = [(_age(now - group.oldest), _age(now - group.newest)) for group in found]
+    return [
+        f"{group.stage:<10} {group.results:>5} {'result ' if group.results == 1 else 'results'} {group.bytes / 1e6:>9.1f} MB   "
+        + (f"{newest} old" if oldest == newest else f"{newest} to {oldest} old")
+        for group, (oldest, newest) in zip(found, ages, strict=True)
+    ]
+
+
+def _age(seconds: float) -> str:
+    """
+    >>> _age(30), _age(7200), _age(200000)
+    ('less than an hour', '2 h', '2 days')
+    """
+    hours = int(max(0.0, seconds) // 3600)
+    return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"

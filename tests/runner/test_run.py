@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.gc import collect
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.store import Store
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, reasons, state, write
 
@@ -231,6 +233,26 @@ def test_gc_keeps_what_is_current_and_only_that(project):
     assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
     assert set(state(project).values()) == {"current"} and state(project, settings=("table.scale=3",))["table"] == "to run"
     assert collect(project).results == 0
+
+
+def test_gc_shows_what_it_would_free_by_stage_and_age_and_asks(project, capsys):
+    make(project, settings=["table.scale=3"])
+    make(project)
+    table = project.build / "store" / "trees" / next(e for e in entries(project) if e.record["stage"] == "table" and "3" in str(e.record)).output
+    for key in (project.build / "store" / "keys").iterdir():
+        os.utime(key, (time.time() - 3 * 86400 - 60,) * 2)
+    capsys.readouterr()
+    assert verbs.collect(project, lambda: False) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search(r"^total +1 result ", said, re.M)
+    assert "nothing was deleted" in said and table.exists()
+    assert verbs.collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out and not table.exists()
+    assert verbs.collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
+
+
+def entries(project):
+    store = Store(project.build / "store")
+    return [store.entry(path.stem) for path in store.keys.iterdir()]
 
 
 def test_clean_takes_a_dataset_and_then_gc_its_results(project):
