@@ -13,6 +13,7 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.stop import heed_stops
 from studies.catalogue import STUDIES
+from studies.core.case import FULL, QUICK
 from studies.run.project import studies
 from studies.run.verbs import make
 
@@ -30,7 +31,7 @@ def run(
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
-    project = studies(switched_on("QUICK", quick))
+    project = studies(QUICK if switched_on("QUICK", quick) else FULL)
     for name in named:
         project.dataset_folder(name)
     raise typer.Exit(make(project, named or list(STUDIES), forced(force)))
@@ -44,7 +45,7 @@ def main() -> None:
     except InputError as error:
         sys.exit(f"error: {error}")
     except OSError as error:
-        if (known := disk_error(error, studies(False).build)) is None:
+        if (known := disk_error(error, studies().build)) is None:
             raise
         sys.exit(f"error: {known}")
 

@@ -16,13 +16,13 @@ from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT
 from factorlib.evaluate.ball import Light
-from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
 from studies.core.case import Case
 from studies.core.world import GRAZING, NAMES, in_camera, light_name, sphere_normals, spheres
 
 NOISE = 0.01  # of a radiance
+STEEPEST = 0.25  # n·o of the faces that are seen at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
 
 
@@ -75,7 +75,7 @@ def mislabelled(n: int, label: int, shown: Sequence[int], share: float, rng: np.
 
 
 def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.ndarray, "n 3"]:
-    """Normals of a convex object that shows so many flat faces, spread evenly over the hemisphere that faces the viewer.
+    """Normals of a convex object that shows so many flat faces (`face_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
     """
@@ -88,6 +88,9 @@ def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.n
 
 
 def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
-    """Of so many faces that all face the viewer, at +z; one face alone looks straight at the viewer."""
-    spread = fibonacci_sphere(2 * facets)
-    return spread[np.argsort(-spread[:, 2], kind="stable")[:facets]] if facets > 1 else np.array([[0.0, 0.0, 1.0]])
+    """Of so many faces, evenly over the cap of n·z > `STEEPEST` about the viewer's z; one face alone looks straight at the viewer."""
+    if facets == 1:
+        return np.array([[0.0, 0.0, 1.0]])
+    z = 1 - (1 - STEEPEST) * (np.arange(facets) + 0.5) / facets
+    turn, radius = np.arange(facets) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=-1)

@@ -15,7 +15,7 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from studies.catalogue import STUDIES
-from studies.core.case import FULL, QUICK, Scale
+from studies.core.case import FULL, Scale
 
 SLICES = ("case", "worlds", "study")
 FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
@@ -37,7 +37,7 @@ class Studies(Project, frozen=True):
     @property
     def pipeline_file(self) -> Path:
         """The file that declares the steps."""
-        return self.root / "studies" / "run" / "pipeline.yaml"
+        return Path(__file__).parent / "pipeline.yaml"
 
     @property
     def build(self) -> Path:
@@ -56,9 +56,8 @@ class Studies(Project, frozen=True):
         return self.dataset_folder(name)
 
 
-def studies(quick: bool, root: Path = LIBRARY) -> Studies:
+def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
     """The project of the studies of a scale."""
-    scale = QUICK if quick else FULL
     return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale)
 
 
@@ -69,7 +68,7 @@ def data_of(folder: Path, scale: Scale) -> Data:
 
     def slice_(name: str, photo: str | None) -> Slice:
         """The facts of a slice; its fields are what a change is reported by."""
-        facts = {"worlds": scale.worlds, "study": {"name": study.name, "scale": scale.name}, "case": cases.get(photo)}[name]
+        facts = {"worlds": scale.worlds, "study": {"name": study.name, "scale": scale}, "case": cases.get(photo)}[name]
         plain = msgspec.to_builtins(facts)
         return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
 

@@ -10,7 +10,7 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_text
 from studies.catalogue import STUDIES
-from studies.core.case import FULL, QUICK
+from studies.core.case import Scale
 from studies.core.table import Score
 from studies.report.conclusion import concluded
 from studies.report.figure import figure
@@ -24,7 +24,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Sum up the scores of all cases."""
     facts = inputs.facts["dataset.study"]
-    study, scale = STUDIES[facts["name"]], {s.name: s for s in (FULL, QUICK)}[facts["scale"]]
+    study, scale = STUDIES[facts["name"]], msgspec.convert(facts["scale"], Scale)
     scores = msgspec.convert(read_json(inputs["score"] / "scores.json"), dict[str, Score])
     found = concluded(study, scale, scores)
     write_json(out / "table.json", found)
