@@ -13,7 +13,7 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.stop import heed_stops
 from studies.catalogue import STUDIES
-from studies.core.case import FULL, QUICK
+from studies.core.study import FULL, QUICK
 from studies.run.project import studies
 from studies.run.verbs import make
 

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from studies import gauss_sphere, label_quality, matrix_size, row_and_column, structure
-from studies.core.case import Study
+from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {m.STUDY.name: m.STUDY for m in (matrix_size, row_and_column, structure, label_quality, gauss_sphere)}

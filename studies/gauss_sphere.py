@@ -7,7 +7,7 @@ Measured   errors of materials and predictions, beside the standard errors that 
 
 from __future__ import annotations
 
-from studies.core.case import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 FACES = {"full": (1, 2, 3, 5, 9, 20, 60), "quick": (1, 9)}
 

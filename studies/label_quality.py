@@ -7,10 +7,10 @@ Measured   materials and predictions.  Renderings are of the true normals; the s
 
 from __future__ import annotations
 
-from studies.core.case import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 NORMALS = {"full": (1, 2, 5, 10, 20), "quick": (5, 20)}
-LABELS = {"full": (1, 2, 5, 10, 20), "quick": (20,)}
+LABELS = {"full": (2, 10, 20), "quick": (20,)}
 
 
 def settings(scale: Scale) -> list[Setting]:

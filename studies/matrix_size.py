@@ -7,7 +7,7 @@ Measured   material 0 in every light of its world, and every material of the wor
 
 from __future__ import annotations
 
-from studies.core.case import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 
 def settings(scale: Scale) -> list[Setting]:

@@ -6,7 +6,7 @@ Measured   their own entries, as in the paper; and, as for the size of the matri
 
 from __future__ import annotations
 
-from studies.core.case import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 
 def settings(scale: Scale) -> list[Setting]:

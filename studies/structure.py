@@ -15,7 +15,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from studies.core.case import Claim, Entry, Scale, Setting, Study, full_matrix
+from studies.core.case import Entry
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 
 def loop(n: int, seed: int) -> list[Entry]:

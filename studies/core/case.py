@@ -1,18 +1,17 @@
 """The unit of work of all studies: a case is one set of observations, solved once and compared with the truth.
 
-A case belongs to a world, which its seed names: `WORLD` materials on spheres, and as many lights.  It sees some entries of
+A case belongs to a world, which its seed names: five materials on spheres, and as many lights at most.  It sees some entries of
 the matrix of materials × lights, perhaps harmed, and is asked for all entries of its rows and columns.  Cases of equal seeds
 show equal materials in equal lights, so that settings are compared seed by seed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
-WORLD = 5  # materials and lights of a world
+NAMES = ("brick", "leaf", "lacquer", "chalk", "gold")  # of the materials of every world
 
 Entry = tuple[int, int]  # a material and a light
 
@@ -42,6 +41,11 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return sorted({m for m, _ in self.entries})
 
     @property
+    def material_names(self) -> list[str]:
+        """The same by name, in the order of their numbers in the case's observations."""
+        return [NAMES[m] for m in self.materials]
+
+    @property
     def lights(self) -> list[int]:
         """Those that are seen, in order."""
         return sorted({li for _, li in self.entries})
@@ -56,95 +60,13 @@ class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spp: int
 
 
-class Scale(msgspec.Struct, frozen=True):
-    """How large a study is: at most `largest` materials and lights; `side` of each where something else is varied."""
+class Score(msgspec.Struct, frozen=True):
+    """values: by measure;  nulls: of those that have one.  A measure that the case does not have is left out."""
 
-    name: Literal["full", "quick"]
-    seeds: tuple[int, ...]
-    largest: int
-    side: int
-    size: int
-    solve: dict[str, Any]
-    light_rows: int = 64
-    light_spp: int = 8
-
-    @property
-    def square(self) -> str:
-        """The name of the setting of all entries of `side` materials in as many lights, unharmed."""
-        return f"{self.side}x{self.side}"
-
-    @property
-    def worlds(self) -> World:
-        """What the studies of this scale show, equal for all of them, so that it is made once."""
-        return World(self.seeds, self.largest, self.light_rows, self.light_spp)
-
-    def case(self, seed: int, entries: Sequence[Entry], **how: Any) -> Case:
-        """A case of this size; how: further fields of it."""
-        return Case(seed, tuple(sorted(entries)), self.size, solve={**self.solve, **how.pop("solve", {})}, **how)
+    values: dict[str, float]
+    nulls: dict[str, float]
 
 
-FEW_LOBES = {"light_prior": "none", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
-FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=WORLD, side=3, size=32, solve={})
-QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, light_rows=32, light_spp=8)
-
-
-class Setting(msgspec.Struct, frozen=True):
-    """One value of what a study varies.
-
-    name:  a word of a-z, 0-9 and -, part of file names;  label: as figures and tables write it
-    x:     where it stands on the axis
-    case:  the case of a seed
-    """
-
-    name: str
-    label: str
-    x: float
-    case: Callable[[int], Case]
-
-
-class Claim(msgspec.Struct, frozen=True):
-    """A comparison that the study makes: the measure is lower in the setting `lower` than in `higher`.
-
-    words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
-    """
-
-    measure: str
-    lower: str
-    higher: str
-    words: str
-    paper: bool = True
-
-
-class Study(msgspec.Struct, frozen=True):
-    """varied: what the axis shows, with its unit;  measures: those of the figure, the first the main one;  paper: its conclusion."""
-
-    name: str
-    title: str
-    question: str
-    paper: str
-    varied: str
-    measures: tuple[str, ...]
-    settings: Callable[[Scale], list[Setting]]
-    claims: Callable[[Scale], list[Claim]]
-
-    def cases(self, scale: Scale) -> dict[str, Case]:
-        """All cases by name: settings in order, each with all seeds."""
-        return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in scale.seeds}
-
-
-def case_name(setting: str, seed: int) -> str:
-    """The name of a case's files.
-
-    >>> case_name("3x3", 0)
-    '3x3-seed0'
-    """
-    return f"{setting}-seed{seed}"
-
-
-def full_matrix(materials: int, lights: int) -> list[Entry]:
-    """Every material in every light.
-
-    >>> full_matrix(1, 2)
-    [(0, 0), (0, 1)]
-    """
-    return [(m, li) for m in range(materials) for li in range(lights)]
+def light_name(light: int) -> str:
+    """Of the illumination, and of the photo that is in it."""
+    return f"light{light}"

@@ -18,8 +18,8 @@ from factorlib.conventions import FRONT
 from factorlib.evaluate.ball import Light
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
-from studies.core.case import Case
-from studies.core.world import GRAZING, NAMES, in_camera, light_name, sphere_normals, spheres
+from studies.core.case import Case, light_name
+from studies.core.world import GRAZING, in_camera, sphere_normals, spheres
 
 NOISE = 0.01  # of a radiance
 STEEPEST = 0.25  # n·o of the faces that are seen at the flattest angle
@@ -31,18 +31,13 @@ def observations_of(case: Case, materials: Mapping[str, Reflectance], lights: Ma
     return {light_name(light): _photo(case, light, list(materials.values()), lights[light]) for light in case.lights}
 
 
-def material_names(case: Case) -> list[str]:
-    """The materials that a case sees, in the order of their numbers in its observations."""
-    return [NAMES[m] for m in case.materials]
-
-
 def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Light) -> Observations:
     shown = [m for m, li in case.entries if li == number]
     normals = faceted(sphere_normals(case.size), case.facets)
     radiance = spheres([materials[m] for m in shown], light, normals)
     for m, sphere in zip(shown, radiance, strict=True):
         sphere *= 1 + NOISE * _random(case, number, m, "noise").standard_normal(sphere.shape)
-    n, names, photo = radiance.shape[0] * radiance.shape[1], tuple(material_names(case)), (light_name(number),)
+    n, names, photo = radiance.shape[0] * radiance.shape[1], tuple(case.material_names), (light_name(number),)
     seen = np.concatenate([tilted(in_camera(normals), case.normal_deg, _random(case, number, m, "normals")) for m in shown])
     labels = [mislabelled(len(normals), case.materials.index(m), [case.materials.index(s) for s in shown], case.wrong_labels,
                           _random(case, number, m, "labels")) for m in shown]  # fmt: skip

@@ -32,10 +32,8 @@ from factorlib.evaluate.relighting import Appearances
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, Solved, read_materials
-from studies.core.case import Case
-from studies.core.observed import material_names
-from studies.core.table import Score
-from studies.core.world import NAMES, light_name, materials_of
+from studies.core.case import NAMES, Case, Score, light_name
+from studies.core.world import materials_of
 
 MAP_ROWS = 128  # of recovered lights, as the stage `export` writes them
 LEAST = 1e-3  # of a reflectance, below which a relative standard error means nothing
@@ -81,7 +79,7 @@ def in_true_gauge(
     """Each component's materials times its factor per channel, its lights divided by it."""
     materials, scaled = {}, {}
     for number in sorted(set(component.values())):
-        names = [n for n in material_names(case) if component[n] == number]
+        names = [n for n in case.material_names if component[n] == number]
         factor = np.array(common_factor([table[n] for n in names], [truths[n] for n in names]))
         materials |= {n: _times(table[n], factor) for n in names}
         for li in {at for m, at in case.entries if NAMES[m] in names}:
@@ -116,7 +114,7 @@ class Pictures:
 
     def scores(self) -> tuple[dict[str, float], dict[str, float]]:
         """DSSIM of what is predicted, and of what nulls predict."""
-        case, names = self.case, material_names(self.case)
+        case, names = self.case, self.case.material_names
         entries = {(n, li): self._entry(n, li) for n in names for li in case.lights}
         observed = {(NAMES[m], li) for m, li in case.entries}
         parts = {"entries": entries, "observed": entries.keys() & observed, "unobserved": entries.keys() - observed}

@@ -1,4 +1,4 @@
-"""What is written of cases and studies, as types that need no science: <case>.json and table.json."""
+"""What is written of studies, as types that need no science: table.json."""
 
 from __future__ import annotations
 
@@ -6,16 +6,9 @@ from typing import Literal
 
 import msgspec
 
-from studies.core.case import Claim
+from studies.core.study import Claim
 
 Verdict = Literal["lower", "higher", "not shown", "too few seeds"]
-
-
-class Score(msgspec.Struct, frozen=True):
-    """values: by measure;  nulls: of those that have one.  A measure that the case does not have is left out."""
-
-    values: dict[str, float]
-    nulls: dict[str, float]
 
 
 class Spread(msgspec.Struct, frozen=True):

@@ -19,8 +19,8 @@ from factorlib.evaluate.ball import Light, ball, ball_normals, light_of_lat_long
 from factorlib.generate.synthetic import Parameters, drawn_materials, light_of
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import Material, look
+from studies.core.case import NAMES
 
-NAMES = ("brick", "leaf", "lacquer", "chalk", "gold")
 ABOUT = dict(
     zip(
         NAMES,
@@ -42,11 +42,6 @@ def materials_of(seed: int) -> dict[str, Reflectance]:
     """The materials of a world by name."""
     drawn = drawn_materials(np.random.default_rng([11, seed]), SPREAD, ABOUT)
     return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
-
-
-def light_name(light: int) -> str:
-    """Of the illumination, and of the photo that is in it."""
-    return f"light{light}"
 
 
 def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "h w 3"]:

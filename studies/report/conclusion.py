@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from studies.core.case import Claim, Scale, Setting, Study, case_name
+from studies.core.case import Score
 from studies.core.measures import MEASURES
 from studies.core.statistics import LEAST_SEEDS, difference, spread
-from studies.core.table import Cell, Conclusion, Difference, Row, Score, Tested
+from studies.core.study import Claim, Scale, Setting, Study, case_name
+from studies.core.table import Cell, Conclusion, Difference, Row, Tested
 
 NO_CONCLUSION = "quick: one seed, smallest sets: no conclusion"
 ANSWERS = {

@@ -15,7 +15,7 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from studies.catalogue import STUDIES
-from studies.core.case import FULL, Scale
+from studies.core.study import FULL, Scale
 
 SLICES = ("case", "worlds", "study")
 FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")

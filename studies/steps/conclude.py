@@ -10,8 +10,8 @@ from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_text
 from studies.catalogue import STUDIES
-from studies.core.case import Scale
-from studies.core.table import Score
+from studies.core.case import Score
+from studies.core.study import Scale
 from studies.report.conclusion import concluded
 from studies.report.figure import figure
 from studies.report.tables import csv_text, paragraph

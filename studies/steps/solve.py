@@ -11,9 +11,7 @@ from factorlib.reflection.network import SHIPPED
 from factorlib.stage import Inputs, Progress
 from stages.solve import Params
 from stages.solve import main as solve
-from studies.core.case import Case
-from studies.core.observed import material_names
-from studies.core.world import light_name
+from studies.core.case import Case, light_name
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
@@ -21,7 +19,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     case = msgspec.convert(inputs.facts["dataset.case"], Case)
     lights = {light_name(li): msgspec.to_builtins(LightSlice(light_name(li), None)) for li in case.lights}
     folders = {"urm": inputs["observe"] / inputs.photo, "train": SHIPPED}
-    facts = {"dataset.materials": material_names(case), "dataset.light": lights}
+    facts = {"dataset.materials": case.material_names, "dataset.light": lights}
     (out / inputs.photo).mkdir()
     chosen = msgspec.convert({**msgspec.to_builtins(params), **case.solve}, Params)
     solve(chosen, Inputs(folders, facts, map=inputs.map, unfinished=inputs.unfinished), out / inputs.photo, progress)

@@ -14,7 +14,7 @@ from factorlib.runner.project import LIBRARY
 from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
 from studies.catalogue import STUDIES
-from studies.core.case import FULL, QUICK
+from studies.core.study import FULL, QUICK
 from studies.core.table import Conclusion
 from studies.report.page import page
 from studies.run.project import data_of, studies
@@ -58,7 +58,7 @@ def test_a_change_of_the_scores_solves_nothing_again(tmp_path):
     records = survey(studies(TINY, tmp_path), NAME, None, []).records
     solve_ = next(record for step, record in records.items() if step.stage == "solve")
     assert "source:studies.core.case" in solve_ and "source:stages.solve" in solve_ and "source:factorlib.solve.bundle" in solve_
-    assert not {"source:studies.core.score", "source:studies.matrix_size", "source:studies.report.figure"} & solve_.keys()
+    assert not {"source:studies.core.score", "source:studies.core.study", "source:studies.core.world", "source:studies.matrix_size", "source:studies.report.figure"} & solve_.keys()
     assert not any("templates" in name or name.endswith("pipeline.yaml") for name in solve_ if name.startswith("data:studies"))
 
 

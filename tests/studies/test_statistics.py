@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
-from studies.core.case import FULL, QUICK, Claim, Setting, Study, case_name
+from studies.core.case import Score
 from studies.core.statistics import LEAST_SEEDS, difference, spread
-from studies.core.table import Score
+from studies.core.study import FULL, QUICK, Claim, Setting, Study, case_name
 from studies.report.conclusion import concluded
 from studies.report.tables import answer_to_the_paper, csv_text, paragraph
 
