@@ -1,7 +1,7 @@
-"""Refresh the tables in docs/studies.md: `python -m studies.docs [--quick]`.
+"""All studies as tables: `python -m studies.tables [--quick] [--docs]`; --docs refreshes docs/studies.md.
 
 Runs whatever of the studies must run first, so that every number is of the sources that are here.  `benchmarks.stale` names the tables
-that are of others.
+of the page that are of others.
 """
 
 from __future__ import annotations
@@ -46,13 +46,19 @@ def _numbers(found: Conclusion) -> str:
     return f"{table(head, rows)}\n\n{sentences}" if not found.label else table(head, rows)
 
 
-def main(quick: Annotated[bool, typer.Option(help="of the quick studies")] = False) -> None:
-    """Run, read, write."""
+def main(
+    quick: Annotated[bool, typer.Option(help="of the quick studies")] = False,
+    docs: Annotated[bool, typer.Option(help="also refresh the tables in docs/studies.md")] = False,
+) -> None:
+    """Run, read, print."""
     project = project_of(QUICK if quick else FULL)
     if make(project, list(STUDIES)) != 0:
         raise SystemExit(1)
     found = [msgspec.convert(read_json(project.build / name / "table.json"), Conclusion, str_keys=True) for name in STUDIES]
-    refresh(DOCS, as_tables(found), "studies.docs")
+    tables = as_tables(found)
+    print("\n\n".join(tables.values()))
+    if docs:
+        refresh(DOCS, tables, "studies.tables")
 
 
 if __name__ == "__main__":
