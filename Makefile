@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph params new compare validate verify clean gc setup lock test test-long data help $(STAGES)
+.PHONY: all plan why status graph params new compare validate verify clean gc setup lock test test-long study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph params new compare validate verify clean gc $(STAGES): .venv/ready
@@ -36,6 +36,13 @@ test-long: .venv/ready
 
 bench-%: .venv/ready
 	@OMP_NUM_THREADS=1 $(PY) -m "benchmarks.$${GOAL#bench-}"
+
+# each reads STUDY, QUICK and FORCE from the environment
+study: .venv/ready
+	@$(PY) -m studies --one
+
+studies: .venv/ready
+	@$(PY) -m studies
 
 data: .venv/ready
 	@$(PY) -m factorlib.generate synthetic
@@ -64,6 +71,8 @@ help:
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
 	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'
+	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
+	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'

@@ -1,0 +1,54 @@
+"""The command line: `python -m studies [study …] [--quick]`; all studies without a name.  Make passes STUDY and QUICK on."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from factorlib.__main__ import forced, switched_on
+from factorlib.disk import disk_error
+from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.stop import heed_stops
+from studies.catalogue import STUDIES
+from studies.core.study import FULL, QUICK
+from studies.run.project import studies
+from studies.run.verbs import make
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command()
+def run(
+    names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
+    one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
+    force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
+) -> None:
+    """Run studies, as far as anything must run."""
+    named = names or (os.environ.get("STUDY", "").split() if one else [])
+    if one and not named:
+        raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
+    project = studies(QUICK if switched_on("QUICK", quick) else FULL)
+    for name in named:
+        project.dataset_folder(name)
+    raise typer.Exit(make(project, named or list(STUDIES), forced(force)))
+
+
+def main() -> None:
+    """An error of the input ends the program with its message and exit code 1."""
+    try:
+        with heed_stops():
+            app(prog_name="python -m studies")
+    except InputError as error:
+        sys.exit(f"error: {error}")
+    except OSError as error:
+        if (known := disk_error(error, studies().build)) is None:
+            raise
+        sys.exit(f"error: {known}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What studies share: cases, the worlds they show, observations, scores, statistics."""

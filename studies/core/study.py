@@ -1,0 +1,104 @@
+"""What a study says of itself: settings, measures, claims; and how large it is, quick or full."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import msgspec
+
+from studies.core.case import NAMES, Case, Entry, World
+
+
+class Scale(msgspec.Struct, frozen=True):
+    """How large a study is: at most `largest` materials and lights; `side` of each where something else is varied."""
+
+    name: Literal["full", "quick"]
+    seeds: tuple[int, ...]
+    largest: int
+    side: int
+    size: int
+    solve: dict[str, Any]
+    light_rows: int = 64
+    light_spp: int = 8
+
+    @property
+    def square(self) -> str:
+        """The name of the setting of all entries of `side` materials in as many lights, unharmed."""
+        return f"{self.side}x{self.side}"
+
+    @property
+    def worlds(self) -> World:
+        """What the studies of this scale show, equal for all of them, so that it is made once."""
+        return World(self.seeds, self.largest, self.light_rows, self.light_spp)
+
+    def case(self, seed: int, entries: Sequence[Entry], **how: Any) -> Case:
+        """A case of this size; how: further fields of it."""
+        return Case(seed, tuple(sorted(entries)), self.size, solve={**self.solve, **how.pop("solve", {})}, **how)
+
+
+FEW_LOBES = {"light_prior": "none", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
+FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
+QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, light_rows=32, light_spp=8)
+
+
+class Setting(msgspec.Struct, frozen=True):
+    """One value of what a study varies.
+
+    name:  a word of a-z, 0-9 and -, part of file names;  label: as figures and tables write it
+    x:     where it stands on the axis
+    case:  the case of a seed
+    """
+
+    name: str
+    label: str
+    x: float
+    case: Callable[[int], Case]
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """A comparison that the study makes: the measure is lower in the setting `lower` than in `higher`.
+
+    words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
+    """
+
+    measure: str
+    lower: str
+    higher: str
+    words: str
+    paper: bool = True
+
+
+class Study(msgspec.Struct, frozen=True):
+    """varied: what the axis shows, with its unit;  measures: those of the figure, the first the main one;  paper: its conclusion."""
+
+    name: str
+    title: str
+    question: str
+    paper: str
+    varied: str
+    measures: tuple[str, ...]
+    settings: Callable[[Scale], list[Setting]]
+    claims: Callable[[Scale], list[Claim]]
+
+    def cases(self, scale: Scale) -> dict[str, Case]:
+        """All cases by name: settings in order, each with all seeds."""
+        return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in scale.seeds}
+
+
+def case_name(setting: str, seed: int) -> str:
+    """The name of a case's files.
+
+    >>> case_name("3x3", 0)
+    '3x3-seed0'
+    """
+    return f"{setting}-seed{seed}"
+
+
+def full_matrix(materials: int, lights: int) -> list[Entry]:
+    """Every material in every light.
+
+    >>> full_matrix(1, 2)
+    [(0, 0), (0, 1)]
+    """
+    return [(m, li) for m in range(materials) for li in range(lights)]

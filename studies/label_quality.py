@@ -1,0 +1,48 @@
+"""Label quality: how much harm do wrong normals and wrong labels do?
+
+Varied     noise on normals, |N(0, σ)| degrees, σ = 0 … 20; and the share of pixels, 0 … 20 %, whose label names another
+           material of the same photo.  Sets of 3 × 3 (quick: 2 × 2).
+Measured   materials and predictions.  Renderings are of the true normals; the solve is told the harmed ones.
+"""
+
+from __future__ import annotations
+
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+
+NORMALS = {"full": (1, 2, 5, 10, 20), "quick": (5, 20)}
+LABELS = {"full": (2, 10, 20), "quick": (20,)}
+
+
+def settings(scale: Scale) -> list[Setting]:
+    """Unharmed, then each harm by itself."""
+    entries = full_matrix(scale.side, scale.side)
+    harms = [(f"normals-{d}deg", f"{d}°", {"normal_deg": float(d)}) for d in NORMALS[scale.name]]
+    harms += [(f"labels-{p}pc", f"{p} %", {"wrong_labels": p / 100}) for p in LABELS[scale.name]]
+    return [
+        Setting(scale.square, "none", 0, lambda seed: scale.case(seed, entries)),
+        *(Setting(name, label, x, lambda seed, how=how: scale.case(seed, entries, **how)) for x, (name, label, how) in enumerate(harms, 1)),
+    ]
+
+
+def claims(scale: Scale) -> list[Claim]:
+    """Little harm by little noise, and where more noise does no more."""
+    none, degrees, shares = scale.square, NORMALS[scale.name], LABELS[scale.name]
+    return [
+        Claim("entries", none, f"normals-{degrees[0]}deg", f"noise of {degrees[0]}° on normals does harm", paper=False),
+        Claim("entries", none, f"normals-{degrees[-1]}deg", f"noise of {degrees[-1]}° on normals does harm"),
+        Claim("entries", f"normals-{degrees[-2]}deg", f"normals-{degrees[-1]}deg", f"{degrees[-1]}° does more harm than {degrees[-2]}°", paper=False),
+        Claim("entries", none, f"labels-{shares[0]}pc", f"{shares[0]} % of wrong labels do harm", paper=False),
+        Claim("entries", none, f"labels-{shares[-1]}pc", f"{shares[-1]} % of wrong labels do harm", paper=False),
+    ]
+
+
+STUDY = Study(
+    name="label-quality",
+    title="Label quality",
+    question="How much harm do wrong normals and wrong labels do?",
+    paper="Noise of about 1 % on normals does no harm; with more the error rises, and then saturates.",
+    varied="noise on normals (σ, degrees), or share of wrong labels (%)",
+    measures=("entries", "new_light", "diffuse", "specular", "roughness", "glossy", "stated_roughness"),
+    settings=settings,
+    claims=claims,
+)

@@ -1,0 +1,40 @@
+"""Matrix size: do more photos of more materials tell more of each?
+
+Varied     the full matrix of n materials in n lights, n = 1 … 5.
+Measured   material 0 in every light of its world, and every material of the world in light 0: these two all sizes share, and
+           an answer is worth what it tells beyond the photos it was fitted to (the one entry of 1 × 1 is fitted all too easily).
+"""
+
+from __future__ import annotations
+
+from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+
+
+def settings(scale: Scale) -> list[Setting]:
+    """1 × 1 to the largest."""
+    return [_setting(scale, n) for n in range(1, scale.largest + 1)]
+
+
+def _setting(scale: Scale, n: int) -> Setting:
+    return Setting(f"{n}x{n}", f"{n} × {n}", n, lambda seed: scale.case(seed, full_matrix(n, n)))
+
+
+def claims(scale: Scale) -> list[Claim]:
+    """The largest against one photo, and against one less."""
+    n = scale.largest
+    measures = (("first_material", "material 0"), ("first_light", "light 0"))
+    against_one = [Claim(m, f"{n}x{n}", "1x1", f"error falls from 1 × 1 to {n} × {n} ({what})") for m, what in measures]
+    against_less = [Claim(m, f"{n}x{n}", f"{n - 1}x{n - 1}", f"it still falls from {n - 1} × {n - 1} ({what})", paper=False) for m, what in measures]
+    return against_one + against_less
+
+
+STUDY = Study(
+    name="matrix-size",
+    title="Matrix size",
+    question="Do more photos of more materials tell more of each?",
+    paper="The error falls as the full matrix grows from 1 × 1 to 5 × 5.",
+    varied="materials × lights, all observed",
+    measures=("first_material", "first_light", "entries", "diffuse", "specular", "roughness", "glossy"),
+    settings=settings,
+    claims=claims,
+)

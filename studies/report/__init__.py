@@ -1,0 +1,1 @@
+"""What a study shows: conclusions, tables, figures, the page."""

@@ -1,0 +1,41 @@
+"""index.html of the studies that are done: figures, tables, paragraphs, and each conclusion beside the paper's; stands alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import msgspec
+
+from studies.core.measures import MEASURES
+from studies.core.table import Cell, Conclusion
+from studies.report.tables import answer_to_the_paper
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def page(studies: Sequence[tuple[Any, str]]) -> str:
+    """HTML of studies, each the value of its table.json and the text of its figure.svg, which is this project's own and set as it is."""
+    found = [(msgspec.convert(table, Conclusion, str_keys=True), figure) for table, figure in studies]
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string((TEMPLATES / "index.html").read_text(encoding="utf-8"))
+    quick = any(conclusion.label for conclusion, _ in found)
+    return template.render(studies=found, quick=quick, measures=MEASURES, number=number, answer=answer_to_the_paper)
+
+
+def number(cell: Cell | None) -> str:
+    """A mean and the half width of its interval.
+
+    >>> from studies.core.statistics import spread
+    >>> number(Cell(spread([0.1, 0.12]), {})), number(Cell(spread([0.1]), {})), number(None)
+    ('.11 ± .127', '.1', '–')
+    """
+    if cell is None:
+        return "–"
+    mean = f"{cell.spread.mean:.3g}".replace("0.", ".", 1) if abs(cell.spread.mean) < 1 else f"{cell.spread.mean:.3g}"
+    if cell.spread.high is None:
+        return mean
+    half = f"{cell.spread.high - cell.spread.mean:.3g}"
+    return f"{mean} ± {half.replace('0.', '.', 1) if half.startswith('0.') else half}"

@@ -1,0 +1,47 @@
+"""A study's table as CSV, and its conclusions as a paragraph."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+from studies.core.measures import MEASURES
+from studies.core.table import Conclusion
+
+HEAD = ("study", "scale", "setting", "label", "measure", "unit", "seeds", "mean", "deviation", "low_95", "high_95", "null_mean")
+
+
+def csv_text(found: Conclusion) -> str:
+    """A line for each setting and measure."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(HEAD)
+    for row in found.rows:
+        for measure, cell in row.cells.items():
+            s = cell.spread
+            numbers = [s.seeds, *("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))]
+            writer.writerow([found.study, found.scale, row.name, row.label, measure, MEASURES[measure].unit, *numbers])
+    return out.getvalue()
+
+
+def paragraph(found: Conclusion) -> str:
+    """Markdown: the question, what the paper says, and what the seeds say of each claim."""
+    start = f"**{found.title}.** {found.question}" + (f" *{found.label}.*" if found.label else "")
+    first = f"{start} The paper: {found.paper}"
+    return "\n".join([first, "", *(f"- {tested.sentence}" for tested in found.claims)]) + "\n"
+
+
+def answer_to_the_paper(found: Conclusion) -> str:
+    """Agrees where all claims that are the paper's are shown, disagrees where the opposite of one is, else why it is not decided.
+
+    Studies without a claim of the paper's are said to have none.
+    """
+    answers = [tested.answer for tested in found.claims if tested.claim.paper]
+    if found.label:
+        return f"not tested ({found.label})"
+    if not answers:
+        return "the paper claims nothing that is tested here"
+    for answer in ("disagrees", "not tested: too few seeds", "no difference is shown"):
+        if answer in answers:
+            return answer
+    return "agrees"

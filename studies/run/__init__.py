@@ -1,0 +1,1 @@
+"""How the project's runner sees a study, and the command line."""

@@ -1,0 +1,75 @@
+"""A study as the runner sees it: a data set whose photos are the study's cases.
+
+Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
+(`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
+build/studies/quick, so that neither `make gc` nor a reader takes one for the other.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.project import LIBRARY, Data, Project, Provider
+from studies.catalogue import STUDIES
+from studies.core.study import FULL, Scale
+
+SLICES = ("case", "worlds", "study")
+FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
+
+
+class Slice(msgspec.Struct, frozen=True):
+    """What a step sees of the study."""
+
+    facts: Any
+    fields: dict[str, Any]
+    files: list[str] = []
+
+
+class Studies(Project, frozen=True):
+    """The checkout, with studies in place of data sets."""
+
+    scale: Scale = FULL
+
+    @property
+    def pipeline_file(self) -> Path:
+        """The file that declares the steps."""
+        return Path(__file__).parent / "pipeline.yaml"
+
+    @property
+    def build(self) -> Path:
+        """The folder of all results of this scale."""
+        folder = self.root / "build" / "studies"
+        return folder / "quick" if self.scale.name == "quick" else folder
+
+    def dataset_folder(self, name: str) -> Path:
+        """A folder that stands for a study; nothing lies there.  InputError where no study is called so."""
+        if name not in STUDIES:
+            raise InputError(f"there is no study {name!r}", key="STUDY", cure=did_you_mean(name, STUDIES))
+        return self.root / "studies" / name
+
+    def find_dataset(self, name: str) -> Path | None:
+        """The same."""
+        return self.dataset_folder(name)
+
+
+def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
+    """The project of the studies of a scale."""
+    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale)
+
+
+def data_of(folder: Path, scale: Scale) -> Data:
+    """A study as the runner reads it."""
+    study = STUDIES[folder.name]
+    cases = study.cases(scale)
+
+    def slice_(name: str, photo: str | None) -> Slice:
+        """The facts of a slice; its fields are what a change is reported by."""
+        facts = {"worlds": scale.worlds, "study": {"name": study.name, "scale": scale}, "case": cases.get(photo)}[name]
+        plain = msgspec.to_builtins(facts)
+        return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
+
+    return Data(folder, list(cases), slice_)

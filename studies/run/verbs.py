@@ -1,0 +1,43 @@
+"""What the command line does: one study, or all, and the page of those that are done."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+from factorlib.jsonfile import read_json
+from factorlib.runner import verbs
+from factorlib.wholefile import replace_file
+from studies.catalogue import STUDIES
+from studies.run.project import FINISHED, Studies
+
+
+def make(project: Studies, names: list[str], force: bool = False) -> int:
+    """Run studies as far as anything must run; their results and the page are under `project.build` afterwards.
+
+    A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
+    """
+    codes = [_make(project, name, force) for name in names]
+    return next((code for code in codes if code), 0)
+
+
+def _make(project: Studies, name: str, force: bool) -> int:
+    if project.scale.name == "quick":
+        print(f"{name}: quick: one seed, smallest sets: no conclusion")
+    code = verbs.make(project, verbs.Wish(name, force=force))
+    if code == 0:
+        home = project.build / name
+        for file in FINISHED:
+            replace_file(home / file, (home / "conclude" / file).read_bytes())
+        print(f"  study: {project.shown(home / 'figure.svg')}")
+        print(f"  page: {project.shown(write_page(project))}")
+    return code
+
+
+def write_page(project: Studies) -> Path:
+    """index.html of all studies of this scale that are done."""
+    folders = [folder for name in STUDIES if (folder := project.build / name) and (folder / "table.json").is_file()]
+    found = [(read_json(folder / "table.json"), (folder / "figure.svg").read_text(encoding="utf-8")) for folder in folders]
+    page = import_module("studies.report.page").page(found)  # by its name: a run with nothing to do must not pay for it
+    replace_file(project.build / "index.html", page.encode())
+    return project.build / "index.html"
