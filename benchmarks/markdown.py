@@ -1,7 +1,7 @@
 """Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`.
 
-Each ends with a line that no reader sees, the command that wrote it and a hash of that command's sources, so that
-`benchmarks.stale` knows which tables are of other sources than those that are here.
+Each ends with a line that no reader sees: the command that wrote it, and a hash of that command's sources, or of those of the
+modules that it names.  So `benchmarks.stale` knows which tables are of other sources than those that are here.
 """
 
 from __future__ import annotations
@@ -38,26 +38,32 @@ def replaced(text: str, name: str, inner: str, file: Path | None = None) -> str:
     return pattern.sub(lambda found: f"{found[1]}{inner}\n{found[2]}", text)
 
 
-def refresh(path: Path, parts: dict[str, str], command: str, root: Path = ROOT) -> None:
-    """Write each part between its marks in the file, with the stamp of the module `command`, which measured it."""
+def refresh(path: Path, parts: dict[str, str], command: str, root: Path = ROOT, modules: Sequence[str] = ()) -> None:
+    """Write each part between its marks in the file, with the stamp of the module `command`, which measured it.
+
+    modules: those that did the measuring, where the command does other things too.
+    """
     text = path.read_text(encoding="utf-8")
-    stamp = f"<!-- written by {command} for sources {sources_hash(command, root)} -->"
+    of = f" of {' '.join(modules)}" if modules else ""
+    stamp = f"<!-- written by {command} for sources {sources_hash(*(modules or [command]), root=root)}{of} -->"
     for name, inner in parts.items():
         text = replaced(text, name, f"{inner}\n{stamp}", path)
     path.write_text(text, encoding="utf-8")
 
 
-def sources_hash(command: str, root: Path = ROOT) -> str:
-    """Eight digits of a hash of all modules of the project, and their data, that `python -m command` imports.
+def sources_hash(*commands: str, root: Path = ROOT) -> str:
+    """Eight digits of a hash of all modules of the project, and their data, that `python -m command` imports, of all commands.
 
     Comments and docstrings do not count, as for the keys of steps.  Raises InputError where there is no such module.
     """
-    sources = Sources([root], FileHashes(None))
-    file = sources.find(command)
-    module = f"{command}.__main__" if file is not None and file.name == "__init__.py" else command
-    package, _, name = module.rpartition(".")
-    closure = sources.closure(package, name, root / "pipeline.yaml")
-    return hashlib.sha256(repr(sorted((closure.modules | closure.data).items())).encode()).hexdigest()[:8]
+    sources, found = Sources([root], FileHashes(None)), {}
+    for command in commands:
+        file = sources.find(command)
+        module = f"{command}.__main__" if file is not None and file.name == "__init__.py" else command
+        package, _, name = module.rpartition(".")
+        closure = sources.closure(package, name, root / "pipeline.yaml")
+        found |= closure.modules | closure.data
+    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()[:8]
 
 
 def exact(value: float, digits: int = 2) -> str:

@@ -15,12 +15,12 @@ from benchmarks.markdown import ROOT, sources_hash
 from factorlib.errors import InputError
 
 TABLE = re.compile(r"<!-- begin (?P<name>.+?) -->\n(?P<inner>.*?)<!-- end (?P=name) -->", re.DOTALL)
-STAMP = re.compile(r"<!-- written by (\S+) for sources ([0-9a-f]{8}) -->")
+STAMP = re.compile(r"<!-- written by (\S+) for sources ([0-9a-f]{8})(?: of (.+?))? -->")
 
 
 def stale(pages: list[Path], root: Path = ROOT) -> Iterator[str]:
     """A line for each table of the pages that is not of the sources below `root`, or does not say of which it is."""
-    hash_of = cache(lambda command: sources_hash(command, root))
+    hash_of = cache(lambda commands: sources_hash(*commands.split(), root=root))
     for page in pages:
         for found in TABLE.finditer(page.read_text(encoding="utf-8")):
             if reason := _reason(STAMP.search(found["inner"]), hash_of):
@@ -30,9 +30,9 @@ def stale(pages: list[Path], root: Path = ROOT) -> Iterator[str]:
 def _reason(stamp: re.Match | None, hash_of: cache) -> str | None:
     if stamp is None:
         return "does not say of which sources it is"
-    command, then = stamp.groups()
+    command, then, modules = stamp.groups()
     try:
-        now = hash_of(command)
+        now = hash_of(modules or command)
     except InputError as error:
         return f"written by {command}, of which {error.found}"
     return None if now == then else f"of sources {then}, now {now}; written by python -m {command} --docs"

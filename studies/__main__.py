@@ -12,7 +12,7 @@ from factorlib.__main__ import forced, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.stop import heed_stops
-from studies.catalogue import STUDIES
+from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK
 from studies.run.project import studies
 from studies.run.verbs import make

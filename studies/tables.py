@@ -1,4 +1,4 @@
-"""All studies as tables: `python -m studies.tables [--quick] [--docs]`; --docs refreshes docs/studies.md.
+"""Studies as tables: `python -m studies.tables [study …] [--quick] [--docs]`; --docs refreshes docs/studies.md.
 
 Runs whatever of the studies must run first, so that every number is of the sources that are here.  `benchmarks.stale` names the tables
 of the page that are of others.
@@ -12,33 +12,36 @@ from typing import Annotated
 import msgspec
 import typer
 
-import studies.steps.conclude
-import studies.steps.observe
-import studies.steps.score
-import studies.steps.solve
-import studies.steps.worlds  # noqa: F401  (what is measured, so that the tables' stamps have its sources)
 from benchmarks.markdown import refresh, table
 from factorlib.jsonfile import read_json
-from studies.catalogue import STUDIES
+from studies.catalogue.contents import STUDIES
 from studies.core.measures import MEASURES
-from studies.core.study import FULL, QUICK
+from studies.core.study import FULL, QUICK, Study
 from studies.core.table import Conclusion
 from studies.report.page import number
 from studies.report.tables import answer_to_the_paper
+from studies.run.project import Studies
 from studies.run.project import studies as project_of
 from studies.run.verbs import make
 
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "studies.md"
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs" / "studies.md"
+STEPS = ROOT / "studies" / "steps"
 SHOWN = 4  # measures of a study
 
 
-def as_tables(found: list[Conclusion]) -> dict[str, str]:
-    """The table of conclusions, and of each study its first measures; a quick one says in its head that it is."""
-    rows = [[f"[{c.title}](#{c.title.lower().replace(' ', '-')})", c.paper, answer_to_the_paper(c)] for c in found]
-    return {"conclusions": table(["study", "the paper", "here"], rows)} | {c.study: _numbers(c) for c in found}
+def against_the_paper(found: dict[str, Conclusion]) -> str:
+    """The table of conclusions of all studies, those that were not run among them."""
+    rows = [[f"[{s.title}](#{s.title.lower().replace(' ', '-')})", s.paper, _answer(found.get(name))] for name, s in STUDIES.items()]
+    return table(["study", "the paper", "here"], rows)
 
 
-def _numbers(found: Conclusion) -> str:
+def _answer(found: Conclusion | None) -> str:
+    return answer_to_the_paper(found) if found else "not run"
+
+
+def numbers(found: Conclusion) -> str:
+    """The first measures of a study, and its claims; a quick one says in its head that it is."""
     measures = found.measures[:SHOWN]
     head = [f"{found.varied} ({found.label})" if found.label else found.varied, *(MEASURES[m].label for m in measures)]
     rows = [[row.label, *(number(row.cells.get(m)) for m in measures)] for row in found.rows]
@@ -46,19 +49,40 @@ def _numbers(found: Conclusion) -> str:
     return f"{table(head, rows)}\n\n{sentences}" if not found.label else table(head, rows)
 
 
+def conclusions(project: Studies) -> dict[str, Conclusion]:
+    """Those of the studies of this scale that were run."""
+    files = {name: project.build / name / "table.json" for name in STUDIES}
+    return {name: msgspec.convert(read_json(file), Conclusion, str_keys=True) for name, file in files.items() if file.is_file()}
+
+
+def measuring(study: Study) -> list[str]:
+    """The modules whose sources decide a study's numbers."""
+    steps = sorted(file.stem for file in (STEPS / study.kind).glob("*.py") if file.stem not in ("__init__", "conclude"))
+    settings = next(module for module in _modules() if module.rpartition(".")[2] == study.name.replace("-", "_"))
+    return [settings, *(f"studies.steps.{study.kind}.{step}" for step in steps), "studies.report.conclusion"]
+
+
+def _modules() -> list[str]:
+    return [f"studies.catalogue.{file.stem}" for file in sorted((ROOT / "studies" / "catalogue").glob("*.py"))]
+
+
 def main(
+    names: Annotated[list[str] | None, typer.Argument(help="studies; all without it")] = None,
     quick: Annotated[bool, typer.Option(help="of the quick studies")] = False,
     docs: Annotated[bool, typer.Option(help="also refresh the tables in docs/studies.md")] = False,
 ) -> None:
-    """Run, read, print."""
+    """Run, read, print.  The table of conclusions has a full study's where there is one, else a quick one's."""
     project = project_of(QUICK if quick else FULL)
-    if make(project, list(STUDIES)) != 0:
+    if make(project, names or list(STUDIES)) != 0:
         raise SystemExit(1)
-    found = [msgspec.convert(read_json(project.build / name / "table.json"), Conclusion, str_keys=True) for name in STUDIES]
-    tables = as_tables(found)
-    print("\n\n".join(tables.values()))
+    found = conclusions(project)
+    parts = {name: numbers(found[name]) for name in names or STUDIES}
+    everything = against_the_paper(conclusions(project_of(QUICK)) | conclusions(project_of(FULL)))
+    print("\n\n".join([everything, *parts.values()]))
     if docs:
-        refresh(DOCS, tables, "studies.tables")
+        refresh(DOCS, {"conclusions": everything}, "studies.tables")
+        for name, part in parts.items():
+            refresh(DOCS, {name: part}, "studies.tables", modules=measuring(STUDIES[name]))
 
 
 if __name__ == "__main__":

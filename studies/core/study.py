@@ -47,13 +47,13 @@ class Setting(msgspec.Struct, frozen=True):
 
     name:  a word of a-z, 0-9 and -, part of file names;  label: as figures and tables write it
     x:     where it stands on the axis
-    case:  the case of a seed
+    case:  the case of a seed, in the form that the kind of the study takes
     """
 
     name: str
     label: str
     x: float
-    case: Callable[[int], Case]
+    case: Callable[[int], msgspec.Struct]
 
 
 class Claim(msgspec.Struct, frozen=True):
@@ -70,7 +70,13 @@ class Claim(msgspec.Struct, frozen=True):
 
 
 class Study(msgspec.Struct, frozen=True):
-    """varied: what the axis shows, with its unit;  measures: those of the figure, the first the main one;  paper: its conclusion."""
+    """What is varied and measured.
+
+    paper:     the paper's conclusion
+    varied:    what the axis shows, with its unit
+    measures:  those of the figure, the first the main one
+    kind:      of its cases: its steps are in studies/steps/<kind>, joined by studies/run/pipelines/<kind>.yaml
+    """
 
     name: str
     title: str
@@ -80,8 +86,9 @@ class Study(msgspec.Struct, frozen=True):
     measures: tuple[str, ...]
     settings: Callable[[Scale], list[Setting]]
     claims: Callable[[Scale], list[Claim]]
+    kind: str = "spheres"
 
-    def cases(self, scale: Scale) -> dict[str, Case]:
+    def cases(self, scale: Scale) -> dict[str, msgspec.Struct]:
         """All cases by name: settings in order, each with all seeds."""
         return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in scale.seeds}
 

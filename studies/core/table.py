@@ -54,6 +54,13 @@ class Tested(msgspec.Struct, frozen=True):
     sentence: str
 
 
+class Picture(msgspec.Struct, frozen=True):
+    """A PNG file of a study's folder pictures/, and what it shows."""
+
+    file: str
+    caption: str
+
+
 class Conclusion(msgspec.Struct, frozen=True):
     """All of a study's table.json.  label: what stands beside everything that is shown of a quick study; empty of a full one."""
 
@@ -68,3 +75,4 @@ class Conclusion(msgspec.Struct, frozen=True):
     measures: tuple[str, ...]
     rows: list[Row]
     claims: list[Tested]
+    pictures: list[Picture] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,25 @@ import jinja2
 import msgspec
 
 from studies.core.measures import MEASURES
-from studies.core.table import Cell, Conclusion
+from studies.core.table import Cell, Conclusion, Picture
 from studies.report.tables import answer_to_the_paper
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def page(studies: Sequence[tuple[Any, str]]) -> str:
-    """HTML of studies, each the value of its table.json and the text of its figure.svg, which is this project's own and set as it is."""
-    found = [(msgspec.convert(table, Conclusion, str_keys=True), figure) for table, figure in studies]
+def page(studies: Sequence[tuple[Any, Path]]) -> str:
+    """HTML of studies, each the value of its table.json and the folder of its figure.svg, which is this project's own and set as it is."""
+    found = [_shown(msgspec.convert(table, Conclusion, str_keys=True), folder) for table, folder in studies]
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((TEMPLATES / "index.html").read_text(encoding="utf-8"))
-    quick = any(conclusion.label for conclusion, _ in found)
+    quick = any(conclusion.label for conclusion, _, _ in found)
     return template.render(studies=found, quick=quick, measures=MEASURES, number=number, answer=answer_to_the_paper)
+
+
+def _shown(found: Conclusion, folder: Path) -> tuple[Conclusion, str, list[tuple[Picture, str]]]:
+    """A study, its figure, and its pictures as data URLs."""
+    data = [base64.b64encode((folder / "pictures" / picture.file).read_bytes()).decode() for picture in found.pictures]
+    return found, (folder / "figure.svg").read_text(encoding="utf-8"), list(zip(found.pictures, data, strict=True))
 
 
 def number(cell: Cell | None) -> str:

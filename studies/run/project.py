@@ -14,9 +14,10 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
-from studies.catalogue import STUDIES
+from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, Scale
 
+PIPELINES = Path(__file__).resolve().parent / "pipelines"
 SLICES = ("case", "worlds", "study")
 FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
 
@@ -30,14 +31,14 @@ class Slice(msgspec.Struct, frozen=True):
 
 
 class Studies(Project, frozen=True):
-    """The checkout, with studies in place of data sets."""
+    """The checkout, with the studies of one kind in place of data sets."""
 
     scale: Scale = FULL
 
     @property
     def pipeline_file(self) -> Path:
         """The file that declares the steps."""
-        return Path(__file__).parent / "pipeline.yaml"
+        return PIPELINES / f"{self.package.rpartition('.')[2]}.yaml"
 
     @property
     def build(self) -> Path:
@@ -56,9 +57,9 @@ class Studies(Project, frozen=True):
         return self.dataset_folder(name)
 
 
-def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
-    """The project of the studies of a scale."""
-    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale)
+def studies(scale: Scale = FULL, root: Path = LIBRARY, kind: str = "spheres") -> Studies:
+    """The project of the studies of a scale whose cases are of a kind."""
+    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), f"studies.steps.{kind}", scale)
 
 
 def data_of(folder: Path, scale: Scale) -> Data:

@@ -8,8 +8,8 @@ from pathlib import Path
 from factorlib.jsonfile import read_json
 from factorlib.runner import verbs
 from factorlib.wholefile import replace_file
-from studies.catalogue import STUDIES
-from studies.run.project import FINISHED, Studies
+from studies.catalogue.contents import STUDIES
+from studies.run.project import FINISHED, Studies, studies
 
 
 def make(project: Studies, names: list[str], force: bool = False) -> int:
@@ -21,7 +21,8 @@ def make(project: Studies, names: list[str], force: bool = False) -> int:
     return next((code for code in codes if code), 0)
 
 
-def _make(project: Studies, name: str, force: bool) -> int:
+def _make(studies_: Studies, name: str, force: bool) -> int:
+    project = studies(studies_.scale, studies_.root, STUDIES[name].kind)
     if project.scale.name == "quick":
         print(f"{name}: quick: one seed, smallest sets: no conclusion")
     code = verbs.make(project, verbs.Wish(name, force=force))
@@ -29,15 +30,26 @@ def _make(project: Studies, name: str, force: bool) -> int:
         home = project.build / name
         for file in FINISHED:
             replace_file(home / file, (home / "conclude" / file).read_bytes())
+        copy_pictures(home / "conclude" / "pictures", home / "pictures")
         print(f"  study: {project.shown(home / 'figure.svg')}")
         print(f"  page: {project.shown(write_page(project))}")
     return code
 
 
+def copy_pictures(found: Path, home: Path) -> None:
+    """The pictures of a study, and no others, in its own folder."""
+    wanted = {file.name: file.read_bytes() for file in sorted(found.glob("*.png"))}
+    for file in set(home.glob("*")) - {home / name for name in wanted}:
+        file.unlink()
+    for name, data in wanted.items():
+        home.mkdir(exist_ok=True)
+        replace_file(home / name, data)
+
+
 def write_page(project: Studies) -> Path:
     """index.html of all studies of this scale that are done."""
     folders = [folder for name in STUDIES if (folder := project.build / name) and (folder / "table.json").is_file()]
-    found = [(read_json(folder / "table.json"), (folder / "figure.svg").read_text(encoding="utf-8")) for folder in folders]
+    found = [(read_json(folder / "table.json"), folder) for folder in folders]
     page = import_module("studies.report.page").page(found)  # by its name: a run with nothing to do must not pay for it
     replace_file(project.build / "index.html", page.encode())
     return project.build / "index.html"

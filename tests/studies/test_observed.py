@@ -5,13 +5,13 @@ import pytest
 
 from factorlib.conventions import FRONT
 from factorlib.evaluate.ball import constant_light
-from studies.catalogue import STUDIES
+from studies.catalogue.contents import STUDIES
+from studies.catalogue.structure import PATTERNS, random
 from studies.core.case import Case
 from studies.core.measures import MEASURES
 from studies.core.observed import face_normals, faceted, mislabelled, observations_of, tilted
 from studies.core.study import FULL, QUICK, full_matrix
 from studies.core.world import materials_of, sphere_normals
-from studies.structure import PATTERNS, random
 
 LIGHTS = {li: constant_light(np.ones(3)) for li in range(3)}
 

@@ -13,13 +13,13 @@ import pytest
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
-from studies.catalogue import STUDIES
+from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK
 from studies.core.table import Conclusion
 from studies.report.page import page
 from studies.run.project import data_of, studies
 from studies.run.verbs import make
-from studies.steps import conclude, observe, score, solve, worlds
+from studies.steps.spheres import conclude, observe, score, solve, worlds
 
 SOLVE = {"light_prior": "none", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
 TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, solve=SOLVE, light_rows=8, light_spp=1)
@@ -58,7 +58,7 @@ def test_a_change_of_the_scores_solves_nothing_again(tmp_path):
     records = survey(studies(TINY, tmp_path), NAME, None, []).records
     solve_ = next(record for step, record in records.items() if step.stage == "solve")
     assert "source:studies.core.case" in solve_ and "source:stages.solve" in solve_ and "source:factorlib.solve.bundle" in solve_
-    assert not {"source:studies.core.score", "source:studies.core.study", "source:studies.core.world", "source:studies.matrix_size", "source:studies.report.figure"} & solve_.keys()
+    assert not {"source:studies.core.score", "source:studies.core.study", "source:studies.core.world", "source:studies.catalogue.matrix_size", "source:studies.report.figure"} & solve_.keys()
     assert not any("templates" in name or name.endswith("pipeline.yaml") for name in solve_ if name.startswith("data:studies"))
 
 
@@ -86,13 +86,14 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in found["rows"])
     figure = (out / "figure.svg").read_text()
     assert figure.startswith("<svg") and "no conclusion" in figure and "materials × lights" in figure
-    text = page([(found, figure)])
+    text = page([(found, out)])
     assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), "the page stands alone"
 
 
 def test_the_page_escapes_what_it_shows(tmp_path):
     found = Conclusion("x", "<script>", "?", "&", "v", "full", "", (0,), ("entries",), [], [])
-    assert "<script>" not in page([(json.loads(msgspec.json.encode(found)), "<svg></svg>")])
+    (tmp_path / "figure.svg").write_text("<svg></svg>")
+    assert "<script>" not in page([(json.loads(msgspec.json.encode(found)), tmp_path)])
 
 
 def finished(project):

@@ -12,7 +12,7 @@ from factorlib.urm.observations import write_observations
 from studies.core.case import Case
 from studies.core.observed import observations_of
 from studies.core.world import light, materials_of
-from studies.steps.worlds import light_file
+from studies.steps.spheres.worlds import light_file
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

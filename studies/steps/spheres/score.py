@@ -12,7 +12,7 @@ from factorlib.stage import Inputs, Progress
 from studies.core.case import Case, World
 from studies.core.score import score_of
 from studies.core.world import light
-from studies.steps.worlds import light_file
+from studies.steps.spheres.worlds import light_file
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,8 +1,0 @@
-"""All studies, by name, in the order of the page."""
-
-from __future__ import annotations
-
-from studies import gauss_sphere, label_quality, matrix_size, row_and_column, structure
-from studies.core.study import Study
-
-STUDIES: dict[str, Study] = {m.STUDY.name: m.STUDY for m in (matrix_size, row_and_column, structure, label_quality, gauss_sphere)}
