@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.evaluate.ball import ball_normals
 from factorlib.export.viewers import MODELS, Angles, Model, distribution, filed, mirrored, solved, spread
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
@@ -57,19 +58,12 @@ def _differences(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]
 
 def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
     """Radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
-    normals = ball_normals()
+    normals = ball_normals(PIXELS)[0]
+    normals = normals[normals[:, 2] >= LEAST_COSINE]
     nodes = np.linspace(LEAST_COSINE, 1.0, SKY_NODES)
     sky = in_sky(material, model, nodes)
     in_the_sky = np.stack([np.interp(normals[:, 2], nodes, sky[:, c]) for c in range(3)], axis=-1)
     return [in_the_sky, *(in_lamp(material, model, normals, np.array(lamp)) for lamp in LAMPS.values())]
-
-
-def ball_normals() -> Float[np.ndarray, "n 3"]:
-    """Normals at the pixels' centres; the viewer stands at +z."""
-    at = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
-    x, y = np.meshgrid(at, -at)
-    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
-    return np.stack([x, y, z], axis=-1)[z >= LEAST_COSINE]
 
 
 def in_lamp(material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:

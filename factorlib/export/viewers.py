@@ -95,11 +95,11 @@ def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
     """UsdPreviewSurface, from the numbers in the file; roughness: the material's, which `filed` has made the file's."""
-    told = shader_inputs(material)
-    base = told["diffuseColor"]
-    if not told["useSpecularWorkflow"]:  # a metal
+    inputs = shader_inputs(material)
+    base = inputs["diffuseColor"]
+    if not inputs["useSpecularWorkflow"]:  # a metal
         return _parts(angles, np.zeros(3), base, separable(material.alpha, angles))
-    f0 = told["specularColor"]
+    f0 = inputs["specularColor"]
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, 1 - f0)
     return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
 
@@ -167,9 +167,9 @@ def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "
     """From the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
-    told = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
-    f90 = told["specularFactor"]
-    f0 = f90 * np.minimum(DIELECTRIC * np.array(told["specularColorFactor"]), 1)
+    specular = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
+    f90 = specular["specularFactor"]
+    f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
     return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
 

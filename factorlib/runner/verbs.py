@@ -283,7 +283,8 @@ def collect(project: Project, agreed: Callable[[], bool]) -> int:
     from factorlib.runner.gc import unneeded
 
     found = unneeded(project)
-    print("\n".join(words.unneeded_lines(found, time.time())))
+    for line in words.unneeded_lines(found, time.time()):
+        print(line)
     if found and not agreed():
         print("nothing was deleted")
         return 0

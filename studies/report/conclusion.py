@@ -57,7 +57,7 @@ def _sentence(claim: Claim, lower: Row, higher: Row, found: Difference) -> str:
     subject, difference_ = MEASURES[claim.measure].words, found.spread
     between = f"{subject} in “{lower.label}” against “{higher.label}”"
     if found.verdict == "too few seeds":
-        return f"{claim.words}: not tested, for {difference_.seeds} of the {LEAST_SEEDS} seeds that it takes were run."
+        return f"{claim.words}: not tested: {difference_.seeds} of at least {LEAST_SEEDS} seeds were run."
     numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} seeds"
     if found.verdict == "not shown":
         return f"{claim.words}: no difference is shown ({numbers})."

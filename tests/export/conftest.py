@@ -1,1 +1,19 @@
+"""What tests of exported files share."""
+
+import pytest
+
+from factorlib.stage import silent
+from stages import export
+from tests.export import made_export
+
 collect_ignore = ["in_materialx.py"]  # runs in a process of its own, where MaterialX is installed
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Inputs of `export`, and the folder of what it wrote."""
+    folder = tmp_path_factory.mktemp("export")
+    inputs = made_export.make(folder)
+    (folder / "export").mkdir()
+    export.main(export.Params(), inputs, folder / "export", silent)
+    return inputs, folder / "export"

@@ -16,9 +16,7 @@ from factorlib.jsonfile import read_json
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.results.materials import Reflectance
-from factorlib.stage import silent
 from factorlib.tracing.variant import mitsuba
-from stages import export
 from tests.export import in_blender, made_export
 
 # a ball under one bright texel: radiance in closed form --------------------------------------------------------------
@@ -113,15 +111,6 @@ def test_what_differs_from_the_solved_model_is_the_shadowing(balls):
 
 
 # photos ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("export")
-    inputs = made_export.make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(), inputs, folder / "export", silent)
-    return inputs, folder / "export"
 
 
 @pytest.mark.long

@@ -20,9 +20,7 @@ from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.stage import silent
 from factorlib.tracing.variant import mitsuba
-from stages import export
 from tests.export import made_export
 
 SPP = 1024
@@ -48,15 +46,6 @@ def block_means(picture: np.ndarray, pixels: np.ndarray, side: int = 8) -> np.nd
 def whole_pixels(label: np.ndarray) -> np.ndarray:
     """Pixels that show one material only: those whose neighbours are of the same."""
     return np.any([binary_erosion(label == k, np.ones((3, 3))) for k in np.unique(label[label > 0])], axis=0)
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("export")
-    inputs = made_export.make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(), inputs, folder / "export", silent)
-    return inputs, folder / "export"
 
 
 @pytest.mark.parametrize("photo", ["front", "side"])

@@ -6,13 +6,13 @@ import base64
 import json
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.browser import CHROMIUM, opened
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.report.page import CONTENTS
@@ -178,20 +178,13 @@ def test_missing_pictures_are_left_out_not_fatal(tmp_path):
     parsed(page_of(inputs, tmp_path / "plain"))
 
 
-CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
-FLAGS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --hide-scrollbars"
-)
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine: the page is not looked at by a browser")
 @pytest.mark.parametrize("width", [1300, 520])
 def test_a_browser_draws_it(made, tmp_path, width):
     shot = tmp_path / "page.png"
-    command = [CHROMIUM, *FLAGS.split(), f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", f"--window-size={width},2000",
-               (made[0] / "report" / "index.html").as_uri()]  # fmt: skip
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    with opened(made[0] / "report" / "index.html", viewport={"width": width, "height": 2000}) as (page, complaints):
+        page.screenshot(path=shot)
+    assert not complaints
     pixels = read_png(shot)[..., :3].astype(int)
     background = pixels[5, 5]
     drawn = np.abs(pixels - background).max(axis=-1) > 40
