@@ -12,8 +12,14 @@ MAKEFLAGS += --no-print-directory
 .PHONY: all plan why status graph params new compare validate verify clean gc setup lock test test-long study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph params new compare validate verify clean gc $(STAGES): .venv/ready
+all plan why status graph params new compare validate verify $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
+
+clean: .venv/ready
+	@if [ -n "$$STUDY" ]; then $(PY) -m studies --one --clean; else $(PY) -m factorlib clean; fi
+
+gc: .venv/ready
+	@$(PY) -m factorlib gc && $(PY) -m studies --gc
 
 setup: .venv/ready
 	@[ -z "$$EXTRAS" ] || $(PY) -I factorlib/setup.py extras
@@ -61,8 +67,8 @@ help:
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
-	@echo 'make clean [DATASET=…]               forget the results of a dataset, or of all'
-	@echo 'make gc                              show results that no dataset names any more, and delete them (FORCE=1: without asking)'
+	@echo 'make clean [DATASET=… | STUDY=…]     forget the results of a dataset, of all datasets, or of a study (QUICK=1: its quick ones)'
+	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'

@@ -194,8 +194,12 @@ def clean(dataset: Dataset = None) -> None:
 @app.command()
 def gc(force: Annotated[bool, typer.Option("--force", help="without asking; as FORCE=1")] = False) -> None:
     """Show which results in the store are current for no dataset, and delete them; a terminal is asked first, but for --force."""
-    ask = sys.stdin.isatty() and not switched_on("FORCE", force)
-    raise typer.Exit(verbs.collect(project(), lambda: not ask or typer.confirm("delete them?")))
+    raise typer.Exit(verbs.collect(project(), lambda: agreed(force)))
+
+
+def agreed(force: bool) -> bool:
+    """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
+    return forced(force) or not sys.stdin.isatty() or typer.confirm("delete them?")
 
 
 @app.command()

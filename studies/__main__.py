@@ -1,4 +1,7 @@
-"""The command line: `python -m studies [study …] [--quick]`; all studies without a name.  Make passes STUDY and QUICK on."""
+"""The command line: `python -m studies [study …] [--quick]`; all studies without a name.  Make passes STUDY and QUICK on.
+
+With --clean the results of studies are forgotten, with --gc those that no study names any more are deleted, quick ones among them.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,14 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import forced, switched_on
+from factorlib.__main__ import agreed, forced, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.stop import heed_stops
 from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK
 from studies.run.project import studies
-from studies.run.verbs import make
+from studies.run.verbs import collect, forget, make
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -26,14 +29,20 @@ def run(
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
     force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
+    clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
+    gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
     """Run studies, as far as anything must run."""
+    if gc:
+        raise typer.Exit(collect(lambda: agreed(force)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
     project = studies(QUICK if switched_on("QUICK", quick) else FULL)
     for name in named:
         project.dataset_folder(name)
+    if clean:
+        raise typer.Exit(forget(project, named or list(STUDIES)))
     raise typer.Exit(make(project, named or list(STUDIES), forced(force)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from factorlib.jsonfile import read_json
 from factorlib.runner import verbs
 from factorlib.wholefile import replace_file
 from studies.catalogue.contents import STUDIES
+from studies.core.study import FULL, QUICK
 from studies.run.project import FINISHED, Studies, studies
 
 
@@ -34,6 +36,30 @@ def _make(studies_: Studies, name: str, force: bool) -> int:
         print(f"  study: {project.shown(home / 'figure.svg')}")
         print(f"  page: {project.shown(write_page(project))}")
     return code
+
+
+def forget(project: Studies, names: list[str]) -> int:
+    """Forget the results of studies of a scale; `collect` frees what they took.  Returns 0."""
+    for name in names:
+        home = project.build / name
+        copy_pictures(home / "nothing", home / "pictures")
+        for file in FINISHED:
+            (home / file).unlink(missing_ok=True)
+        if (home / "pictures").is_dir():
+            (home / "pictures").rmdir()
+        verbs.clean(project, name)
+    if project.build.is_dir():
+        write_page(project)
+    return 0
+
+
+def collect(agreed: Callable[[], bool]) -> int:
+    """Show which results no study names any more, and delete them where that is `agreed`.  Returns 0."""
+    for project in (studies(FULL), studies(QUICK)):
+        if (project.build / "store").is_dir():
+            print(f"{project.shown(project.build)}:")
+            verbs.collect(project, agreed)
+    return 0
 
 
 def copy_pictures(found: Path, home: Path) -> None:

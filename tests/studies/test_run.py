@@ -18,7 +18,7 @@ from studies.core.study import FULL, QUICK
 from studies.core.table import Conclusion
 from studies.report.page import page
 from studies.run.project import data_of, studies
-from studies.run.verbs import make
+from studies.run.verbs import copy_pictures, forget, make
 from studies.steps.spheres import conclude, observe, score, solve, worlds
 
 SOLVE = {"light_prior": "none", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
@@ -108,7 +108,7 @@ import sys
 from pathlib import Path
 from tests.studies.test_run import NAME, TINY
 from studies.run.project import studies
-from studies.run.verbs import make
+from studies.run.verbs import copy_pictures, forget, make
 if __name__ == "__main__":
     sys.exit(make(studies(TINY, Path(sys.argv[1])), [NAME]))
 """
@@ -134,3 +134,21 @@ def test_a_killed_study_goes_on_from_there_and_ends_with_the_page(tmp_path):
     text = (project.build / "index.html").read_text()
     assert "no conclusion" in text and STUDIES[NAME].title in text
     assert make(project, [NAME]) == 0 and len(finished(project)) == len(set(finished(project))), "there was nothing to do"
+    forget(project, [NAME])
+    assert sorted(path.name for path in project.build.iterdir()) == ["index.html", "store"]
+    assert STUDIES[NAME].title not in (project.build / "index.html").read_text()
+
+
+def test_to_forget_what_was_not_run_is_no_error(tmp_path, capsys):
+    assert forget(studies(TINY, tmp_path), [NAME]) == 0
+    assert "has no results" in capsys.readouterr().out
+
+
+def test_a_run_takes_the_pictures_of_the_last_away(tmp_path):
+    found, home = tmp_path / "found", tmp_path / "home"
+    found.mkdir()
+    (found / "a.png").write_bytes(b"a")
+    copy_pictures(found, home)
+    (found / "a.png").rename(found / "b.png")
+    copy_pictures(found, home)
+    assert [path.name for path in home.iterdir()] == ["b.png"]
