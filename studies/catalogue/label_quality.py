@@ -7,7 +7,7 @@ Measured   materials and predictions.  Renderings are of the true normals; the s
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Rise, Scale, Setting, Study, full_matrix
 
 NORMALS = {"full": (1, 2, 5, 10, 20), "quick": (5, 20)}
 LABELS = {"full": (2, 10, 20), "quick": (20,)}
@@ -25,12 +25,15 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """Little harm by little noise, and where more noise does no more."""
+    """Whether little noise does harm and much does; whether the error saturates: it rises less per degree at the most noise."""
     none, degrees, shares = scale.square, NORMALS[scale.name], LABELS[scale.name]
+    at = {0: none} | {d: f"normals-{d}deg" for d in degrees}
+    *_, low, mid, most = at
     return [
         Claim("entries", none, f"normals-{degrees[0]}deg", f"noise of {degrees[0]}° on normals does harm", paper=False),
         Claim("entries", none, f"normals-{degrees[-1]}deg", f"noise of {degrees[-1]}° on normals does harm"),
-        Claim("entries", f"normals-{degrees[-2]}deg", f"normals-{degrees[-1]}deg", f"{degrees[-1]}° does more harm than {degrees[-2]}°", paper=False),
+        Claim("entries", at[mid], at[most], f"{most}° does more harm than {mid}°", paper=False),
+        Claim("entries", Rise(at[mid], at[most], most - mid), Rise(at[low], at[mid], mid - low), f"the error rises less per degree beyond {mid}°"),
         Claim("entries", none, f"labels-{shares[0]}pc", f"{shares[0]} % of wrong labels do harm", paper=False),
         Claim("entries", none, f"labels-{shares[-1]}pc", f"{shares[-1]} % of wrong labels do harm", paper=False),
     ]

@@ -56,17 +56,35 @@ class Setting(msgspec.Struct, frozen=True):
     case: Callable[[int], msgspec.Struct]
 
 
+class Rise(msgspec.Struct, frozen=True):
+    """How much a measure rises from one setting to another, for each of the `per` units that they are apart."""
+
+    start: str
+    end: str
+    per: float
+
+
 class Claim(msgspec.Struct, frozen=True):
-    """A comparison that the study makes: the measure is lower in the setting `lower` than in `higher`.
+    """A comparison that the study makes: the measure, or its rise, is lower in the setting `lower` than in `higher`.
 
     words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
     """
 
     measure: str
-    lower: str
-    higher: str
+    lower: str | Rise
+    higher: str | Rise
     words: str
     paper: bool = True
+
+    @property
+    def settings(self) -> list[str]:
+        """The names of all that are compared."""
+        return [name for side in (self.lower, self.higher) for name in settings_of(side)]
+
+
+def settings_of(side: str | Rise) -> list[str]:
+    """The names of the settings of one side of a claim."""
+    return [side] if isinstance(side, str) else [side.start, side.end]
 
 
 class Study(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from studies.core.case import Score
 from studies.core.measures import MEASURES
 from studies.core.statistics import LEAST_SEEDS, difference, spread
-from studies.core.study import Claim, Scale, Setting, Study, case_name
+from studies.core.study import Claim, Rise, Scale, Setting, Study, case_name, settings_of
 from studies.core.table import Cell, Conclusion, Difference, Row, Tested
 
 NO_CONCLUSION = "quick: one seed, smallest sets: no conclusion"
@@ -24,7 +24,7 @@ def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclu
     rows = [_row(setting, scale, scores) for setting in study.settings(scale)]
     claims = study.claims(scale)
     known = {row.name: row for row in rows}
-    tested = [tested_claim(claim, known[claim.lower], known[claim.higher], len(claims)) for claim in claims if _both(claim, known)]
+    tested = [tested_claim(claim, known, len(claims)) for claim in claims if _both(claim, known)]
     label = NO_CONCLUSION if scale.name == "quick" else ""
     return Conclusion(
         study.name, study.title, study.question, study.paper, study.varied, scale.name, label, scale.seeds, study.measures, rows, tested
@@ -43,19 +43,29 @@ def _cell(measure: str, of: Mapping[int, Score]) -> Cell:
 
 
 def _both(claim: Claim, rows: Mapping[str, Row]) -> bool:
-    """Whether both settings have the measure: small sets lack some."""
-    return all(name in rows and claim.measure in rows[name].cells for name in (claim.lower, claim.higher)) and claim.lower != claim.higher
+    """Whether all settings have the measure: small sets lack some."""
+    return all(name in rows and claim.measure in rows[name].cells for name in claim.settings) and claim.lower != claim.higher
 
 
-def tested_claim(claim: Claim, lower: Row, higher: Row, comparisons: int) -> Tested:
+def _by_seed(side: str | Rise, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:
+    first, *last = (rows[name].cells[measure].values for name in settings_of(side))
+    return {seed: (last[0][seed] - value) / side.per for seed, value in first.items() if seed in last[0]} if last else first
+
+
+def _label(side: str | Rise, rows: Mapping[str, Row]) -> str:
+    return " to ".join(f"“{rows[name].label}”" for name in settings_of(side))
+
+
+def tested_claim(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> Tested:
     """What the seeds say of `claim`, one of so many of the study."""
-    found = difference(lower.cells[claim.measure].values, higher.cells[claim.measure].values, comparisons)
-    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, lower, higher, found))
+    found = difference(*(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher)), comparisons)
+    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, rows, found))
 
 
-def _sentence(claim: Claim, lower: Row, higher: Row, found: Difference) -> str:
-    subject, difference_ = MEASURES[claim.measure].words, found.spread
-    between = f"{subject} in “{lower.label}” against “{higher.label}”"
+def _sentence(claim: Claim, rows: Mapping[str, Row], found: Difference) -> str:
+    rise = "" if isinstance(claim.lower, str) else "the rise of "
+    subject, difference_ = rise + MEASURES[claim.measure].words, found.spread
+    between = f"{subject} in {_label(claim.lower, rows)} against {_label(claim.higher, rows)}"
     if found.verdict == "too few seeds":
         return f"{claim.words}: not tested: {difference_.seeds} of at least {LEAST_SEEDS} seeds were run."
     numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} seeds"

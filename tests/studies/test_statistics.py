@@ -1,12 +1,13 @@
 """A conclusion stands only where seeds leave no doubt; numbers here are made up."""
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
 from studies.core.case import Score
 from studies.core.statistics import difference, spread
-from studies.core.study import FULL, QUICK, Claim, Setting, Study, case_name
+from studies.core.study import FULL, QUICK, Claim, Rise, Setting, Study, case_name
 from studies.report.conclusion import concluded
 from studies.report.tables import answer_to_the_paper, csv_text, paragraph
 
@@ -83,6 +84,19 @@ def test_the_sentence_says_what_was_found(a, b, answer, words):
     found = concluded(study(CLAIM), FULL, scores(FULL, a=a, b=b))
     assert words in paragraph(found) and answer_to_the_paper(found) == answer
     assert found.rows[0].cells["entries"].null == 0.5 and "roughness" not in found.rows[0].cells
+
+
+@pytest.mark.parametrize("b, c, answer", [(0.5, 0.6, "agrees"), (0.5, 1.9, "disagrees")])
+def test_rises_are_compared_per_unit(b, c, answer):
+    """From a to b one unit, from b to c two: .4 and .05 or .7 a unit."""
+    made = [Setting(name, name, x, lambda seed: QUICK.case(seed, [(0, 0)])) for x, name in enumerate("abc")]
+    claim = Claim("entries", Rise("b", "c", 2), Rise("a", "b", 1), "it saturates")
+    of = msgspec.structs.replace(study(claim), settings=lambda scale: made)
+    noise = {name: 1e-6 * k for name, k in zip("abc", (0, 1, 5), strict=True)}
+    given = {case_name(name, s): Score({"entries": v + s**2 * noise[name]}, {}) for name, v in zip("abc", (0.1, b, c), strict=True) for s in FULL.seeds}
+    found = concluded(of, FULL, given)
+    assert found.claims[0].answer == answer and "the rise of DSSIM" in found.claims[0].sentence
+    assert found.claims[0].difference.spread.mean == pytest.approx((c - b) / 2 - (b - 0.1), abs=1e-4)
 
 
 def test_a_quick_study_concludes_nothing_and_says_so():
