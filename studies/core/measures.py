@@ -27,6 +27,8 @@ MEASURES = {
     "mirror": Measure("error of a mirror sphere", "RMSE over the truth's RMS", "the error of a mirror sphere"),
     "glossy": Measure("error of a glossy sphere", "RMSE over the truth's RMS", "the error of a glossy sphere"),
     "matte": Measure("error of a matte sphere", "RMSE over the truth's RMS", "the error of a matte sphere"),
+    "normals": Measure("error of the normals given", "degrees, median", "the error of the normals given"),
+    "seconds": Measure("time of the solve", "processor seconds", "the time of the solve"),
     "stated_roughness": Measure("stated standard error of roughness", "1", "the stated standard error of roughness"),
     "stated_reflectance": Measure("stated standard error of k_d and k_s", "relative to k_d + k_s", "the stated standard error of k_d and k_s"),
 }

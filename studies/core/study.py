@@ -28,6 +28,11 @@ class Scale(msgspec.Struct, frozen=True):
         return f"{self.side}x{self.side}"
 
     @property
+    def entry_pixels(self) -> int:
+        """About as many as a sphere has that grazing ones are left out of."""
+        return round(0.77 * self.size**2)
+
+    @property
     def worlds(self) -> World:
         """What the studies of this scale show, equal for all of them, so that it is made once."""
         return World(self.seeds, self.largest, self.light_rows, self.light_spp)
