@@ -31,9 +31,9 @@ HARMS: dict[str, tuple[str, Harm]] = {
 }
 ARMS: dict[str, tuple[str, dict[str, Any]]] = {
     "as-it-is": ("", {}),
-    "squares": (", squares", {"robust": False}),
-    "even": (", even", {"confidence": False}),
-    "outline": (", outline", {"refined": True}),
+    "squares": (" squares", {"robust": False}),
+    "even": (" even", {"confidence": False}),
+    "outline": (" outline", {"refined": True}),
 }
 FEW = ("as-it-is", "outline")
 SHOWN = {

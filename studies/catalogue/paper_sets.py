@@ -53,7 +53,7 @@ def settings(scale: Scale) -> list[Setting]:
 
 def _setting(scale: Scale, x: int, name: str, entries: list[Entry]) -> Setting:
     case = lambda seed: ObjectsCase(seed, tuple(sorted(entries)), scale.entry_pixels, solve=scale.solve)  # noqa: E731
-    return Setting(f"set-{name}", name.replace("docksta-unlinked", "docksta, no chair"), x, case)
+    return Setting(f"set-{name}", name.replace("-unlinked", " without chair"), x, case)
 
 
 def claims(scale: Scale) -> list[Claim]:

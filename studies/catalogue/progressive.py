@@ -20,7 +20,7 @@ def settings(scale: Scale) -> list[Setting]:
 
 def _setting(scale: Scale, x: int, n: int, start: str) -> Setting:
     entries, warm = tuple(full_matrix(scale.side, n)), start == "earlier"
-    label = f"{n}, warm" if warm else str(n)
+    label = f"{n} warm" if warm else str(n)
     case = lambda seed: ObjectsCase(seed, entries, scale.entry_pixels, start=start, solve=scale.solve)  # noqa: E731
     return Setting(f"photos-{n}-warm" if warm else f"photos-{n}", label, x, case)
 

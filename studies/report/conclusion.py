@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from studies.core.case import Score
 from studies.core.measures import MEASURES
@@ -21,18 +22,27 @@ ANSWERS = {
 
 def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
     """scores: by the cases' names."""
-    rows = [_row(setting, scale, scores) for setting in study.settings(scale)]
+    seeds = study.seeds_of(scale)
+    rows = [_row(setting, seeds, scores) for setting in study.settings(scale)]
     claims = study.claims(scale)
     known = {row.name: row for row in rows}
-    tested = [tested_claim(claim, known[claim.lower], known[claim.higher], len(claims)) for claim in claims if _both(claim, known)]
+    tested = [tested_claim(claim, known[claim.lower], known[claim.higher], Testing(len(claims), study.over)) for claim in claims if _both(claim, known)]
     label = NO_CONCLUSION if scale.name == "quick" else ""
     return Conclusion(
-        study.name, study.title, study.question, study.paper, study.varied, scale.name, label, scale.seeds, study.measures, rows, tested
-    )
+        study.name, study.title, study.question, study.paper, study.varied, scale.name, label, seeds, study.measures, rows, tested,
+        over=study.over,
+    )  # fmt: skip
 
 
-def _row(setting: Setting, scale: Scale, scores: Mapping[str, Score]) -> Row:
-    of = {seed: scores[case_name(setting.name, seed)] for seed in scale.seeds}
+class Testing(NamedTuple):
+    """How many comparisons the study makes, and what its intervals are over."""
+
+    comparisons: int
+    over: str = "seeds"
+
+
+def _row(setting: Setting, seeds: tuple[int, ...], scores: Mapping[str, Score]) -> Row:
+    of = {seed: scores[case_name(setting.name, seed)] for seed in seeds}
     return Row(setting.name, setting.label, setting.x, {m: _cell(m, of) for m in MEASURES if any(m in s.values for s in of.values())})
 
 
@@ -47,18 +57,18 @@ def _both(claim: Claim, rows: Mapping[str, Row]) -> bool:
     return all(name in rows and claim.measure in rows[name].cells for name in (claim.lower, claim.higher)) and claim.lower != claim.higher
 
 
-def tested_claim(claim: Claim, lower: Row, higher: Row, comparisons: int) -> Tested:
-    """What the seeds say of `claim`, one of so many of the study."""
-    found = difference(lower.cells[claim.measure].values, higher.cells[claim.measure].values, comparisons)
-    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, lower, higher, found))
+def tested_claim(claim: Claim, lower: Row, higher: Row, testing: Testing) -> Tested:
+    """What the seeds say of `claim`."""
+    found = difference(lower.cells[claim.measure].values, higher.cells[claim.measure].values, testing.comparisons)
+    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, lower, higher, found, testing.over))
 
 
-def _sentence(claim: Claim, lower: Row, higher: Row, found: Difference) -> str:
+def _sentence(claim: Claim, lower: Row, higher: Row, found: Difference, over: str) -> str:
     subject, difference_ = MEASURES[claim.measure].words, found.spread
     between = f"{subject} in “{lower.label}” against “{higher.label}”"
     if found.verdict == "too few seeds":
-        return f"{claim.words}: not tested, for {difference_.seeds} of the {LEAST_SEEDS} seeds that it takes were run."
-    numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} seeds"
+        return f"{claim.words}: not tested, for {difference_.seeds} of the {LEAST_SEEDS} {over} that it takes were run."
+    numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} {over}"
     if found.verdict == "not shown":
         return f"{claim.words}: no difference is shown ({numbers})."
     said = "shown" if found.verdict == "lower" else "the opposite is shown"
