@@ -27,7 +27,7 @@ HARMS: dict[str, tuple[str, Harm]] = {
     "turned-20": ("turned 20°", Harm(turned_deg=20.0)),
     "shifted": ("shifted 5 %", Harm(shifted=0.05)),
     "larger": ("10 % larger", Harm(larger=0.1)),
-    "coarse": ("100 triangles", Harm(triangles=100)),
+    "coarse": ("of 100 triangles", Harm(triangles=100)),
 }
 ARMS: dict[str, tuple[str, dict[str, Any]]] = {
     "as-it-is": ("", {}),
@@ -58,19 +58,25 @@ def _setting(scale: Scale, x: int, harm: str, arm: str) -> Setting:
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """What does harm, and what helps against it."""
-    exact = "exact-as-it-is"
-    harmful = [Claim("entries", exact, f"{harm}-as-it-is", f"“{label}” does harm", paper=harm == "turned-20") for harm, (label, _) in HARMS.items()
-               if harm not in ("exact", "turned-2", "turned-10")]  # fmt: skip
-    refined = [
-        Claim("entries", f"{harm}-outline", f"{harm}-as-it-is", f"fitting the outline helps where objects are {HARMS[harm][0]}", paper=False)
-        for harm in ("turned-5", "turned-20", "larger")
-    ]
-    return harmful + refined + [
-        Claim("entries", "turned-20-as-it-is", "turned-20-squares", "the robust loss helps where poses are off by 20°", paper=False),
-        Claim("entries", "turned-5-as-it-is", "turned-5-even", "knowing how sure normals are helps where poses are off by 5°", paper=False),
-        Claim("entries", "coarse-as-it-is", "coarse-even", "knowing how sure normals are helps with coarse meshes", paper=False),
-    ]  # fmt: skip
+    """What does harm, and what helps against it; of settings that this scale has."""
+    harmful = [_harmful(harm) for harm in ("turned-5", "turned-20", "shifted", "larger", "coarse")]
+    refined = [_helps("outline", harm, "fitting the outline") for harm in ("turned-5", "turned-20", "larger")]
+    robust = [_matters("squares", "turned-20", "the robust loss")]
+    sure = [_matters("even", harm, "knowing how sure normals are") for harm in ("turned-5", "coarse")]
+    known = {setting.name for setting in settings(scale)}
+    return [claim for claim in (*harmful, *refined, *robust, *sure) if {claim.lower, claim.higher} <= known]
+
+
+def _harmful(harm: str) -> Claim:
+    return Claim("entries", "exact-as-it-is", f"{harm}-as-it-is", f"“{HARMS[harm][0]}” does harm")
+
+
+def _helps(arm: str, harm: str, what: str) -> Claim:
+    return Claim("entries", f"{harm}-{arm}", f"{harm}-as-it-is", f"{what} helps where objects are {HARMS[harm][0]}", paper=False)
+
+
+def _matters(arm: str, harm: str, what: str) -> Claim:
+    return Claim("entries", f"{harm}-as-it-is", f"{harm}-{arm}", f"{what} helps where objects are {HARMS[harm][0]}", paper=False)
 
 
 STUDY = Study(

@@ -96,8 +96,7 @@ def _dssim(chair: Chair, image: Image) -> float:
 
 
 def _factor(chair: Chair, image: Image) -> Float[np.ndarray, "3"]:
-    """The least-squares factor of each channel, over pixels that neither picture cuts."""
-    found, truth = image[chair.mask], chair.truth[chair.mask]
-    kept = np.maximum(found, truth).max(axis=1) <= chair.white
-    found, truth = found[kept], truth[kept]
+    """The least-squares factor of each channel, over pixels that the photo's picture does not cut."""
+    kept = chair.mask & (chair.truth.max(axis=2) <= chair.white)
+    found, truth = image[kept], chair.truth[kept]
     return (found * truth).sum(0) / np.maximum((found**2).sum(0), 1e-30)

@@ -1,7 +1,7 @@
 """What a case of objects sees: radiance of the true normals, beside the normals of where the objects are thought to be.
 
 Pixels     those that both the true object and the one of the harmed pose and mesh show, as the stage `urm` takes them
-Noise      each radiance times 1 + .01 · normal, as of the spheres
+Noise      each radiance times 1 + .01 · normal, drawn for each pixel by itself: harm leaves what a pixel shows as it is
 Normals    of the mesh that is given, at the pose that is given: harmed, or fitted to the outline from there
 """
 
@@ -75,8 +75,8 @@ def _entry(case: ObjectsCase, m: int, li: int, materials: Mapping[str, Reflectan
     kept = np.sort(rng.permutation(kept)[: case.pixels])
     true, believed = (maps.normal.reshape(-1, 3)[kept] for maps in (shown, had))
     radiance = spheres([list(materials.values())[m]], light, true @ YUP_FROM_CAMERA.T)[0]
-    radiance = radiance * (1 + NOISE * np.random.default_rng([13, case.seed, li, m, 0]).standard_normal(radiance.shape))
-    seen = _observations(case, m, li, believed, radiance, sure.reshape(-1)[kept])
+    noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((had.label.size, 3))[kept]
+    seen = _observations(case, m, li, believed, radiance * (1 + NOISE * noise), sure.reshape(-1)[kept])
     return Seen(msgspec.structs.replace(seen, x=kept), angle_deg(true, believed))
 
 
