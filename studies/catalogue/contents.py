@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from studies.catalogue import gauss_sphere, label_quality, matrix_size, row_and_column, structure
+from studies.catalogue import (
+    alignment_error,
+    gauss_sphere,
+    label_quality,
+    leave_one_out,
+    matrix_size,
+    paper_sets,
+    progressive,
+    row_and_column,
+    structure,
+)
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -12,6 +22,10 @@ STUDIES: dict[str, Study] = {
         row_and_column,
         structure,
         label_quality,
+        alignment_error,
+        progressive,
+        leave_one_out,
+        paper_sets,
         gauss_sphere,
     )
 }

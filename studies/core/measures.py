@@ -27,6 +27,10 @@ MEASURES = {
     "mirror": Measure("error of a mirror sphere", "RMSE over the truth's RMS", "the error of a mirror sphere"),
     "glossy": Measure("error of a glossy sphere", "RMSE over the truth's RMS", "the error of a glossy sphere"),
     "matte": Measure("error of a Lambertian sphere", "RMSE over the truth's RMS", "the error of a Lambertian sphere"),
+    "chair": Measure("DSSIM of a chair", "1", "DSSIM of a chair"),
+    "chair_scaled": Measure("DSSIM of a chair, a factor per channel taken out", "1", "DSSIM of a chair, a factor per channel taken out,"),
+    "normals": Measure("median error of the normals given", "degrees", "the error of the normals given"),
+    "seconds": Measure("time of the solve", "processor seconds", "the time of the solve"),
     "stated_roughness": Measure("stated standard error of roughness", "1", "the stated standard error of roughness"),
     "stated_reflectance": Measure("stated standard error of k_d and k_s", "relative to k_d + k_s", "the stated standard error of k_d and k_s"),
 }

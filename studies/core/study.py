@@ -28,6 +28,11 @@ class Scale(msgspec.Struct, frozen=True):
         return f"{self.side}x{self.side}"
 
     @property
+    def entry_pixels(self) -> int:
+        """About as many as a sphere has that grazing ones are left out of."""
+        return round(0.77 * self.size**2)
+
+    @property
     def worlds(self) -> World:
         """What the studies of this scale show, equal for all of them, so that it is made once."""
         return World(self.seeds, self.largest, self.light_rows, self.light_spp)
@@ -94,6 +99,7 @@ class Study(msgspec.Struct, frozen=True):
     varied:    what the axis shows, with its unit
     measures:  those of the figure, the first the main one
     kind:      of its cases: its steps are in studies/steps/<kind>, joined by studies/run/pipelines/<kind>.yaml
+    spread:    what stands in the place of seeds, where these are not what intervals are over;  over: what that is called
     """
 
     name: str
@@ -105,10 +111,16 @@ class Study(msgspec.Struct, frozen=True):
     settings: Callable[[Scale], list[Setting]]
     claims: Callable[[Scale], list[Claim]]
     kind: str = "spheres"
+    spread: Callable[[Scale], tuple[int, ...]] | None = None
+    over: str = "seeds"
+
+    def seeds_of(self, scale: Scale) -> tuple[int, ...]:
+        """The numbers of a setting's cases."""
+        return self.spread(scale) if self.spread else scale.seeds
 
     def cases(self, scale: Scale) -> dict[str, msgspec.Struct]:
         """All cases by name: settings in order, each with all seeds."""
-        return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in scale.seeds}
+        return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in self.seeds_of(scale)}
 
 
 def case_name(setting: str, seed: int) -> str:

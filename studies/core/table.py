@@ -62,7 +62,10 @@ class Picture(msgspec.Struct, frozen=True):
 
 
 class Conclusion(msgspec.Struct, frozen=True):
-    """All of a study's table.json.  label: what stands beside everything that is shown of a quick study; empty of a full one."""
+    """All of a study's table.json.  label: what stands beside everything that is shown of a quick study; empty of a full one.
+
+    over: what intervals are over
+    """
 
     study: str
     title: str
@@ -76,3 +79,4 @@ class Conclusion(msgspec.Struct, frozen=True):
     rows: list[Row]
     claims: list[Tested]
     pictures: list[Picture] = []
+    over: str = "seeds"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from studies.core.case import Score
 from studies.core.measures import MEASURES
@@ -21,18 +22,27 @@ ANSWERS = {
 
 def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
     """scores: by the cases' names."""
-    rows = [_row(setting, scale, scores) for setting in study.settings(scale)]
+    seeds = study.seeds_of(scale)
+    rows = [_row(setting, seeds, scores) for setting in study.settings(scale)]
     claims = study.claims(scale)
     known = {row.name: row for row in rows}
-    tested = [tested_claim(claim, known, len(claims)) for claim in claims if _both(claim, known)]
+    tested = [tested_claim(claim, known, Testing(len(claims), study.over)) for claim in claims if _both(claim, known)]
     label = NO_CONCLUSION if scale.name == "quick" else ""
     return Conclusion(
-        study.name, study.title, study.question, study.paper, study.varied, scale.name, label, scale.seeds, study.measures, rows, tested
-    )
+        study.name, study.title, study.question, study.paper, study.varied, scale.name, label, seeds, study.measures, rows, tested,
+        over=study.over,
+    )  # fmt: skip
 
 
-def _row(setting: Setting, scale: Scale, scores: Mapping[str, Score]) -> Row:
-    of = {seed: scores[case_name(setting.name, seed)] for seed in scale.seeds}
+class Testing(NamedTuple):
+    """How many comparisons the study makes, and what its intervals are over."""
+
+    comparisons: int
+    over: str = "seeds"
+
+
+def _row(setting: Setting, seeds: tuple[int, ...], scores: Mapping[str, Score]) -> Row:
+    of = {seed: scores[case_name(setting.name, seed)] for seed in seeds}
     return Row(setting.name, setting.label, setting.x, {m: _cell(m, of) for m in MEASURES if any(m in s.values for s in of.values())})
 
 
@@ -56,19 +66,19 @@ def _label(side: str | Rise, rows: Mapping[str, Row]) -> str:
     return " to ".join(f"“{rows[name].label}”" for name in settings_of(side))
 
 
-def tested_claim(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> Tested:
-    """What the seeds say of `claim`, one of so many of the study."""
-    found = difference(*(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher)), comparisons)
-    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, rows, found))
+def tested_claim(claim: Claim, rows: Mapping[str, Row], testing: Testing) -> Tested:
+    """What the seeds say of `claim`."""
+    found = difference(*(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher)), testing.comparisons)
+    return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, rows, found, testing.over))
 
 
-def _sentence(claim: Claim, rows: Mapping[str, Row], found: Difference) -> str:
+def _sentence(claim: Claim, rows: Mapping[str, Row], found: Difference, over: str) -> str:
     rise = "" if isinstance(claim.lower, str) else "the rise of "
     subject, difference_ = rise + MEASURES[claim.measure].words, found.spread
     between = f"{subject} in {_label(claim.lower, rows)} against {_label(claim.higher, rows)}"
     if found.verdict == "too few seeds":
-        return f"{claim.words}: not tested: {difference_.seeds} of at least {LEAST_SEEDS} seeds were run."
-    numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} seeds"
+        return f"{claim.words}: not tested: {difference_.seeds} of at least {LEAST_SEEDS} {over} were run."
+    numbers = f"{between}: {difference_.mean:+.2g}, {difference_.low:+.2g} to {difference_.high:+.2g} over {difference_.seeds} {over}"
     if found.verdict == "not shown":
         return f"{claim.words}: no difference is shown ({numbers})."
     said = "shown" if found.verdict == "lower" else "the opposite is shown"

@@ -13,12 +13,14 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from studies.catalogue.contents import STUDIES
+from studies.core.left_out.case import FOLDER, LeftOutCase
 from studies.core.study import FULL, Scale
 
 PIPELINES = Path(__file__).resolve().parent / "pipelines"
-SLICES = ("case", "worlds", "study")
+SLICES = ("case", "worlds", "study", "photos")
 FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
 
 
@@ -62,6 +64,14 @@ def studies(scale: Scale = FULL, root: Path = LIBRARY, kind: str = "spheres") ->
     return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), f"studies.steps.{kind}", scale)
 
 
+def photos_of(case: LeftOutCase) -> dict[str, Any]:
+    """The photos of a study of a data set, how they are solved, and what the data set contains, so that a step's key has it."""
+    hashes, folder = FileHashes(None), LIBRARY / FOLDER
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.relative_to(folder).parts[0] != "truth")
+    content = {str(file.relative_to(folder)): hashes.content(file) for file in files}
+    return {"folder": FOLDER, "photos": list(case.photos), "solve": case.solve, "content": content}
+
+
 def data_of(folder: Path, scale: Scale) -> Data:
     """A study as the runner reads it."""
     study = STUDIES[folder.name]
@@ -69,8 +79,13 @@ def data_of(folder: Path, scale: Scale) -> Data:
 
     def slice_(name: str, photo: str | None) -> Slice:
         """The facts of a slice; its fields are what a change is reported by."""
-        facts = {"worlds": scale.worlds, "study": {"name": study.name, "scale": scale}, "case": cases.get(photo)}[name]
-        plain = msgspec.to_builtins(facts)
+        facts = {
+            "worlds": lambda: scale.worlds,
+            "study": lambda: {"name": study.name, "scale": scale},
+            "case": lambda: cases.get(photo),
+            "photos": lambda: photos_of(next(iter(cases.values()))),
+        }
+        plain = msgspec.to_builtins(facts[name]())
         return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
 
     return Data(folder, list(cases), slice_)

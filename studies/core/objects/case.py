@@ -1,0 +1,72 @@
+"""A case whose entries are objects: made bodies, each turned at random, seen by a camera, and perhaps thought to be elsewhere.
+
+Materials are seven, the first five about those of `studies.core.case.NAMES`; lights are those of the sphere's worlds, and one more.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from studies.core.case import NAMES, Entry
+
+SEVEN = (*NAMES, "tile", "bronze")
+
+
+class Harm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What of an object is not as the solve is led to believe.
+
+    turned_deg:  about a random axis through its middle
+    shifted:     in a random direction of the image, as a share of the mesh's diameter
+    larger:      the mesh, as a share of its size
+    triangles:   of the mesh that stands for it; None: all some 20,000
+    """
+
+    turned_deg: float = 0.0
+    shifted: float = 0.0
+    larger: float = 0.0
+    triangles: int | None = None
+
+
+class ObjectsCase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one solve sees.
+
+    entries:     observed ones, an object each
+    pixels:      most observations of an entry
+    harm:        of every object alike, toward random sides
+    robust:      whether the solve has its robust loss
+    confidence:  whether it hears how sure each normal is, as the stage `align` says it
+    refined:     whether every pose is first fitted to the outline of its mask by `factorlib.align.refine`, from where the harm left it
+    start:       nothing, or the solution of all photos but the last (the stage's parameter `start`)
+    solve:       parameters of the stage `solve` that differ from their defaults
+    """
+
+    seed: int
+    entries: tuple[Entry, ...]
+    pixels: int
+    harm: Harm = Harm()
+    robust: bool = True
+    confidence: bool = True
+    refined: bool = False
+    start: Literal["nothing", "earlier"] = "nothing"
+    solve: dict[str, Any] = {}
+
+    @property
+    def materials(self) -> list[int]:
+        """Those that are seen, in order."""
+        return sorted({m for m, _ in self.entries})
+
+    @property
+    def material_names(self) -> list[str]:
+        """The same by name, in the order of their numbers in the case's observations."""
+        return [SEVEN[m] for m in self.materials]
+
+    @property
+    def lights(self) -> list[int]:
+        """Those that are seen, in order."""
+        return sorted({li for _, li in self.entries})
+
+    def names_in(self, light: int) -> list[str]:
+        """Of the materials that are seen in a light."""
+        return [SEVEN[m] for m, at in self.entries if at == light]
