@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from studies.catalogue import (
     alignment_error,
+    comparison,
     gauss_sphere,
     label_quality,
     leave_one_out,
@@ -27,5 +28,6 @@ STUDIES: dict[str, Study] = {
         leave_one_out,
         paper_sets,
         gauss_sphere,
+        comparison,
     )
 }
