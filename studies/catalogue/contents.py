@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from studies.catalogue import gauss_sphere, label_quality, matrix_size, row_and_column, structure
+from studies.catalogue import gauss_sphere, label_quality, matrix_size, prior, row_and_column, structure
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -13,5 +13,6 @@ STUDIES: dict[str, Study] = {
         structure,
         label_quality,
         gauss_sphere,
+        prior,
     )
 }

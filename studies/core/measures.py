@@ -29,4 +29,8 @@ MEASURES = {
     "matte": Measure("error of a Lambertian sphere", "RMSE over the truth's RMS", "the error of a Lambertian sphere"),
     "stated_roughness": Measure("stated standard error of roughness", "1", "the stated standard error of roughness"),
     "stated_reflectance": Measure("stated standard error of k_d and k_s", "relative to k_d + k_s", "the stated standard error of k_d and k_s"),
+    "chromaticity": Measure("chromaticity of the lights", "deviation of channels over their mean", "the chromaticity of the lights"),
+    "true_chromaticity": Measure("chromaticity of the true lights", "deviation of channels over their mean", "the chromaticity of the true lights"),
+    "colour": Measure("angle of a mirror sphere's colour", "degrees", "the angle between a mirror sphere's colours"),
+    "tint": Measure("tint of all reflectances", "deviation of the log over channels", "the tint of all reflectances"),
 }

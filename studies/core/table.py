@@ -62,7 +62,11 @@ class Picture(msgspec.Struct, frozen=True):
 
 
 class Conclusion(msgspec.Struct, frozen=True):
-    """All of a study's table.json.  label: what stands beside everything that is shown of a quick study; empty of a full one."""
+    """All of a study's table.json.
+
+    label: what stands beside everything that is shown of a quick study; empty of a full one
+    notes: sentences that are no claims
+    """
 
     study: str
     title: str
@@ -76,3 +80,4 @@ class Conclusion(msgspec.Struct, frozen=True):
     rows: list[Row]
     claims: list[Tested]
     pictures: list[Picture] = []
+    notes: list[str] = []

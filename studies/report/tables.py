@@ -28,7 +28,12 @@ def paragraph(found: Conclusion) -> str:
     """Markdown: the question, what the paper says, and what the seeds say of each claim."""
     start = f"**{found.title}.** {found.question}" + (f" *{found.label}.*" if found.label else "")
     first = f"{start} The paper: {found.paper}"
-    return "\n".join([first, "", *(f"- {tested.sentence}" for tested in found.claims)]) + "\n"
+    return "\n".join([first, "", *(f"- {sentence}" for sentence in sentences(found))]) + "\n"
+
+
+def sentences(found: Conclusion) -> list[str]:
+    """What the seeds say of each claim, then the notes."""
+    return [tested.sentence for tested in found.claims] + found.notes
 
 
 def answer_to_the_paper(found: Conclusion) -> str:
