@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from studies.catalogue import gauss_sphere, label_quality, matrix_size, prior, row_and_column, structure
+from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, prior, row_and_column, structure
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -14,5 +14,6 @@ STUDIES: dict[str, Study] = {
         label_quality,
         gauss_sphere,
         prior,
+        cost,
     )
 }

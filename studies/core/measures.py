@@ -33,4 +33,8 @@ MEASURES = {
     "true_chromaticity": Measure("chromaticity of the true lights", "deviation of channels over their mean", "the chromaticity of the true lights"),
     "colour": Measure("angle of a mirror sphere's colour", "degrees", "the angle between a mirror sphere's colours"),
     "tint": Measure("tint of all reflectances", "deviation of the log over channels", "the tint of all reflectances"),
+    "seconds": Measure("processor time of the solve", "seconds", "the processor time of the solve"),
+    "seconds_an_entry": Measure("processor time of the solve, an entry", "seconds", "the processor time an entry"),
+    "peak": Measure("largest memory of the process", "GB", "the largest memory of the process"),
+    "grown": Measure("memory beyond that before the solve", "GB", "the memory that the solve adds"),
 }

@@ -64,8 +64,9 @@ class Picture(msgspec.Struct, frozen=True):
 class Conclusion(msgspec.Struct, frozen=True):
     """All of a study's table.json.
 
-    label: what stands beside everything that is shown of a quick study; empty of a full one
-    notes: sentences that are no claims
+    label:  what stands beside everything that is shown of a quick study; empty of a full one
+    notes:  sentences that are no claims
+    answer: to the paper, where it is not that of the claims
     """
 
     study: str
@@ -81,3 +82,4 @@ class Conclusion(msgspec.Struct, frozen=True):
     claims: list[Tested]
     pictures: list[Picture] = []
     notes: list[str] = []
+    answer: str = ""

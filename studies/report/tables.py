@@ -44,6 +44,8 @@ def answer_to_the_paper(found: Conclusion) -> str:
     answers = [tested.answer for tested in found.claims if tested.claim.paper]
     if found.label:
         return f"not tested ({found.label})"
+    if found.answer:
+        return found.answer
     if not answers:
         return "the paper claims nothing that is tested here"
     for answer in ("disagrees", "not tested: too few seeds", "no difference is shown"):
