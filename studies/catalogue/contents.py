@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, prior, row_and_column, structure
+from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, prior, row_and_column, speed, structure
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -15,5 +15,6 @@ STUDIES: dict[str, Study] = {
         gauss_sphere,
         prior,
         cost,
+        speed,
     )
 }

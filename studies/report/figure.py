@@ -11,6 +11,7 @@ from studies.core.table import Cell, Conclusion
 
 WIDTH, HEIGHT, COLUMNS = 380, 230, 2  # of a panel; panels side by side
 LEFT, RIGHT, TOP, BOTTOM = 58, 14, 44, 50
+LETTER, TURN, TURNED = 6.4, -30, 36  # width of a letter, degrees and further height of labels that would overlap
 HEAD = 34  # of the title
 FAR = 2.5  # times the highest value
 Place = Callable[[float], float]  # where a number stands, pixels
@@ -33,7 +34,8 @@ def _panel(found: Conclusion, measure: str, x0: float, y0: float) -> list[str]:
     null = max((cell.null for _, cell in cells if cell.null is not None), default=0.0)
     near = null <= FAR * found_top  # a far one would press all else to the axis: it is written instead
     top = max(found_top, null) if near else found_top
-    left, right, base, high = x0 + LEFT, x0 + WIDTH - RIGHT, y0 + HEIGHT - BOTTOM, y0 + TOP
+    below = TURNED if crowded([row.label for row in found.rows]) else 0
+    left, right, base, high = x0 + LEFT, x0 + WIDTH - RIGHT, y0 + HEIGHT - BOTTOM - below, y0 + TOP
 
     def across(k: float) -> float:
         """Of setting k."""
@@ -48,10 +50,20 @@ def _panel(found: Conclusion, measure: str, x0: float, y0: float) -> list[str]:
     parts = [text(left, high - 14, f"{about.label}{unit}", css="small")]
     for value in ticks(0, 1.05 * top, 4):
         parts += [line(left, up(value), right, up(value), "grid"), text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
-    parts += [line(left, base, right, base, "axis"), text((left + right) / 2, base + 36, found.varied, "middle", "small soft")]
-    parts += [text(across(k), base + 16, row.label, "middle", "small") for k, row in enumerate(found.rows)]
+    parts += [line(left, base, right, base, "axis"), text((left + right) / 2, base + 36 + below, found.varied, "middle", "small soft")]
+    turned = ("end", "small", TURN) if below else ("middle", "small")
+    parts += [text(across(k), base + 16, row.label, *turned) for k, row in enumerate(found.rows)]
     parts += [] if near else [text(right, high - 2, f"a guess: up to {null:.2g}", "end", "small soft")]
     return parts + _marks(cells, across, up, near)
+
+
+def crowded(labels: Sequence[str]) -> bool:
+    """Whether labels, each as wide as the longest, would overlap along a panel's axis.
+
+    >>> crowded(["1 × 1", "2 × 2"]), crowded(["a quite long label"] * 12)
+    (False, True)
+    """
+    return LETTER * max(map(len, labels), default=0) * len(labels) > WIDTH - LEFT - RIGHT
 
 
 def _marks(cells: Sequence[tuple[int, Cell]], across: Place, up: Place, with_null: bool) -> list[str]:
