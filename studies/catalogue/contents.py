@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, prior, row_and_column, speed, structure
+from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, network_evaluation, prior, row_and_column, speed, structure
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -14,6 +14,7 @@ STUDIES: dict[str, Study] = {
         label_quality,
         gauss_sphere,
         prior,
+        network_evaluation,
         cost,
         speed,
     )

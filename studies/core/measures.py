@@ -37,4 +37,9 @@ MEASURES = {
     "seconds_an_entry": Measure("processor time of the solve, an entry", "seconds", "the processor time an entry"),
     "peak": Measure("largest memory of the process", "GB", "the largest memory of the process"),
     "grown": Measure("memory beyond that before the solve", "GB", "the memory that the solve adds"),
+    "error_median": Measure("error of a reflection, median", "1", "the median error of a reflection"),
+    "error_p95": Measure("error of a reflection, 95th percentile", "1", "the 95th percentile of a reflection's error"),
+    "error_worst": Measure("error of a reflection, worst", "1", "the worst error of a reflection"),
+    "rendering": Measure("DSSIM, a rendered sphere", "1", "DSSIM of a rendered sphere"),
+    "microseconds": Measure("processor time an evaluation", "µs", "the processor time an evaluation"),
 }
