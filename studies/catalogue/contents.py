@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, network_evaluation, prior, row_and_column, speed, structure
+from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, network_evaluation, parts, prior, row_and_column, speed, structure
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -17,5 +17,6 @@ STUDIES: dict[str, Study] = {
         network_evaluation,
         cost,
         speed,
+        parts,
     )
 }

@@ -42,4 +42,6 @@ MEASURES = {
     "error_worst": Measure("error of a reflection, worst", "1", "the worst error of a reflection"),
     "rendering": Measure("DSSIM, a rendered sphere", "1", "DSSIM of a rendered sphere"),
     "microseconds": Measure("processor time an evaluation", "µs", "the processor time an evaluation"),
+    "unseen": Measure("error of unseen cells", "RMSE over the peak", "the error of unseen cells"),
+    "kept_parts": Measure("parts that the solve took, of four", "1", "the number of parts that the solve took"),
 }
