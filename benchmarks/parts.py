@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 import torch
 import typer
+from jaxtyping import Int
 from tqdm import tqdm
 
 from benchmarks.markdown import refresh, table
@@ -33,7 +34,7 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations, usable
+from factorlib.model.observed import Rotations, blocks_of_observations, usable
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
@@ -47,7 +48,7 @@ from factorlib.solve.rounds import Start, from_nothing, with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.warm import with_exposures
 from factorlib.urm.merge import merge
-from factorlib.urm.observations import concatenate, read_observations
+from factorlib.urm.observations import Observations, concatenate, read_observations
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "solve.md"
@@ -61,6 +62,12 @@ VARIANTS: dict[str, dict] = {
     "no material specular": {"lambertian": True},
     "no tint prior": {"prior": 0.0},
     "tint prior .1, the paper's": {"prior": 0.1},
+    "no interreflection": {"interreflection": "off"},
+    "no light prior": {"light_prior": "none"},
+    "normals all as sure": {"seen": "sure"},
+    "squares, not pseudo-Huber": {"robust_scale": 1e6},
+    "clipped values as they are": {"seen": "unclipped"},
+    "no clipped values": {"seen": "dropped"},
 }
 
 
@@ -71,28 +78,57 @@ class Split(msgspec.Struct, frozen=True):
     asked: Block
 
 
-def splits_of(dataset: str) -> tuple[list[str], list[Split]]:
-    """Names of the materials, and every light's observations."""
+def observations_of(dataset: str) -> tuple[list[str], list[Observations], Rotations]:
+    """Names of the materials, what each photo shows, and how cameras stand where lights are fixed to the world."""
     folder = ROOT / "data" / dataset if "/" not in dataset else Path(dataset)
     spec, built = read_dataset(folder).spec, ROOT / "build" / folder.resolve().name
     rotations = {p.name: np.array(p.world_from_camera) for p in spec.photos if p.world_from_camera is not None}
     if not (files := sorted((built / "urm").glob("*.parquet"))):
         raise InputError("there are no observations yet", file=built / "urm", cure=f"run: make urm train DATASET={dataset}")
-    parts = [merge(usable(read_observations(path)), MERGE_DEGREES) for path in files]
-    blocks = blocks_of_observations(concatenate(parts), Noise(), world_from_camera=rotations)
-    return list(spec.materials), [_split(block) for block in blocks]
+    return list(spec.materials), [usable(read_observations(path)) for path in files], rotations
 
 
-def _split(block: Block) -> Split:
-    names, cell = np.unique(mirror_cells(block.normal, block.view, CELL), return_inverse=True)
-    asked = (np.random.default_rng(17).random(len(names)) < SHARE)[cell.reshape(-1)]
-    asked &= np.isin(block.material, block.material[~asked])
-    return Split(block.take(~asked), block.take(asked))
+def as_sure(seen: Observations) -> Observations:
+    """All normals are believed alike."""
+    return msgspec.structs.replace(seen, confidence=None, weight=np.ones(len(seen), seen.weight.dtype))
+
+
+def unclipped(seen: Observations) -> Observations:
+    """Clipped values are taken for what they are."""
+    return msgspec.structs.replace(seen, clipped=np.zeros_like(seen.clipped))
+
+
+def dropped(seen: Observations) -> Observations:
+    """Without any pixel of which a channel is clipped."""
+    return seen.take(~seen.clipped.any(axis=1))
+
+
+HARMS = {"sure": as_sure, "unclipped": unclipped, "dropped": dropped}
+
+
+def splits_of(photos: Sequence[Observations], rotations: Rotations, harm: str | None = None) -> list[Split]:
+    """Every light's observations.  harm: what is done to those that a solve may see; those asked for are the same whatever is done."""
+    changed = [HARMS[harm](photo) for photo in photos] if harm else photos
+    whole, seen = (blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations) for of in (photos, changed))
+    return [_split(block, next(b for b in seen if b.name == block.name)) for block in whole]
+
+
+def _split(whole: Block, seen: Block) -> Split:
+    cells = _cells(whole)
+    names = np.unique(cells)
+    chosen = names[np.random.default_rng(17).random(len(names)) < SHARE]
+    left = seen.take(~np.isin(_cells(seen), chosen))
+    return Split(left, whole.take(np.isin(cells, chosen) & np.isin(whole.material, left.material)))
+
+
+def _cells(block: Block) -> Int[np.ndarray, " n"]:
+    return mirror_cells(block.normal, block.view, CELL)
 
 
 def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
-    how = dict(how)
-    none_specular, loss = np.full(materials, how.pop("lambertian", False)), Loss(prior=how.pop("prior", Loss().prior))
+    how = {key: value for key, value in how.items() if key != "seen"}
+    none_specular, usual = np.full(materials, how.pop("lambertian", False)), Loss()
+    loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
     start = Start(from_nothing(materials).point, none_specular, none_specular)
     return solve(JointProblem(list(blocks), operator, loss, threaded), start, Run(msgspec.structs.replace(DEFAULT, **how)))
 
@@ -190,15 +226,21 @@ def _photos_left_out(splits: Sequence[Split], k: int, whole: Solution, materials
 
 
 def measured(dataset: str, photos: bool) -> dict:
-    names, splits = splits_of(dataset)
+    names, seen_by_photos, rotations = observations_of(dataset)
+    splits = splits_of(seen_by_photos, rotations)
     operator = reflection_operator("network")
     seen, count = [split.seen for split in splits], len(names)
+
+    def of(how: dict) -> list[Block]:
+        """What a variant may see."""
+        return [split.seen for split in splits_of(seen_by_photos, rotations, how["seen"])] if "seen" in how else seen
+
     leaving = sum(1 if len(b.photos) == 1 else len(b.photos) for b in seen) if photos else 0
     result: dict = {"parts": {"flat": _summary([flat(split) for split in splits])}}
     with tqdm(total=len(VARIANTS) + leaving, desc=dataset) as bar:
         whole = None
         for name, how in VARIANTS.items():
-            solution = whole if whole is not None and how and not _differs(how, whole) else solved(seen, count, operator, how)
+            solution = whole if whole is not None and how and not _differs(how, whole) else solved(of(how), count, operator, how)
             lobes = [len(light) for light in solution.point.lights]
             result["parts"][name] = _summary(unseen(splits, solution, operator)) | {"lobes": [min(lobes), max(lobes)]}
             if not how:
@@ -220,7 +262,8 @@ def measured(dataset: str, photos: bool) -> dict:
 
 def _differs(how: dict, whole: Solution) -> bool:
     """Whether the solve as it is has what a variant goes without."""
-    has = {"tone": any(one.kept for one in whole.tone), "self_shadowing": whole.shadows.kept, "specular": whole.lambertian.any()}
+    has = {"tone": any(one.kept for one in whole.tone), "specular": whole.lambertian.any(), "self_shadowing": whole.shadows.kept}
+    has |= {"interreflection": whole.interreflection.kept, "light_prior": whole.light_prior.kept}
     return all(has.get(part, True) for part in how)
 
 

@@ -20,6 +20,7 @@ from studies.core.study import FULL, QUICK, Study
 from studies.core.table import Conclusion
 from studies.report.page import number
 from studies.report.tables import answer_to_the_paper
+from studies.report.tables import sentences as said
 from studies.run.project import Studies
 from studies.run.project import studies as project_of
 from studies.run.verbs import make
@@ -45,7 +46,7 @@ def numbers(found: Conclusion) -> str:
     measures = found.measures[:SHOWN]
     head = [f"{found.varied} ({found.label})" if found.label else found.varied, *(MEASURES[m].label for m in measures)]
     rows = [[row.label, *(number(row.cells.get(m)) for m in measures)] for row in found.rows]
-    sentences = "\n".join(f"- {tested.sentence}" for tested in found.claims)
+    sentences = "\n".join(f"- {sentence}" for sentence in said(found))
     return f"{table(head, rows)}\n\n{sentences}" if not found.label else table(head, rows)
 
 

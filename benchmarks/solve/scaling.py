@@ -59,9 +59,9 @@ def exponent(seconds: dict[int, float]) -> float | None:
     return float(np.polyfit(np.log(list(seconds)), np.log(list(seconds.values())), 1)[0])
 
 
-def problem(n: int, operator: Operator) -> list[Block]:
-    """n materials in n lights, each pair observed."""
-    rng = np.random.default_rng(n)
+def problem(n: int, operator: Operator, seed: int = 0) -> list[Block]:
+    """n materials in n lights, each pair observed; others with another seed."""
+    rng = np.random.default_rng([n, seed] if seed else n)
     gloss = rng.uniform(0.05, 0.4, n)
     materials = Materials(rng.uniform(0.05, 0.5, (n, 3)), np.repeat(gloss[:, None], 3, 1), rng.uniform(0.2, 0.7, n))
     return [lit(block, random_light(rng), materials, operator) for block in blocks_of_observations(spheres(n), Noise())]

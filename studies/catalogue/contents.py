@@ -5,13 +5,18 @@ from __future__ import annotations
 from studies.catalogue import (
     alignment_error,
     comparison,
+    cost,
     gauss_sphere,
     label_quality,
     leave_one_out,
     matrix_size,
+    network_evaluation,
     paper_sets,
+    parts,
+    prior,
     progressive,
     row_and_column,
+    speed,
     structure,
 )
 from studies.core.study import Study
@@ -29,5 +34,10 @@ STUDIES: dict[str, Study] = {
         paper_sets,
         gauss_sphere,
         comparison,
+        prior,
+        network_evaluation,
+        cost,
+        speed,
+        parts,
     )
 }

@@ -62,9 +62,12 @@ class Picture(msgspec.Struct, frozen=True):
 
 
 class Conclusion(msgspec.Struct, frozen=True):
-    """All of a study's table.json.  label: what stands beside everything that is shown of a quick study; empty of a full one.
+    """All of a study's table.json.
 
-    over: what intervals are over
+    label:  what stands beside everything that is shown of a quick study; empty of a full one
+    notes:  sentences that are no claims
+    answer: to the paper, where it is not that of the claims
+    over:   what intervals are over
     """
 
     study: str
@@ -80,3 +83,5 @@ class Conclusion(msgspec.Struct, frozen=True):
     claims: list[Tested]
     pictures: list[Picture] = []
     over: str = "seeds"
+    notes: list[str] = []
+    answer: str = ""

@@ -78,4 +78,3 @@ def _marks(cells: Sequence[tuple[int, Cell]], across: Place, up: Place, with_nul
             parts += [dot(across(k) + 7, up(value), COLOURS[1], radius=1.6) for value in cell.values.values()]
         parts.append(dot(across(k), up(cell.spread.mean), COLOURS[0], hollow=cell.spread.low is None, radius=3.6))
     return parts
-

@@ -28,7 +28,12 @@ def paragraph(found: Conclusion) -> str:
     """Markdown: the question, what the paper says, and what the seeds say of each claim."""
     start = f"**{found.title}.** {found.question}" + (f" *{found.label}.*" if found.label else "")
     first = f"{start} The paper: {found.paper}"
-    return "\n".join([first, "", *(f"- {tested.sentence}" for tested in found.claims)]) + "\n"
+    return "\n".join([first, "", *(f"- {sentence}" for sentence in sentences(found))]) + "\n"
+
+
+def sentences(found: Conclusion) -> list[str]:
+    """What the seeds say of each claim, then the notes."""
+    return [tested.sentence for tested in found.claims] + found.notes
 
 
 def answer_to_the_paper(found: Conclusion) -> str:
@@ -39,6 +44,8 @@ def answer_to_the_paper(found: Conclusion) -> str:
     answers = [tested.answer for tested in found.claims if tested.claim.paper]
     if found.label:
         return f"not tested ({found.label})"
+    if found.answer:
+        return found.answer
     if not answers:
         return "the paper claims nothing that is tested here"
     for answer in ("disagrees", "not tested: too few seeds", "no difference is shown"):

@@ -1,4 +1,5 @@
-"""The whole pipeline on data/synthetic, by the runner as a user runs it, against the bounds of `evaluate.table`.
+"""The whole pipeline on data/synthetic, by the runner as a user runs it, against the numbers stored of the last run and what seeds
+change of them (`benchmarks.reference`), and against the bounds of `evaluate.table`, which are how good it must be at worst.
 
 The run uses the project's own build/, so that what is current there is not made again: keys are by content.
 """
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.reference import complaint, differences, read_stored
 from factorlib.evaluate.table import SYNTHETIC, Row, rows_of, table_text
 from factorlib.jsonfile import read_json
 
@@ -25,6 +27,11 @@ def rows() -> list[Row]:
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     return rows_of(read_json(ROOT / "build" / "synthetic" / "evaluate" / "metrics.json"), SYNTHETIC)
+
+
+def test_every_number_is_as_stored(rows):
+    found = differences(read_json(ROOT / "build" / "synthetic" / "evaluate" / "metrics.json"), read_stored())
+    assert not found, complaint(found)
 
 
 def test_every_bound_holds(rows):

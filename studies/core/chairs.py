@@ -1,0 +1,105 @@
+"""Sets of chairs as `factorlib.generate` makes them, from shapes to observations, and how far a solve of one is from the truth.
+
+Photographs have all bounces, a mesh coarser than what was photographed, searched poses, clipped pixels: each part of the model has
+something to do.  The stages `masks`, `align` and `urm` themselves turn them into observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from benchmarks.parts import Split, flat, solved, splits_of, unseen
+from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import Dataset
+from factorlib.dataset.slices import dataset_slice
+from factorlib.diagnose.answer import Answer
+from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.lights import compare_lights
+from factorlib.evaluate.materials import compare_materials
+from factorlib.generate.eames import SET, Parameters, generate
+from factorlib.images.exr import read_rgb_exr
+from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.model.problem import JointProblem
+from factorlib.reflection import reflection_operator
+from factorlib.results.materials import Reflectance
+from factorlib.stage import Inputs, silent
+from factorlib.urm.observations import read_observations
+from stages import align, masks, urm
+from studies.core.case import Score
+from studies.core.part import PARTS, Chairs, Part
+
+STAGES = {"masks": (masks, ("materials", "photo")), "align": (align, ("materials", "objects")), "urm": (urm, ("materials", "objects", "light"))}
+MAP_ROWS = 128  # of recovered lights
+GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
+
+
+def make_set(folder: Path, seed: int, chairs: Chairs) -> None:
+    """Generate a set into the empty folder."""
+    parameters = Parameters(width=chairs.width, height=chairs.height, light_rows=chairs.light_rows, spp=chairs.spp)
+    generate(folder, seed, [], parameters, silent, SET.shots[: chairs.shots])
+
+
+def observe(folder: Path, out: Path) -> None:
+    """masks/, align/ and urm/ of a set, in `out`."""
+    dataset = read_dataset(folder)
+    for name, (stage, slices) in STAGES.items():
+        (out / name).mkdir(parents=True)
+        for photo in dataset.spec.photos:
+            found = {slice_: dataset_slice(dataset, slice_, photo.name) for slice_ in slices}
+            facts = {f"dataset.{slice_}": each.facts for slice_, each in found.items()}
+            files = {file: dataset.folder / file for each in found.values() for file in each.files}
+            inputs = Inputs({before: out / before for before in STAGES}, facts, files, photo.name)
+            stage.main(stage.Params(), inputs, out / name, silent)
+
+
+def score_of(case: Part, folder: Path, observed: Path) -> Score:
+    """Solve what a set shows but for the cells that are asked for, and compare with these and with the truth."""
+    dataset, how = read_dataset(folder), {**case.solve, **PARTS[case.part][1]}
+    splits = splits_of([read_observations(file) for file in sorted(observed.glob("*.parquet"))], {}, how.get("seen"))
+    names, operator = list(dataset.spec.materials), reflection_operator("network")
+    blocks = [split.seen for split in splits]
+    solution = solved(blocks, len(names), operator, how)
+    answer = Answer(names, JointProblem(blocks, operator), solution, {}, "bundle")
+    values = {"unseen": relative(unseen(splits, solution, operator)), "kept_parts": kept(answer)}
+    return _joined(Score(values, {"unseen": relative([flat(split) for split in splits])}), _against_truth(dataset, answer, splits))
+
+
+def relative(decibels: Sequence[float]) -> float:
+    """Mean over lights of the RMSE over the peak, of PSNRs.
+
+    >>> relative([20.0, 40.0])
+    0.055
+    """
+    return float(np.mean([10 ** (-value / 20) for value in decibels]))
+
+
+def kept(answer: Answer) -> float:
+    """How many of shadows, bounce, light prior and tone the solve took."""
+    found = answer.solution
+    return float(found.shadows.kept + found.interreflection.kept + found.light_prior.kept + any(one.kept for one in found.tone))
+
+
+def _against_truth(dataset: Dataset, answer: Answer, splits: Sequence[Split]) -> Score:
+    seen = {answer.names[m] for split in splits for m in np.unique(split.seen.material)}
+    of = answer.solution.point.materials
+    rows = {n: Reflectance(tuple(of.diffuse[k].tolist()), tuple(of.specular[k].tolist()), float(of.roughness[k])) for k, n in enumerate(answer.names)}
+    truths = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in dataset.truth.materials.items()}
+    errors = compare_materials({n: rows[n] for n in sorted(seen)}, truths, dict.fromkeys(seen, 0))
+    parts = ("diffuse", "specular", "roughness")
+    materials = Score(*({part: getattr(errors, f"{prefix}_{part}") for part in parts} for prefix in ("mean", "null_mean")))
+    return _joined(materials, _of_lights(dataset, answer))
+
+
+def _of_lights(dataset: Dataset, answer: Answer) -> Score:
+    found = {name: light_of_lat_long(lat_long_of_lobes(lobes, MAP_ROWS, 2 * MAP_ROWS)) for name, lobes in answer.lights().items()}
+    truths: dict[str, Light] = {name: light_of_lat_long(read_rgb_exr(dataset.folder / dataset.truth.illumination[name])) for name in found}
+    scored = {view: compare_lights(found, truths, {}).mean[GAUGE][view] for view in ("glossy", "mirror")}
+    return Score({v: s.estimate.rmse for v, s in scored.items()}, {v: s.null.rmse for v, s in scored.items()})
+
+
+def _joined(one: Score, other: Score) -> Score:
+    return msgspec.structs.replace(one, values=one.values | other.values, nulls=one.nulls | other.nulls)
