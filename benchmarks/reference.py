@@ -31,7 +31,7 @@ from factorlib.runner.project import LIBRARY, Project, photo_sets
 
 DATASET = "synthetic"
 STORED = LIBRARY / "tests" / "regression" / "synthetic.json"
-SEEDS = 5
+SEEDS = 10
 DOUBT = 0.01
 COMMAND = 'python -m benchmarks.reference "why the numbers changed"'
 NUMBERS = {

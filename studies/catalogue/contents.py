@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from studies.catalogue import cost, gauss_sphere, label_quality, matrix_size, network_evaluation, parts, prior, row_and_column, speed, structure
+from studies.catalogue import (
+    cost,
+    gauss_sphere,
+    hard_cases,
+    label_quality,
+    matrix_size,
+    network_evaluation,
+    parts,
+    prior,
+    row_and_column,
+    speed,
+    structure,
+)
 from studies.core.study import Study
 
 STUDIES: dict[str, Study] = {
@@ -18,5 +30,6 @@ STUDIES: dict[str, Study] = {
         cost,
         speed,
         parts,
+        hard_cases,
     )
 }
