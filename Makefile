@@ -77,6 +77,7 @@ help:
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
 	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'
+	@echo 'make bench-reference REASON="…"         the numbers of data/synthetic that make test compares with, and README.md, anew'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
 	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
 	@echo 'make data                            make data/ again'

@@ -19,41 +19,32 @@ import msgspec
 import numpy as np
 import torch
 import typer
-from jaxtyping import Int
 from tqdm import tqdm
 
 from benchmarks.markdown import refresh, table
-from benchmarks.solve.workers import threaded
+from benchmarks.splits import DEFAULT, Split, decibels, flat, predicted, shown, solved, splits_of, unseen
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
-from factorlib.geometry.sphere import mirror_cells
 from factorlib.jsonfile import json_text
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.noise import Noise
-from factorlib.model.observed import Rotations, blocks_of_observations, usable
+from factorlib.model.observed import Rotations, usable
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import Solution, solve
+from factorlib.solve.bundle import Solution
 from factorlib.solve.descent import Descent, descend
-from factorlib.solve.history import Run
 from factorlib.solve.insertion import blurred, pruned
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import Start, from_nothing, with_new_lobes
+from factorlib.solve.rounds import with_new_lobes
 from factorlib.solve.start import starting_light
 from factorlib.solve.warm import with_exposures
-from factorlib.urm.merge import merge
-from factorlib.urm.observations import Observations, concatenate, read_observations
+from factorlib.urm.observations import Observations, read_observations
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "solve.md"
-CELL, SHARE, MERGE_DEGREES = 0.1, 0.15, 2.0
-DEFAULT = Bundle(tolerance=1e-3)
 VARIANTS: dict[str, dict] = {
     "as it is": {},
     "no tone curves": {"tone": "off"},
@@ -71,13 +62,6 @@ VARIANTS: dict[str, dict] = {
 }
 
 
-class Split(msgspec.Struct, frozen=True):
-    """A light's observations that a solve may see, and those that it is asked for."""
-
-    seen: Block
-    asked: Block
-
-
 def observations_of(dataset: str) -> tuple[list[str], list[Observations], Rotations]:
     """Names of the materials, what each photo shows, and how cameras stand where lights are fixed to the world."""
     folder = ROOT / "data" / dataset if "/" not in dataset else Path(dataset)
@@ -86,81 +70,6 @@ def observations_of(dataset: str) -> tuple[list[str], list[Observations], Rotati
     if not (files := sorted((built / "urm").glob("*.parquet"))):
         raise InputError("there are no observations yet", file=built / "urm", cure=f"run: make urm train DATASET={dataset}")
     return list(spec.materials), [usable(read_observations(path)) for path in files], rotations
-
-
-def as_sure(seen: Observations) -> Observations:
-    """All normals are believed alike."""
-    return msgspec.structs.replace(seen, confidence=None, weight=np.ones(len(seen), seen.weight.dtype))
-
-
-def unclipped(seen: Observations) -> Observations:
-    """Clipped values are taken for what they are."""
-    return msgspec.structs.replace(seen, clipped=np.zeros_like(seen.clipped))
-
-
-def dropped(seen: Observations) -> Observations:
-    """Without any pixel of which a channel is clipped."""
-    return seen.take(~seen.clipped.any(axis=1))
-
-
-HARMS = {"sure": as_sure, "unclipped": unclipped, "dropped": dropped}
-
-
-def splits_of(photos: Sequence[Observations], rotations: Rotations, harm: str | None = None) -> list[Split]:
-    """Every light's observations.  harm: what is done to those that a solve may see; those asked for are the same whatever is done."""
-    changed = [HARMS[harm](photo) for photo in photos] if harm else photos
-    whole, seen = (blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations) for of in (photos, changed))
-    return [_split(block, next(b for b in seen if b.name == block.name)) for block in whole]
-
-
-def _split(whole: Block, seen: Block) -> Split:
-    cells = _cells(whole)
-    names = np.unique(cells)
-    chosen = names[np.random.default_rng(17).random(len(names)) < SHARE]
-    left = seen.take(~np.isin(_cells(seen), chosen))
-    return Split(left, whole.take(np.isin(cells, chosen) & np.isin(whole.material, left.material)))
-
-
-def _cells(block: Block) -> Int[np.ndarray, " n"]:
-    return mirror_cells(block.normal, block.view, CELL)
-
-
-def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
-    how = {key: value for key, value in how.items() if key != "seen"}
-    none_specular, usual = np.full(materials, how.pop("lambertian", False)), Loss()
-    loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
-    start = Start(from_nothing(materials).point, none_specular, none_specular)
-    return solve(JointProblem(list(blocks), operator, loss, threaded), start, Run(msgspec.structs.replace(DEFAULT, **how)))
-
-
-def shown(solution: Solution, block: Block, operator: Operator) -> Block:
-    """With what the solve took of visibility."""
-    return solution.shown(JointProblem([block], operator)).blocks[0]
-
-
-def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> np.ndarray:
-    """Radiance of a block's observations in a light, by the materials and the model of a solution."""
-    return Illumination(shown(solution, block, operator), light, solution.point.materials, operator).radiance()
-
-
-def decibels(of: Block, radiance: np.ndarray, whole: Block) -> float:
-    """PSNR of observations that are not clipped."""
-    error = np.where(of.clipped, 0.0, radiance - of.radiance)
-    return -10 * float(np.log10(max(np.mean(error**2), 1e-12) / np.quantile(whole.radiance, 0.999) ** 2))
-
-
-def unseen(splits: Sequence[Split], solution: Solution, operator: Operator) -> list[float]:
-    found = zip(splits, solution.point.lights, strict=True)
-    return [decibels(s.asked, predicted(solution, s.asked, light, operator), s.seen) for s, light in found]
-
-
-def flat(split: Split) -> float:
-    """Of each material's mean colour in each photo."""
-    guess = np.zeros_like(split.asked.radiance)
-    for m, f in {*zip(split.asked.material.tolist(), split.asked.photo.tolist(), strict=True)}:
-        of, like = ((b.material == m) & (b.photo == f) for b in (split.asked, split.seen))
-        guess[of] = split.seen.radiance[like if like.any() else split.seen.material == m].mean(0)
-    return decibels(split.asked, guess, split.seen)
 
 
 def light_of(block: Block, materials: Materials, operator: Operator) -> Light:

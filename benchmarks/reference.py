@@ -1,8 +1,9 @@
-"""The numbers of data/synthetic that a run must reproduce: `python -m benchmarks.reference "why they changed"` writes them anew.
+"""The numbers of data/synthetic that a run must reproduce: `make bench-reference REASON="why they changed"` writes them anew.
 
-Runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again) and writes
+Runs the pipeline on data/synthetic with several seeds of the solve (what is current is not run again) and writes
 tests/regression/synthetic.json: of each number its value with the default seed, how far other seeds lie apart, the tolerance that
-follows, and below them the reasons of all refreshes with what each changed.  `make test` runs the default seed and compares.
+follows, and below them the reasons of all refreshes with what each changed; and the paragraph of README.md that quotes them.
+`make test` runs the default seed and compares.
 
 Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's of n − 1 degrees of freedom at 1 − DOUBT / 2: two runs that
              differ by nothing but their seeds lie further apart once in 1 / DOUBT times, a number.  On the processors of
@@ -22,6 +23,7 @@ import numpy as np
 import typer
 from scipy.stats import t as student
 
+from benchmarks.markdown import refresh
 from factorlib.errors import InputError
 from factorlib.evaluate.table import SYNTHETIC, value_at
 from factorlib.jsonfile import read_json, write_json
@@ -30,10 +32,11 @@ from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 
 DATASET = "synthetic"
+STAGES = ("masks", "align", "urm", "solve", "export", "render", "evaluate")  # whose sources decide the numbers
 STORED = LIBRARY / "tests" / "regression" / "synthetic.json"
 SEEDS = 5
 DOUBT = 0.01
-COMMAND = 'python -m benchmarks.reference "why the numbers changed"'
+COMMAND = 'make bench-reference REASON="why the numbers changed"'
 NUMBERS = {
     **{bound.path: bound.meaning for bound in SYNTHETIC},
     "materials.mean_roughness": "roughness, mean over materials",
@@ -43,10 +46,12 @@ NUMBERS = {
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """value: of the default seed;  deviation: over seeds;  tolerance: in the number's own unit, either way."""
+    """value: of the default seed;  low, high, deviation: over seeds;  tolerance: in the number's own unit, either way."""
 
     meaning: str
     value: float
+    low: float
+    high: float
     deviation: float
     tolerance: float
 
@@ -78,7 +83,7 @@ class Difference(msgspec.Struct, frozen=True):
     def line(self) -> str:
         """Old and new, for people.
 
-        >>> Difference("a.b", Number("roughness", 0.01, 0.001, 0.005), 0.02).line()
+        >>> Difference("a.b", Number("roughness", 0.01, 0.009, 0.011, 0.001, 0.005), 0.02).line()
         'roughness: old 0.01, new 0.02, by +0.01, tolerance 0.005 (a.b)'
         """
         found = "missing" if self.new is None else f"{self.new:.4g}, by {self.new - self.old.value:+.2g}"
@@ -117,7 +122,7 @@ def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored
     values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
     for path in (p for p, v in values.items() if None in v):
         raise InputError("there is no such number", file=Path("metrics.json"), key=path, cure="correct NUMBERS in benchmarks/reference.py")
-    numbers = {p: Number(NUMBERS[p], v[0], float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()}
+    numbers = {p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()}
     old: Mapping[str, Number] = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
     return Stored(DATASET, len(runs), DOUBT, numbers, [Refresh(reason, changed), *(before.refreshes if before else [])])
@@ -130,6 +135,25 @@ def checked(reason: str) -> str:
     return reason.strip()
 
 
+def quoted(found: Stored) -> str:
+    """The paragraph of README.md."""
+
+    def shown(path: str, form: str, scale: float = 1.0) -> str:
+        """A number and its range."""
+        n = found.numbers[path]
+        value, low, high = ((form % (scale * v)).replace("0.", ".", 1 if scale * v < 1 else 0) for v in (n.value, n.low, n.high))
+        return f"{value} ({low} to {high})"
+
+    return (
+        f"On `data/{found.dataset}` (known answer, exact meshes; the default seed, and the range of {found.seeds} seeds of the solve,\n"
+        f"`python -m benchmarks.reference`): roughness is wrong by {shown('materials.worst_roughness', '%.3f')},\n"
+        f"diffuse by {shown('materials.worst_diffuse', '%.1f', 100)} %, specular by {shown('materials.worst_specular', '%.1f', 100)} %\n"
+        f"of the worst material and channel, after one factor a channel; re-synthesis "
+        f"{shown('resynthesis.worst_psnr_linear_db', '%.1f')} dB linear in\nthe worst photo; balls of the materials in the true light "
+        f"{shown('relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db', '%.1f')} dB."
+    )
+
+
 def run(project: Project, seed: int) -> object:
     """The metrics of a run of the pipeline with that seed of the solve."""
     if verbs.make(project, verbs.Wish(DATASET, ["evaluate"], [f"solve.seed={seed}"])) != 0:
@@ -137,11 +161,15 @@ def run(project: Project, seed: int) -> object:
     return msgspec.to_builtins(read_metrics(project.build / DATASET / "evaluate" / "metrics.json"))
 
 
-def main(reason: Annotated[str, typer.Argument(help="why the numbers changed; it is stored beside them", envvar="REASON")]) -> None:
+def main(
+    reason: Annotated[str, typer.Argument(help="why the numbers changed; it is stored beside them", envvar="REASON")],
+    seeds: Annotated[int, typer.Option(help="of the solve, the default one among them", min=3)] = SEEDS,
+) -> None:
     """Run all seeds, the default one last, so that build/ shows it afterwards; write, and print what changed."""
     why, project, before = checked(reason), Project(LIBRARY, photo_sets()), read_stored() if STORED.exists() else None
-    runs = [run(project, seed) for seed in reversed(range(SEEDS))][::-1]
+    runs = [run(project, seed) for seed in reversed(range(seeds))][::-1]
     write_json(STORED, found := stored(runs, why, before))
+    refresh(LIBRARY / "README.md", {"synthetic": quoted(found)}, "benchmarks.reference", modules=[f"stages.{stage}" for stage in STAGES])
     print("\n".join(f"{found.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in found.refreshes[0].changed.items()) or "nothing changed")
 
 

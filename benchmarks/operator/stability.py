@@ -13,10 +13,10 @@ import typer
 
 from benchmarks.markdown import exact, refresh, table
 from benchmarks.operator import laws
-from benchmarks.operator.cases import ALL, CASES, Found, Pairs, case, found, gradient_error, value_error
-from benchmarks.operator.variants import REFERENCE, made, variants
+from benchmarks.operator.cases import ALL, CASES, case
+from benchmarks.operator.rounding import measures
+from benchmarks.operator.variants import variants
 from factorlib.jsonfile import json_text
-from factorlib.reflection import Operator
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "operator.md"
 LAWS = {
@@ -36,34 +36,9 @@ def measured() -> dict:
     """{"cases": {case: {operator: {measure: number}}}, "laws": {law: {operator: [p99, worst] or [worst]}}}."""
     fast = variants(("float32", "float64"))
     shown = {label: operator for label, operator in fast.items() if "float64" not in label}
-    rows = {name: _case(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
+    rows = {name: measures(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
     by_law = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
     return {"cases": rows, "laws": by_law}
-
-
-def _case(given: Pairs, shown: dict[str, Operator], fast: dict[str, Operator], with_reference: bool) -> dict:
-    exactly = {name: found(fast[f"{name} float64"], given) for name in {label.split()[0] for label in shown} if f"{name} float64" in fast}
-    true = _values(given) if with_reference else None
-    return {label: _measures(found(operator, given), exactly.get(label.split()[0]), true, given) for label, operator in shown.items()}
-
-
-def _values(given: Pairs) -> dict[str, torch.Tensor]:
-    """Diffuse and specular of the reference."""
-    reference = made(REFERENCE, "float64")
-    n, o, z = given.normal, given.view, given.axis
-    no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
-    with torch.no_grad():
-        specular = reference.specular(given.roughness[:, None], given.sharpness[:, None], no, nz, oz)
-        return {"diffuse": reference.diffuse(given.sharpness[:, None], nz)[:, 0], "specular": specular[:, 0]}
-
-
-def _measures(answer: Found, exactly: Found | None, true: dict | None, given: Pairs) -> dict:
-    measures: dict = {"pairs": len(given), "finite": answer.finite()}
-    if exactly is not None:
-        measures |= {"value_rounding": value_error(answer, exactly, given), "gradient_rounding": gradient_error(answer, exactly, given)}
-    if true is not None:
-        measures["value"] = value_error(answer, Found(true, answer.turning), given)
-    return {k: float(f"{float(v.max()):.3g}") if torch.is_tensor(v) else v for k, v in measures.items()}
 
 
 def as_tables(result: dict) -> dict[str, str]:

@@ -7,6 +7,7 @@ from studies.catalogue import (
     comparison,
     cost,
     gauss_sphere,
+    hard_cases,
     label_quality,
     leave_one_out,
     matrix_size,
@@ -39,5 +40,6 @@ STUDIES: dict[str, Study] = {
         cost,
         speed,
         parts,
+        hard_cases,
     )
 }

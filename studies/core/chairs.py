@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from benchmarks.parts import Split, flat, solved, splits_of, unseen
+from benchmarks.splits import Split, flat, solved, splits_of, unseen
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.dataset.slices import dataset_slice

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.markdown import refresh, table
-from benchmarks.stale import stale
+from benchmarks.stale import ROOT, stale, unmarked
 
 PAGE = "Text.\n\n<!-- begin speed -->\n<!-- end speed -->\n"
 SPEED = {"speed": table(["case", "s"], [["one", "2"]])}
@@ -44,3 +44,21 @@ def test_a_table_without_stamp_or_without_its_command_is_named(page):
     assert "written by measures.speed, of which" in next(stale([page], page.parent))
     page.write_text(PAGE)
     assert list(stale([page], page.parent)) == ["speed.md: speed: does not say of which sources it is"]
+
+
+def test_a_typed_number_is_named_whatever_the_sources(page):
+    page.write_text("<!-- begin speed -->\n2 s\n<!-- typed from make all -->\n<!-- end speed -->\n")
+    (line,) = stale([page], page.parent)
+    assert line == "speed.md: speed: typed by hand from: make all; of which sources, nothing says"
+
+
+def test_quantities_between_no_marks_are_found_and_no_others(page):
+    page.write_text(
+        "Right to .5 % and 31 dB.\n\n<!-- begin speed -->\n12 s\n<!-- end speed -->\n`x 5 %`, 192 × 128 pixels, 3 photos, 4.2.\n"
+        "```\nsolve 3 s\n```\nthen 2.5° wrong\n"
+    )
+    assert list(unmarked(page, page.parent)) == ["speed.md:1: .5 %, 31 dB", "speed.md:10: 2.5°"]
+
+
+def test_every_quantity_of_the_readme_names_its_command():
+    assert not list(unmarked(ROOT / "README.md"))

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.reference import NUMBERS, Number, Stored, checked, complaint, differences, read_stored, stored, tolerance
+from benchmarks.reference import NUMBERS, Number, Stored, checked, complaint, differences, quoted, read_stored, stored, tolerance
 from factorlib.errors import InputError
 
 PATH = "materials.worst_roughness"
@@ -41,7 +41,7 @@ def test_a_number_beyond_its_tolerance_fails_with_old_and_new(side):
     assert not differences(metrics(0.010 + side * 0.999 * limit), FIVE)
     (found,) = differences(metrics(moved := 0.010 + side * 1.001 * limit), FIVE)
     text = complaint([found])
-    assert found.path == PATH and "old 0.01, " in text and f"new {moved:.4g}" in text and "benchmarks.reference" in text
+    assert found.path == PATH and "old 0.01, " in text and f"new {moved:.4g}" in text and "make bench-reference" in text
 
 
 @pytest.mark.parametrize("path", NUMBERS)
@@ -98,3 +98,10 @@ def test_what_is_kept_is_what_is_asked_for():
     kept = read_stored()
     assert kept.numbers.keys() == NUMBERS.keys() and kept.refreshes and kept.seeds >= 5
     assert all(isinstance(n, Number) and n.tolerance > 0 for n in kept.numbers.values())
+
+
+def test_the_readme_quotes_what_is_stored():
+    from benchmarks.stale import ROOT
+
+    assert quoted(read_stored()) in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "roughness is wrong by .010 (.009 to .013)" in quoted(FIVE)

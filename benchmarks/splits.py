@@ -1,0 +1,114 @@
+"""Cells of observations that no solve has seen: how a set is split, what may be done to what a solve sees, and how well it predicts the rest.
+
+Used by `benchmarks.parts` on data sets, and by the study of parts on rendered sets of many seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Int
+
+from benchmarks.solve.workers import threaded
+from factorlib.geometry.sphere import mirror_cells
+from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.noise import Noise
+from factorlib.model.observed import Rotations, blocks_of_observations
+from factorlib.model.problem import JointProblem
+from factorlib.reflection.operator import Operator
+from factorlib.solve.bundle import Solution, solve
+from factorlib.solve.history import Run
+from factorlib.solve.options import Bundle
+from factorlib.solve.rounds import Start, from_nothing
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import Observations, concatenate
+
+CELL, SHARE, MERGE_DEGREES = 0.1, 0.15, 2.0
+DEFAULT = Bundle(tolerance=1e-3)
+
+
+class Split(msgspec.Struct, frozen=True):
+    """A light's observations that a solve may see, and those that it is asked for."""
+
+    seen: Block
+    asked: Block
+
+
+def as_sure(seen: Observations) -> Observations:
+    """All normals are believed alike."""
+    return msgspec.structs.replace(seen, confidence=None, weight=np.ones(len(seen), seen.weight.dtype))
+
+
+def unclipped(seen: Observations) -> Observations:
+    """Clipped values are taken for what they are."""
+    return msgspec.structs.replace(seen, clipped=np.zeros_like(seen.clipped))
+
+
+def dropped(seen: Observations) -> Observations:
+    """Without any pixel of which a channel is clipped."""
+    return seen.take(~seen.clipped.any(axis=1))
+
+
+HARMS = {"sure": as_sure, "unclipped": unclipped, "dropped": dropped}
+
+
+def splits_of(photos: Sequence[Observations], rotations: Rotations, harm: str | None = None) -> list[Split]:
+    """Every light's observations.  harm: what is done to those that a solve may see; those asked for are the same whatever is done."""
+    changed = [HARMS[harm](photo) for photo in photos] if harm else photos
+    whole, seen = (blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations) for of in (photos, changed))
+    return [_split(block, next(b for b in seen if b.name == block.name)) for block in whole]
+
+
+def _split(whole: Block, seen: Block) -> Split:
+    cells = _cells(whole)
+    names = np.unique(cells)
+    chosen = names[np.random.default_rng(17).random(len(names)) < SHARE]
+    left = seen.take(~np.isin(_cells(seen), chosen))
+    return Split(left, whole.take(np.isin(cells, chosen) & np.isin(whole.material, left.material)))
+
+
+def _cells(block: Block) -> Int[np.ndarray, " n"]:
+    return mirror_cells(block.normal, block.view, CELL)
+
+
+def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
+    how = {key: value for key, value in how.items() if key != "seen"}
+    none_specular, usual = np.full(materials, how.pop("lambertian", False)), Loss()
+    loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
+    start = Start(from_nothing(materials).point, none_specular, none_specular)
+    return solve(JointProblem(list(blocks), operator, loss, threaded), start, Run(msgspec.structs.replace(DEFAULT, **how)))
+
+
+def shown(solution: Solution, block: Block, operator: Operator) -> Block:
+    """With what the solve took of visibility."""
+    return solution.shown(JointProblem([block], operator)).blocks[0]
+
+
+def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> np.ndarray:
+    """Radiance of a block's observations in a light, by the materials and the model of a solution."""
+    return Illumination(shown(solution, block, operator), light, solution.point.materials, operator).radiance()
+
+
+def decibels(of: Block, radiance: np.ndarray, whole: Block) -> float:
+    """PSNR of observations that are not clipped."""
+    error = np.where(of.clipped, 0.0, radiance - of.radiance)
+    return -10 * float(np.log10(max(np.mean(error**2), 1e-12) / np.quantile(whole.radiance, 0.999) ** 2))
+
+
+def unseen(splits: Sequence[Split], solution: Solution, operator: Operator) -> list[float]:
+    found = zip(splits, solution.point.lights, strict=True)
+    return [decibels(s.asked, predicted(solution, s.asked, light, operator), s.seen) for s, light in found]
+
+
+def flat(split: Split) -> float:
+    """Of each material's mean colour in each photo."""
+    guess = np.zeros_like(split.asked.radiance)
+    for m, f in {*zip(split.asked.material.tolist(), split.asked.photo.tolist(), strict=True)}:
+        of, like = ((b.material == m) & (b.photo == f) for b in (split.asked, split.seen))
+        guess[of] = split.seen.radiance[like if like.any() else split.seen.material == m].mean(0)
+    return decibels(split.asked, guess, split.seen)
