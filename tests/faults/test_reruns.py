@@ -38,7 +38,7 @@ from factorlib.runner.survey import survey
 from factorlib.runner.worker import Code, load_stage
 
 DATA = "synthetic"
-LINES, MODULES = 150, 12  # of the sample
+LINES, MODULES = 60, 8  # of the sample
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices)
 
 
