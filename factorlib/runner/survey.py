@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.reading import check_plain
 from factorlib.runner.closure import Closure, Sources
 from factorlib.runner.defaults import other_than
 from factorlib.runner.filehash import FileHashes
@@ -138,6 +139,8 @@ def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) 
         folder = given_folder(stage, param)
         for file in files:
             try:
+                if os.path.lexists(folder / file):
+                    check_plain(folder / file, "a result", f"{name}.{param}", most_bytes=None)  # a pipe or a device would never end
                 record[f"given:{param}/{file}"] = hashes.content(folder / file)
             except (OSError, TypeError):
                 found = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"

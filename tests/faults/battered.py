@@ -113,8 +113,8 @@ def kill(process: subprocess.Popen, whom: str) -> None:
 
 
 def results(project: Project) -> dict[str, bytes]:
-    """What a user finds under the data set's name, but for the log of runs."""
-    return {name: data for name, data in files_of(project.build / "set").items() if name != "log.jsonl" and not name.startswith("errors/")}
+    """What a user finds under the data set's name, but for the log of runs; drafts of a writer that was killed are hidden files."""
+    return {name: data for name, data in files_of(project.build / "set").items() if name != "log.jsonl" and not name.startswith(("errors/", "."))}
 
 
 def kept(project: Project) -> dict[str, str]:
@@ -141,8 +141,9 @@ def lost_in(project: Project, wanted: dict[str, bytes], *settings: str) -> list[
         found.append("the next run failed")
     if again := sorted(before & set(done(project)[already:])):
         found.append(f"made twice: {', '.join(again)}")
-    if results(project) != wanted:
-        found.append("other bytes")
+    now = results(project)
+    if now != wanted:
+        found.append(f"other bytes: {sorted(name for name in now.keys() | wanted.keys() if now.get(name) != wanted.get(name))}")
     if verbs.verify(project, None) != 0:
         found.append("damaged afterwards")
     return found

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -55,7 +56,7 @@ def again(tmp_path):
 def no_loss(fault, losses, stages=None):
     """Every try lost nothing; all of them are noted."""
     note("faults", fault, len(losses), sum(map(bool, losses)), stages=stages)
-    assert not any(losses), losses
+    assert not any(losses), [(number, found) for number, found in enumerate(losses) if found]
 
 
 # ── SIGKILL ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -97,6 +98,20 @@ def struck(project, seed, whom):
     return writing
 
 
+def test_drafts_of_killed_writers_go_once_they_are_old_and_those_of_others_stay(finished, again):
+    project = again(finished)
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    folders = [project.build / "set", *(project.build / "store" / name for name in ("keys", "logs", "cache"))]
+    old, new, own = ([folder / f".{name}.json.{pid}" for folder in folders] for name, pid in (("old", gone.pid), ("new", gone.pid), ("own", os.getpid())))
+    for path in (*old, *new, *own):
+        write(path, "{")
+        os.utime(path, (time.time() - 7200 * (path not in new),) * 2)
+    write(project.root / "data" / "set" / "c.txt", "Gamma")
+    assert make(project) == 0
+    assert not any(path.exists() for path in old) and all(path.exists() for path in (*new, *own))
+
+
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
 
 
@@ -121,7 +136,7 @@ def test_a_photo_that_vanishes_in_mid_run_is_named_and_costs_its_own_steps(fresh
         chance, project = random.Random(seed), again(fresh)
         photo = project.root / "data" / "set" / f"{'ab'[seed % 2]}.txt"
         content, process = photo.read_bytes(), start(project)
-        wait_until(lambda: half_written(project) or process.poll() is not None)
+        wait_until(partial(half_written, project), seconds=20)
         time.sleep(chance.uniform(0, 0.3))
         photo.unlink()
         said = process.communicate(timeout=60)[0]

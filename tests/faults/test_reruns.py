@@ -193,7 +193,7 @@ def test_the_modules_in_the_keys_are_those_that_are_imported():
 
 def check_line(module, number, texts):
     """Whether the line could be changed; the change is then seen by the steps that run the module, and by no other."""
-    file, before = all_modules()[module], MEMORY.source(all_modules()[module], None, Source)
+    before = MEMORY.source(all_modules()[module], None, Source)
     for text in texts:
         try:
             now = edited(module, text)
