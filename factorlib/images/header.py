@@ -5,6 +5,7 @@ Compressed, a picture of one colour takes a thousandth of that, and a file of a 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import OpenImageIO as oiio
@@ -21,7 +22,8 @@ def check_values(path: str | Path, most_megapixels: float, key: str | None = Non
     """
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        oiio.geterror()  # read, so that nobody else takes it for their own
+        with suppress(UnicodeError):  # the words of a damaged file may be damaged themselves
+            oiio.geterror()  # read, so that nobody else takes it for their own
         return
     spec = source.spec()
     millions = spec.width * spec.height * spec.nchannels / 1e6
