@@ -16,6 +16,7 @@ from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
+from factorlib.runner.terminal import plain_streams, printable
 
 
 class Verbs(typer.core.TyperGroup):
@@ -210,13 +211,13 @@ def ship(stage: str, dataset: Dataset = None) -> None:
 
 def main() -> None:
     """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
-    logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
     sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
-        with heed_stops():
+        with plain_streams(), heed_stops():
+            logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
             app(prog_name="factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
     except InputError as error:
-        sys.exit(f"error: {error}")
+        sys.exit(printable(f"error: {error}"))
     except OSError as error:
         known = disk_error(error, project().build)
         if known is None and error.errno in NOT_OURS:
@@ -224,7 +225,7 @@ def main() -> None:
             known = InputError(error.strerror, file=error.filename, cure=cure)
         if known is None:
             raise
-        sys.exit(f"error: {known}")
+        sys.exit(printable(f"error: {known}"))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.images.header import check_values
 from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import open_photo
@@ -59,6 +60,7 @@ class Validation:
         for path in files.values():
             try:
                 if is_light_file(path.name):
+                    check_values(path, MOST_MEGAPIXELS)
                     read_light_map(path)
                 elif path.suffix.lower() in MESHES:
                     read_parts(path)
@@ -78,11 +80,16 @@ class Validation:
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, spec.meshes[obj.mesh], limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
-                yield f"light {path}", partial(read_true_light, self._file(path), name)
+                yield f"light {path}", partial(self._light, name, path)
             for name, path in self.dataset.truth.normals.items():
                 yield f"normals {name}", partial(self._normals, name, path)
 
+    def _light(self, name: str, path: str) -> None:
+        check_values(self._file(path), MOST_MEGAPIXELS, f"illumination.{name}")
+        read_true_light(self._file(path), name)
+
     def _normals(self, name: str, path: str) -> None:
+        check_values(self._file(path), MOST_MEGAPIXELS, f"normals.{name}")
         size = open_photo(self._file(self.dataset.photo(name).image), f"photos[{name}].image").size
         read_true_normals(self._file(path), name, size[::-1])
 
@@ -90,6 +97,7 @@ class Validation:
         key, path = f"photos[{entry.name}]", self._file(entry.image)
         size = open_photo(path, f"{key}.image").size
         check_pixels(size, most_megapixels, path, f"{key}.image")
+        check_values(path, most_megapixels, f"{key}.image")
         read_labels(entry.masks, self._file, self.dataset.spec.materials, size, entry.image, f"{key}.masks")
         read_objects([(obj.name, obj.mask) for obj in entry.objects], self._file, size, f"{key}.objects")
 

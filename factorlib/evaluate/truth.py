@@ -9,13 +9,16 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.reading import reading
 
 LEAST = -1e-3  # of the mean magnitude: resampling leaves a little below 0
 
 
 def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
     """The lat-long map of illumination `name`; InputError where a texel is no radiance."""
-    radiance, key = read_rgb_exr(path), f"illumination.{name}"
+    key = f"illumination.{name}"
+    with reading("an image", path, key):
+        radiance = read_rgb_exr(path)
     finite = np.isfinite(radiance)
     if not finite.all():
         found = f"{int((~finite).any(axis=-1).sum())} texels are NaN or infinite"
@@ -28,7 +31,9 @@ def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
 
 def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
     """Of photo `name`, whose file has `size` (width, height): normal.x/y/z, or R, G, B; zero or NaN where none is known."""
-    channels, key = read_exr(path), f"normals.{name}"
+    key = f"normals.{name}"
+    with reading("an image", path, key):
+        channels = read_exr(path)
     names = [f"normal.{axis}" for axis in "xyz"] if "normal.x" in channels else list("RGB")
     missing = [channel for channel in names if channel not in channels]
     if missing:

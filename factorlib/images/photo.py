@@ -28,6 +28,7 @@ from factorlib.images.raw import is_raw, open_raw
 from factorlib.images.scanlines import open_scanlines
 from factorlib.images.stored import Stored
 from factorlib.images.transfer import decoder
+from factorlib.reading import reading
 
 READ_AT_ONCE = 1 << 21  # pixels of the rows that are in memory as floats
 log = logging.getLogger("factorlib.images")
@@ -56,9 +57,10 @@ def open_photo(path: str | Path, key: str | None = None) -> Stored:
     key: where the photo is named, for messages.
     Raises InputError for a file that is unreadable, or holds no grey or RGB.
     """
-    if is_heif(path):
-        return open_heif(path, key)
-    return open_raw(path, key) if is_raw(path) else open_scanlines(path, key)
+    with reading("an image", path, key):  # a library's words about a damaged file may be damaged themselves
+        if is_heif(path):
+            return open_heif(path, key)
+        return open_raw(path, key) if is_raw(path) else open_scanlines(path, key)
 
 
 def read_photo(path: str | Path, encoding: str | None = None, key: str | None = None) -> Photo:
@@ -76,7 +78,7 @@ def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path)
     height, width = (n // factor for n in (stored.height, stored.width))
     radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
-    for rows, codes, cut in _strips(stored, factor):
+    for rows, codes, cut in _strips(stored, factor, path):
         linear = _decoded(codes, stored.white, encoding)
         numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
@@ -94,7 +96,7 @@ def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path)
     )  # fmt: skip
 
 
-def _strips(stored: Stored, factor: int) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
+def _strips(stored: Stored, factor: int, path: str | Path) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
     """Whole rows of boxes, some at a time: which rows of boxes, the codes in them, and where these are clipped.
 
     Boxes count from the displayed corner, so what is left over lies at the other end of an axis that display turns round.
@@ -106,10 +108,13 @@ def _strips(stored: Stored, factor: int) -> Iterator[tuple[slice, Shaped[np.ndar
     for first in range(0, height, step):
         last = min(first + step, height)
         begin, end = top + first * factor, top + last * factor
-        codes = stored.rows(begin, end)
-        yield slice(first, last), codes[:, columns], stored.clipped(begin, end, codes)[:, columns]
+        with reading("an image", path):
+            codes = stored.rows(begin, end)
+            clipped = stored.clipped(begin, end, codes)
+        yield slice(first, last), codes[:, columns], clipped[:, columns]
     if end < stored.height:
-        stored.rows(end, stored.height)  # a file that is cut short there is refused all the same
+        with reading("an image", path):
+            stored.rows(end, stored.height)  # a file that is cut short there is refused all the same
 
 
 def _reversed_axes(orientation: int) -> tuple[bool, bool]:

@@ -35,7 +35,10 @@ def is_raw(path: str | Path) -> bool:
 def open_raw(path: str | Path, key: str | None) -> Stored:
     """Raises InputError for a file that LibRaw cannot read."""
     rawpy, sensor = _opened(path, key)
-    sizes, cached = sensor.sizes, {}
+    try:
+        sizes, camera, cached = sensor.sizes, _of_camera(sensor), {}
+    except rawpy.LibRawError as error:
+        raise _refused(f"not readable as a raw photo ({_said(error)})", path, key) from None
     top, left, height, width = _crop(sizes)
 
     def developed() -> dict[str, np.ndarray]:
@@ -51,7 +54,7 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
         width=width,
         height=height,
         orientation=ORIENTATION.get(sizes.flip, 1),
-        exif={**_of_camera(sensor), **exif_of_tiff(path)},
+        exif={**camera, **exif_of_tiff(path)},
         profile="",
         white=WHITE,
         encoding="linear",

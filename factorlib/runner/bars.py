@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from factorlib.runner.display import Display
 from factorlib.runner.plan import Step
+from factorlib.runner.terminal import own, printable
 
 
 class Bars(Display):
@@ -14,16 +17,16 @@ class Bars(Display):
 
     def __init__(self, console: Console | None = None):
         super().__init__()
-        self.console = console or Console(stderr=True)
+        self.console = console or Console(file=own(sys.stderr))
         columns = [SpinnerColumn(), TextColumn("{task.description:<10}"), BarColumn(24), TextColumn("{task.fields[count]:>7}")]
-        self.bars = Progress(*columns, TimeElapsedColumn(), TextColumn("{task.fields[words]}"), console=self.console)
+        self.bars = Progress(*columns, TimeElapsedColumn(), TextColumn("{task.fields[words]}", markup=False), console=self.console)
         self._rows: dict[str, int] = {}
         self._running: dict[Step, float] = {}
         self.bars.start()
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
-        self.bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.bars.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def start(self, step: Step) -> None:
         """Count a step as running; its stage gets a bar if it has none."""
@@ -35,7 +38,7 @@ class Bars(Display):
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
         """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does."""
         self._running[step] = min(done / total, 1.0) if total else 0.0
-        self._words[step] = text
+        self._words[step] = printable(text)
         self._refresh(step.stage)
 
     def tick(self) -> None:

@@ -28,7 +28,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.defaults import Names, defaults_of, names_of
+from factorlib.runner.defaults import Names, defaults_of, names_of, values_of
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.leftover import left_over
 
@@ -147,6 +147,10 @@ class Sources:
         """A stage's parameters and their defaults as text, read without importing it."""
         self._stage_file(package, stage, pipeline_file)
         return defaults_of(f"{package}.{stage}", "Params", self._names)
+
+    def default_values(self, package: str, stage: str) -> dict[str, Any]:
+        """The same as values, a table where a default is a struct; UNKNOWN where the source does not tell it."""
+        return values_of(f"{package}.{stage}", "Params", self._names)
 
     def _names(self, module: str) -> Names | None:
         file = self.find(module)

@@ -7,6 +7,7 @@ import time
 from typing import TextIO
 
 from factorlib.runner.plan import Planned, Step
+from factorlib.runner.terminal import printable
 
 BEAT = 10.0  # seconds between two plain lines about the same step
 
@@ -38,7 +39,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """Print a line."""
-        print(text, file=self.stream, flush=True)
+        print(printable(text), file=self.stream, flush=True)
 
     def start(self, step: Step) -> None:
         """A step begins; printed for the first step of a stage only."""

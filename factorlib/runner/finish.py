@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from factorlib.runner.home import claim
+from factorlib.runner.leftover import sweep_drafts
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
@@ -40,6 +41,7 @@ def show(survey: Survey, planned: list[Planned]) -> None:
         if link.is_symlink() and link.name not in survey.spec.pipeline.stages:
             link.unlink()
     _drop_errors(survey, planned)
+    sweep_drafts(survey.home.folder)
 
 
 def _drop_errors(survey: Survey, planned: list[Planned]) -> None:

@@ -11,11 +11,13 @@ from pathlib import Path
 import msgspec
 
 from factorlib.runner.home import Home, made_homes
+from factorlib.runner.plan import Step
 from factorlib.runner.project import Project
 from factorlib.runner.store import Store
 from factorlib.runner.tenancy import alone
 
 LEFT_OVER = "left over"  # what was damaged, and files without a key
+INPUT = "input:"  # of the fields of a record, those that name a result it was made from
 
 
 class Gone(msgspec.Struct, frozen=True):
@@ -76,19 +78,28 @@ def unneeded(project: Project) -> list[Unneeded]:
 
 
 def collect(project: Project) -> Freed:
-    """Delete every result that is not current for some dataset; refused while a run goes on."""
+    """Delete every result that is not current for some dataset, nor what such a one was made from; refused while a run goes on."""
     store = Store(project.build / "store")
     with alone(store):
         dead = _dead(project, store)
         freed = sum(_size(path) for path in dead.trees)
         for path in dead.keys + dead.trees + dead.rest:
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            _delete(path, store.tmp / f"gc-{os.getpid()}-{path.name}")
     return Freed(len(dead.keys), freed)
+
+
+def _delete(path: Path, aside: Path) -> None:
+    """A folder goes from its place by one rename: where this is killed, no part of it is taken for a result that is damaged."""
+    if path.is_dir() and not path.is_symlink():
+        os.rename(path, aside)
+        shutil.rmtree(aside)
+    else:
+        path.unlink()
 
 
 def _dead(project: Project, store: Store) -> _Dead:
     homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
-    keys = {key for home in homes for key in home.keys().values()}
+    keys = _needed(store, {key for home in homes for key in home.keys().values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
     views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
@@ -96,6 +107,29 @@ def _dead(project: Project, store: Store) -> _Dead:
     rest += [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
     rest += [*store.locks.glob("*"), *store.unfinished.glob("*")]
     return _Dead(unused, [p for p in store.trees.glob("*") if p.name not in trees] + list(store.damaged.glob("*")), rest)
+
+
+def _needed(store: Store, current: set[str]) -> set[str]:
+    """Those keys, and of every result that they were made from, however far, the keys that gave it.
+
+    A step whose result is current is current only as long as what it was made from is there, though another run may have made
+    that anew in the meantime, with other parameters.
+    """
+    entries = {path.stem: entry for path in store.keys.glob("*.json") if (entry := store.entry(path.stem))}
+    gave: dict[tuple[str, str], list[str]] = {}
+    for key, entry in entries.items():
+        gave.setdefault((_step(entry.record), entry.output), []).append(key)
+    found, stack = set(current), list(current)
+    while stack:
+        record = entries[key].record if (key := stack.pop()) in entries else {}
+        above = {other for name, output in record.items() if name.startswith(INPUT) for other in gave.get((name.removeprefix(INPUT), output), [])}
+        stack += above - found
+        found |= above
+    return found
+
+
+def _step(record: dict) -> str:
+    return str(Step(record.get("stage", LEFT_OVER), record.get("photo"), record.get("recipe")))
 
 
 def forget(project: Project, home: Home) -> Gone:

@@ -18,6 +18,7 @@ from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 PIPELINE = "pipeline.yaml"
+DATASET_FILE = "dataset.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 
 
@@ -82,6 +83,7 @@ def photo_sets() -> Provider:
 
     def read(path: Path) -> Data:
         """The data set of a folder, as the runner sees it."""
+        _check_own(path)
         dataset = read_dataset(path)
         take_sigterm_back()
         photos = [photo.name for photo in dataset.spec.photos]
@@ -98,6 +100,13 @@ def photo_sets() -> Provider:
         return Data(dataset.folder, photos, slices, lambda *of: look().faults(*of), recipe, lambda files: look().recipe_faults(files))
 
     return Provider(SLICES, read)
+
+
+def _check_own(folder: Path) -> None:
+    """A dataset.yaml that is a link is as much a path of the data set as those that stand in it."""
+    file = folder / DATASET_FILE
+    if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder)):
+        raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
 
 
 def _looking_at(dataset: Any) -> Callable[[], Any]:

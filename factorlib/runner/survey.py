@@ -12,7 +12,9 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.reading import check_plain
 from factorlib.runner.closure import Closure, Sources
+from factorlib.runner.defaults import other_than
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
@@ -94,6 +96,8 @@ def _records(
     records = {}
     for name in spec.pipeline.needed(spec.targets):
         of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        values = other_than(sources.default_values(project.package, name), spec.pipeline.stages[name].values)
+        of_stage |= {f"param:{param}": value for param, value in values.items()}
         of_stage |= {f"default:{param}": text for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()}
         of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
@@ -125,7 +129,6 @@ def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> Non
 def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Packages) -> Record:
     stage = pipeline.stages[name]
     record = {"stage": name, "threads": stage.threads, "python": f"{sys.version_info[0]}.{sys.version_info[1]}", "makes": stage.makes}
-    record |= {f"param:{key}": value for key, value in stage.values.items()}
     return record | closure.record() | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
 
 
@@ -136,6 +139,8 @@ def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) 
         folder = given_folder(stage, param)
         for file in files:
             try:
+                if os.path.lexists(folder / file):
+                    check_plain(folder / file, "a result", f"{name}.{param}", most_bytes=None)  # a pipe or a device would never end
                 record[f"given:{param}/{file}"] = hashes.content(folder / file)
             except (OSError, TypeError):
                 found = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"

@@ -16,6 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from factorlib.errors import InputError
+from factorlib.runner.leftover import is_alive, sweep_drafts
 from factorlib.runner.store import Store
 
 
@@ -64,7 +65,7 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def sweep(store: Store) -> None:
-    """Delete what dead runs left in tmp."""
+    """Delete what dead runs left in tmp, and their drafts of keys, logs and caches."""
     for lock_file in store.tmp.glob("run-*.lock"):
         lock = FileLock(lock_file)
         try:
@@ -74,6 +75,8 @@ def sweep(store: Store) -> None:
         shutil.rmtree(lock_file.with_suffix(""), ignore_errors=True)
         lock.release()
         lock_file.unlink(missing_ok=True)
+    for folder in (store.keys, store.logs, store.cache):
+        sweep_drafts(folder)
     alive = {path.stem for path in store.tmp.glob("run-*.lock")}
     for path in store.tmp.iterdir():
         if path.is_dir() and path.name not in alive and not _maker_lives(path.name):
@@ -82,11 +85,6 @@ def sweep(store: Store) -> None:
 
 def _maker_lives(name: str) -> bool:
     """Whether the process that a draft is named for, `view-<pid>-…`, still is."""
-    pid = name.split("-")[1]
-    try:
-        os.kill(int(pid), 0)
-    except (ProcessLookupError, ValueError):
-        return False
-    except PermissionError:
-        pass
-    return name.startswith("view-")
+    kind, _, rest = name.partition("-")
+    pid = rest.partition("-")[0]
+    return kind == "view" and pid.isdigit() and is_alive(int(pid))

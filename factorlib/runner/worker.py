@@ -178,12 +178,24 @@ def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
     if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
         copy_shipped(folder, task.temporary)
     else:
-        module.main(params, inputs, task.temporary, events.progress)
+        _run_main(module, params, inputs, task, results, events)
     _check_files_still(task)
     _check_results_still(results)
     _check_code_still(task, hashes)
     _check_made(task)
     return store.take_in(task.record, task.temporary)
+
+
+def _run_main(
+    module: ModuleType, params: msgspec.Struct, inputs: Inputs, task: Task, results: dict[Path, dict[str, Stamp]], events: Events
+) -> None:
+    """Where the stage fails because a file was taken away or edited while it ran, that is what is said: it is no defect of the stage."""
+    try:
+        module.main(params, inputs, task.temporary, events.progress)
+    except Exception:
+        _check_files_still(task)
+        _check_results_still(results)
+        raise
 
 
 def _keep(task: Task, entry: Entry) -> None:
