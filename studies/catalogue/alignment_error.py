@@ -35,11 +35,11 @@ ARMS: dict[str, tuple[str, dict[str, Any]]] = {
     "even": (" even", {"confidence": False}),
     "outline": (" outline", {"refined": True}),
 }
-FEW = ("as-it-is", "outline")
+FIT, HEARD = ("as-it-is", "outline"), ("as-it-is", "squares", "even")
 SHOWN = {
-    "full": {"exact": tuple(ARMS), "turned-2": FEW, "turned-5": tuple(ARMS), "turned-10": FEW,
-             "turned-20": tuple(ARMS), "shifted": tuple(ARMS), "larger": tuple(ARMS), "coarse": tuple(ARMS)},
-    "quick": {"exact": ("as-it-is",), "turned-5": tuple(ARMS), "turned-20": FEW},
+    "full": {"exact": HEARD, "turned-2": ("as-it-is",), "turned-5": tuple(ARMS), "turned-10": FIT, "turned-20": tuple(ARMS),
+             "shifted": FIT, "larger": FIT, "coarse": HEARD},
+    "quick": {"exact": ("as-it-is",), "turned-5": tuple(ARMS), "turned-20": FIT},
 }  # fmt: skip
 
 
