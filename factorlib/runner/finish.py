@@ -10,9 +10,12 @@ from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
 
 
-def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
-    """Write down which key each step has now; steps of photos and stages that are no more are dropped."""
-    planned = survey.planned(frozenset()) if more is None else []
+def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
+    """Write down which key each step has now; steps of photos and stages that are no more are dropped.
+
+    more: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
+    """
+    planned = [] if more is not None else survey.planned(frozenset()) if planned is None else planned
     pipeline, spec = survey.spec.pipeline, survey.spec
     there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
     over_recipes = tuple(f"{name}/" for name, stage in pipeline.stages.items() if stage.over == "recipe")  # kept: others were asked for before

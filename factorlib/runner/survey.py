@@ -74,7 +74,8 @@ def survey(
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
         packages.save()
-    outputs, entries = Outputs(store), {step: store.entry(key) for step, key in _last_keys(home).items()}
+    outputs = Outputs(store)
+    entries = {step: outputs.entry(key) for step, key in _last_keys(home).items()}
     return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked)
 
 

@@ -74,7 +74,7 @@ def _make(project: Project, wish: Wish) -> int:
     whole = wish.targets is None
     planned = seen.planned()
     if all(p.status == "current" for p in planned):
-        remember(seen)
+        remember(seen, planned=planned)
         print(f"{seen.data.folder.name}: nothing to do, all {len(seen.records)} steps are current")
         _name_results(seen, whole)
         return 0
