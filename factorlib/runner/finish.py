@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from factorlib.runner.home import claim
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
+
+LONGEST = 85  # bytes of the name of a step's files, to which suffixes are added
 
 
 def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
@@ -58,8 +61,13 @@ def _drop_errors(survey: Survey, planned: list[Planned]) -> None:
 
 
 def label(step: Step) -> str:
-    """The name of a step's own files."""
-    return str(step).replace("/", "-")
+    """The name of a step's own files, short however long the photo's name is.
+
+    >>> label(Step("masks", "kitchen")), len(label(Step("masks", "k" * 240)))
+    ('masks-kitchen', 70)
+    """
+    name = str(step).replace("/", "-")
+    return name if len(name.encode()) <= LONGEST else f"{step.stage[:20]}-{hashlib.sha256(name.encode()).hexdigest()}"
 
 
 def folder_of(survey: Survey, stage: str, outputs: dict[str | None, str]) -> Path:

@@ -176,7 +176,7 @@ class Run:
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
         cores = self.pools.cores if spec.cores == "all" else min(spec.cores, self.pools.cores)
-        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores)
+        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores, self.survey.words)
 
     def _task(self, planned: Planned) -> Task:
         step, data = planned.step, self.survey.data

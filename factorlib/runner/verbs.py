@@ -15,7 +15,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.checks import faults, new_faults
+from factorlib.runner.checks import faults, new_faults, wrong_values
 from factorlib.runner.finish import remember, results
 from factorlib.runner.home import Home, claim, made_home, made_homes
 from factorlib.runner.logs import warnings_in
@@ -129,14 +129,21 @@ def _name_results(seen: Survey, whole: bool) -> None:
 
 
 def show_plan(project: Project, wish: Wish) -> int:
-    """Print what would run."""
-    print("\n".join(words.plan_lines(_looked_at(project, wish).planned())))
-    return 0
+    """Print what would run; 1 where a value of a parameter would not do."""
+    return _shown(project, wish, words.plan_lines)
 
 
 def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run."""
-    print("\n".join(words.why_lines(_looked_at(project, wish).planned())))
+    """Print why each step would run; 1 where a value of a parameter would not do."""
+    return _shown(project, wish, words.why_lines)
+
+
+def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]]) -> int:
+    seen = _looked_at(project, wish)
+    planned = seen.planned()
+    if found := wrong_values(seen, planned):
+        return _refused(seen, found, "parameters")
+    print("\n".join(lines(planned)))
     return 0
 
 
@@ -239,6 +246,8 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes
     """
     seen = survey(project, dataset, None, settings)
+    if found := wrong_values(seen, seen.planned()):
+        return _refused(seen, found, "parameters")
     if found := faults(seen, seen.records):
         return _refused(seen, found)
     print(
@@ -256,11 +265,11 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     return 0
 
 
-def _refused(seen: Survey, found: list[InputError]) -> int:
+def _refused(seen: Survey, found: list[InputError], where: str = "files") -> int:
     """Every fault at once, before anything has run."""
     for fault in found:
         print(f"error: {fault}", file=sys.stderr)
-    print(f"{seen.data.folder.name}: {len(found)} {'fault' if len(found) == 1 else 'faults'} in its files; nothing was run", file=sys.stderr)
+    print(f"{seen.data.folder.name}: {len(found)} {'fault' if len(found) == 1 else 'faults'} in its {where}; nothing was run", file=sys.stderr)
     return 1
 
 

@@ -31,7 +31,7 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.integrity import Stamp, stamps_of
-from factorlib.runner.pipeline import Shipping
+from factorlib.runner.pipeline import Shipping, said_of_settings
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shipped import copy_shipped, shipped_folder
@@ -49,6 +49,7 @@ class Code(msgspec.Struct, frozen=True):
     """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
+    words: settings of the command line, by the keys that they stand for
     """
 
     root: Path
@@ -58,6 +59,7 @@ class Code(msgspec.Struct, frozen=True):
     settings: Path
     threads: int = 1
     cores: int = 1
+    words: dict[str, str] = {}
 
     @property
     def taken(self) -> int:
@@ -124,6 +126,16 @@ def check_params(code: Code) -> Outcome:
         return _failed(error, code.root)
 
 
+def value_fault(code: Code) -> InputError | None:
+    """What is wrong with the parameters, in this process; a stage that cannot be loaded says so when it is run."""
+    with contextlib.suppress(ImportError):
+        try:
+            params_of(load_stage(code), code)
+        except InputError as error:
+            return error
+    return None
+
+
 def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
     """What the user can mend says how; the rest is a defect, and comes with its traceback."""
     if known := error if isinstance(error, InputError) else disk_error(error, folder):
@@ -151,7 +163,10 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
 
 def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
     """The stage's parameters as its own struct, every bound checked."""
-    return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
+    try:
+        return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
+    except InputError as error:
+        raise said_of_settings(error, code.words) from None
 
 
 def limit_threads(threads: int) -> None:
