@@ -25,6 +25,7 @@ from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned, difference
 from factorlib.runner.project import Project, is_path
 from factorlib.runner.recipes import ALL
+from factorlib.runner.shared import has, shared_store
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
@@ -143,8 +144,17 @@ def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[s
     planned = seen.planned()
     if found := wrong_values(seen, planned):
         return _refused(seen, found, "parameters")
+    if folder := shared_store(seen.store.root):
+        planned = [_with_shared(p, Store(folder)) for p in planned]
     print("\n".join(lines(planned)))
     return 0
+
+
+def _with_shared(planned: Planned, shared: Store) -> Planned:
+    """With a word of it where a step need only be copied."""
+    if planned.status == "current" or planned.key is None or "forced" in planned.reasons or not has(shared, planned.key):
+        return planned
+    return msgspec.structs.replace(planned, reasons=[*planned.reasons, "the shared store has it"])
 
 
 def _looked_at(project: Project, wish: Wish) -> Survey:

@@ -31,9 +31,11 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.integrity import Stamp, stamps_of
+from factorlib.runner.logs import warnings_in
 from factorlib.runner.pipeline import Shipping, said_of_settings
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.shared import fetch, offer
 from factorlib.runner.shipped import copy_shipped, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Store
@@ -72,6 +74,7 @@ class Task(msgspec.Struct, frozen=True):
 
     hashes:  of the dataset's files, as they were when the key was made
     shipped: where the package may have the result already; None where it is to be made in any case
+    shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
     """
 
     code: Code
@@ -89,6 +92,8 @@ class Task(msgspec.Struct, frozen=True):
     temporary: Path
     events: Path
     shipped: Shipping | None = None
+    shared: Path | None = None
+    forced: bool = False
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -107,10 +112,15 @@ def run_step(task: Task) -> Outcome:
     meter = Meter()
     with Events(task) as events:
         try:
+            if found := _fetched(task, events):
+                _keep(task, found[0])
+                return Outcome(output=found[0].output, damaged=found[1], seconds=meter.read(0, 0)["seconds"])
             entry, damaged = _made(task, events)
             cost = meter.read(task.code.threads, task.code.cores)
             _write_log(task, events, cost)
             _keep(task, entry)
+            if task.shared:
+                offer(Store(task.store), Store(task.shared), task.key, entry, events.say)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
@@ -201,6 +211,19 @@ def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
     return store.take_in(task.record, task.temporary)
 
 
+def _fetched(task: Task, events: Events) -> tuple[Entry, Path | None] | None:
+    """The result as others have made it, and what they were warned of; None where it is to be made here."""
+    if task.shared is None or task.forced:
+        return None
+    store = Store(task.store)
+    found = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
+    for text in warnings_in(store.log(task.key)) if found else ():
+        events.say(text)
+    if found and not store.log(task.key).exists():
+        _write_log(task, events, {"seconds": 0.0, "shared": True})
+    return found
+
+
 def _keep(task: Task, entry: Entry) -> None:
     store = Store(task.store)
     store.keep(task.key, entry)
@@ -289,6 +312,10 @@ class Events(logging.Handler):
         if text not in self.warnings:
             self.warnings.append(text)
             self._say({"warning": text})
+
+    def say(self, text: str) -> None:
+        """A warning that is no part of the result's log."""
+        self._say({"warning": text})
 
     def _say(self, event: dict) -> None:
         """On a full disk nothing more is said: the step itself fails there, or finds room again."""
