@@ -136,10 +136,25 @@ def status(asked: argparse.Namespace) -> int:
     return verbs.show_status(project(), wish(asked, asked.stages))
 
 
-@verb("graph", _option("--mermaid", action="store_true", help="as a Mermaid diagram"))
+@verb(
+    "graph",
+    _option("--mermaid", action="store_true", help="as a Mermaid diagram"),
+    _option("--svg", type=Path, help="file to draw to; else SVG"),
+    DATASET,
+    SETTINGS,
+    RECIPES,
+)
 def graph(asked: argparse.Namespace) -> int:
-    """The stages and what they take."""
-    return verbs.show_graph(project(), asked.mermaid)
+    """The stages and what they take, as text or as a drawing; the drawing of a dataset has its photos, and how far each stage is."""
+    svg = asked.svg or _folder_named("SVG")
+    return verbs.show_graph(project(), asked.mermaid, svg, wish(asked) if svg and named_if_any(asked.dataset) else None)
+
+
+@verb("logs", STAGES, DATASET, SETTINGS, RECIPES, _option("--photo", help="its name, or a recipe's; else PHOTO"))
+def logs(asked: argparse.Namespace) -> int:
+    """What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…)."""
+    stages = asked.stages or os.environ.get("STAGE", "").split() or None
+    return verbs.show_logs(project(), wish(asked, stages), asked.photo or os.environ.get("PHOTO") or None)
 
 
 @verb("params", STAGES)
@@ -156,7 +171,7 @@ def new(asked: argparse.Namespace) -> int:
 
 
 def _folder_named(key: str) -> Path | None:
-    """The folder that the environment names."""
+    """The folder or file that the environment names."""
     return Path(os.environ[key]).expanduser() if os.environ.get(key) else None
 
 

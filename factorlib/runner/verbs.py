@@ -10,15 +10,16 @@ import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.checks import faults, new_faults, wrong_values
-from factorlib.runner.finish import remember, results
+from factorlib.runner.finish import label, remember, results
 from factorlib.runner.home import Home, claim, made_home, made_homes
-from factorlib.runner.logs import warnings_in
+from factorlib.runner.logs import sound_lines, warnings_in
 from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
@@ -31,6 +32,9 @@ from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
+
+if TYPE_CHECKING:
+    from factorlib.runner.drawing import State
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 
@@ -119,9 +123,9 @@ def _run(seen: Survey, whole: bool, started: float) -> int:
 
 def _name_results(seen: Survey, whole: bool) -> None:
     """Of the whole pipeline what a user looks at first, else the folder of each stage; pictures of recipes either way."""
-    for label, path in results(seen) if whole else ():
+    for what, path in results(seen) if whole else ():
         shown = seen.project.shown(path)
-        print(f"  {label}: {shown}" + ("/*.exr" if path.is_dir() else ""))
+        print(f"  {what}: {shown}" + ("/*.exr" if path.is_dir() else ""))
     for name in seen.spec.targets or ():
         over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
         if over_recipes or not whole:
@@ -190,11 +194,50 @@ def warnings_of(seen: Survey, planned: Planned) -> list[str]:
     return warnings_in(seen.store.log(planned.key))
 
 
-def show_graph(project: Project, mermaid: bool) -> int:
-    """Print the stages and what each takes, as text or as a Mermaid diagram."""
+def show_graph(project: Project, mermaid: bool = False, svg: Path | None = None, wish: Wish | None = None) -> int:
+    """Print the stages and what each takes, as text or as a Mermaid diagram, or draw them.
+
+    svg: file to draw to;  wish: with a data set the drawing has its numbers of photos, and how far each stage is
+    """
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
+    if svg is not None:
+        from factorlib.runner.drawing import drawing
+
+        if svg.suffix.lower() != ".svg":
+            raise InputError("is no name of an SVG file", file=svg, key="SVG", cure="name one, as in SVG=build/graph.svg")
+        svg.parent.mkdir(parents=True, exist_ok=True)
+        write_text(svg, drawing(pipeline, states_of(surveyed(project, wish)) if wish else None))
+        print(f"graph: {project.shown(svg)}")
+        return 0
     print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
     return 0
+
+
+def states_of(seen: Survey) -> dict[str, State]:
+    """How far each stage of a survey is, for a drawing."""
+    from factorlib.runner.drawing import State
+
+    planned: dict[str, list[str]] = {}
+    for p in seen.planned():
+        planned.setdefault(p.step.stage, []).append("running" if p.key and p.status != "current" and is_running(seen, p) else p.status)
+    return {stage: State(len(found), {status: found.count(status) for status in dict.fromkeys(found)}) for stage, found in planned.items()}
+
+
+def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
+    """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
+    seen = _looked_at(project, wish)
+    found = [p for p in seen.planned() if (not wish.targets or p.step.stage in wish.targets) and photo in (None, p.step.of)]
+    if not found:
+        known = [name for name in [*seen.data.photos, *seen.recipes] if name]
+        raise InputError(f"no step is of {photo!r}", key="PHOTO", cure=did_you_mean(str(photo), known))
+    print("\n".join(words.log_lines([_logged(seen, p) for p in found])))
+    return 0
+
+
+def _logged(seen: Survey, planned: Planned) -> words.Logged:
+    events = [msgspec.json.decode(line) for line in sound_lines(seen.store.log(planned.key))] if planned.status == "current" else []
+    error = seen.home.errors / f"{label(planned.step)}.txt"
+    return words.Logged(planned, events, seen.project.shown(error) if error.is_file() else None)
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
