@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph params new compare validate verify clean gc setup lock test test-long study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph params new compare validate verify $(STAGES): .venv/ready
+all plan why status graph logs params new compare validate verify $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
@@ -63,7 +63,8 @@ help:
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
-	@echo 'make graph                           the stages and what they take'
+	@echo 'make logs DATASET=… STAGE=… PHOTO=…  what results cost and were made with: time, peak memory, versions, warnings'
+	@echo 'make graph                           the stages and what they take; SVG=build/graph.svg DATASET=…: as a drawing of how far each is'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
@@ -76,6 +77,7 @@ help:
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
+	@echo 'make bench-runners                   a run with nothing to do, a plan and a status, beside DVC and Snakemake (docs/runner.md)'
 	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'
 	@echo 'make bench-reference REASON="…"         the numbers of data/synthetic that make test compares with, and README.md, anew'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'

@@ -1,43 +1,52 @@
-"""The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`."""
+"""The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
+
+Read by `argparse`, for a run with nothing to do must not wait for a library: it takes a fifth of a second in all.
+"""
 
 from __future__ import annotations
 
+import argparse
 import errno
 import logging
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import NoReturn
 
-import typer
-
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 from factorlib.runner.terminal import plain_streams, printable
 
-
-class Verbs(typer.core.TyperGroup):
-    """A word that is no verb is the name of a stage."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Read a first word that is neither an option nor a verb as `stage <word>`."""
-        if args and not args[0].startswith("-") and args[0] not in self.commands:
-            args = ["stage", *args]
-        return super().resolve_command(ctx, args)
-
-
 NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}  # what the system refuses to this user
 
-app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+Verb = Callable[[argparse.Namespace], int]
+Option = tuple[tuple[str, ...], dict[str, object]]  # as `ArgumentParser.add_argument` takes them
+VERBS: dict[str, tuple[Verb, tuple[Option, ...]]] = {}  # by name, in the order of `--help`
 
-Dataset = Annotated[str | None, typer.Option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="stage.parameter=value, as in solve.lobes=64; else SET")]
-Force = Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")]
-Recipes = Annotated[list[str] | None, typer.Option("--recipe", help="pictures to make: a path, a name in recipes/, or all; else RECIPE")]
-Stages = Annotated[list[str] | None, typer.Argument(help="stages; all without it")]
+
+def _option(*names: str, **how: object) -> Option:
+    return names, how
+
+
+DATASET = _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET")
+SETTINGS = _option("--set", dest="settings", action="append", metavar="X.Y=Z", help="stage.parameter=value, as in solve.lobes=64; else SET")
+FORCE = _option("--force", action="store_true", help="run again, whatever the store holds; as FORCE=1")
+RECIPES = _option("--recipe", dest="recipes", action="append", help="pictures to make: a path, a name in recipes/, or all; else RECIPE")
+STAGES = _option("stages", nargs="*", help="stages; all without it")
+
+
+def verb(name: str, *options: Option) -> Callable[[Verb], Verb]:
+    """Makes a function the verb `name`, which takes these options; its docstring is its help."""
+
+    def known(function: Verb) -> Verb:
+        """Remember it."""
+        VERBS[name] = function, options
+        return function
+
+    return known
 
 
 def project() -> Project:
@@ -74,11 +83,10 @@ def chosen(settings: list[str] | None) -> list[str]:
     return settings or [os.environ.get("SET", "")]
 
 
-def wish(
-    dataset: str | None, stages: list[str] | None, settings: list[str] | None, recipes: list[str] | None, force: bool = False
-) -> verbs.Wish:
-    """What is asked for, by the options, else by the environment."""
-    return verbs.Wish(named(dataset), stages or None, chosen(settings), forced(force), recipes or [name for name in [os.environ.get("RECIPE")] if name])
+def wish(asked: argparse.Namespace, stages: list[str] | None = None) -> verbs.Wish:
+    """What is asked for, by the options, else by the environment; `stages`: those of the command line, all where there are none."""
+    recipes = asked.recipes or [name for name in [os.environ.get("RECIPE")] if name]
+    return verbs.Wish(named(asked.dataset), stages or None, chosen(asked.settings), forced(getattr(asked, "force", False)), recipes)
 
 
 def forced(force: bool) -> bool:
@@ -97,135 +105,168 @@ def switched_on(key: str, option: bool) -> bool:
 # ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@app.command("all")
-def all_(dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
+@verb("all", DATASET, SETTINGS, FORCE, RECIPES)
+def all_(asked: argparse.Namespace) -> int:
     """Run the whole pipeline, as far as anything must run, and make the pictures of recipes that are named."""
-    raise typer.Exit(verbs.make(project(), wish(dataset, None, settings, recipe, force)))
+    return verbs.make(project(), wish(asked))
 
 
-@app.command()
-def stage(name: str, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
+@verb("stage", _option("name"), DATASET, SETTINGS, FORCE, RECIPES)
+def stage(asked: argparse.Namespace) -> int:
     """Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes that one's pictures alone."""
     known = project()
-    verbs.check_stage(known, name, [command.name or command.callback.__name__ for command in app.registered_commands])
-    raise typer.Exit(verbs.make(known, wish(dataset, [name], settings, recipe, force)))
+    verbs.check_stage(known, asked.name, list(VERBS))
+    return verbs.make(known, wish(asked, [asked.name]))
 
 
-@app.command()
-def plan(
-    stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None
-) -> None:
+@verb("plan", STAGES, DATASET, SETTINGS, FORCE, RECIPES)
+def plan(asked: argparse.Namespace) -> int:
     """What would run; with a recipe and no stage, for its pictures alone."""
-    raise typer.Exit(verbs.show_plan(project(), wish(dataset, stages, settings, recipe, force)))
+    return verbs.show_plan(project(), wish(asked, asked.stages))
 
 
-@app.command()
-def why(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, force: Force = False, recipe: Recipes = None) -> None:
+@verb("why", STAGES, DATASET, SETTINGS, FORCE, RECIPES)
+def why(asked: argparse.Namespace) -> int:
     """Every reason why it would run."""
-    raise typer.Exit(verbs.show_why(project(), wish(dataset, stages, settings, recipe, force)))
+    return verbs.show_why(project(), wish(asked, asked.stages))
 
 
-@app.command()
-def status(stages: Stages = None, dataset: Dataset = None, settings: Settings = None, recipe: Recipes = None) -> None:
+@verb("status", STAGES, DATASET, SETTINGS, RECIPES)
+def status(asked: argparse.Namespace) -> int:
     """How far each stage is, and what the current results warned of."""
-    raise typer.Exit(verbs.show_status(project(), wish(dataset, stages, settings, recipe)))
+    return verbs.show_status(project(), wish(asked, asked.stages))
 
 
-@app.command()
-def graph(mermaid: Annotated[bool, typer.Option("--mermaid", help="as a Mermaid diagram")] = False) -> None:
-    """The stages and what they take."""
-    raise typer.Exit(verbs.show_graph(project(), mermaid))
+@verb(
+    "graph",
+    _option("--mermaid", action="store_true", help="as a Mermaid diagram"),
+    _option("--svg", type=Path, help="file to draw to; else SVG"),
+    DATASET,
+    SETTINGS,
+    RECIPES,
+)
+def graph(asked: argparse.Namespace) -> int:
+    """The stages and what they take, as text or as a drawing; the drawing of a dataset has its photos, and how far each stage is."""
+    svg = asked.svg or _folder_named("SVG")
+    return verbs.show_graph(project(), asked.mermaid, svg, wish(asked) if svg and named_if_any(asked.dataset) else None)
 
 
-@app.command()
-def params(stages: Stages = None) -> None:
+@verb("logs", STAGES, DATASET, SETTINGS, RECIPES, _option("--photo", help="its name, or a recipe's; else PHOTO"))
+def logs(asked: argparse.Namespace) -> int:
+    """What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…)."""
+    stages = asked.stages or os.environ.get("STAGE", "").split() or None
+    return verbs.show_logs(project(), wish(asked, stages), asked.photo or os.environ.get("PHOTO") or None)
+
+
+@verb("params", STAGES)
+def params(asked: argparse.Namespace) -> int:
     """Every parameter of stages with its default, its range and its meaning (make params STAGE=…)."""
-    raise typer.Exit(verbs.show_params(project(), stages or os.environ.get("STAGE", "").split() or None))
+    return verbs.show_params(project(), asked.stages or os.environ.get("STAGE", "").split() or None)
 
 
-@app.command()
-def new(
-    dataset: Dataset = None,
-    photos: Annotated[Path | None, typer.Option(help="folder of photos; else PHOTOS")] = None,
-    masks: Annotated[Path | None, typer.Option(help="folder of masks; else MASKS")] = None,
-    meshes: Annotated[Path | None, typer.Option(help="folder of meshes; else MESHES")] = None,
-) -> None:
+@verb("new", DATASET, *(_option(f"--{word}", type=Path, help=f"folder of {word}; else {word.upper()}") for word in ("photos", "masks", "meshes")))
+def new(asked: argparse.Namespace) -> int:
     """Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml."""
-    folders = [given or _folder_named(key) for given, key in ((photos, "PHOTOS"), (masks, "MASKS"), (meshes, "MESHES"))]
-    raise typer.Exit(verbs.begin(project(), named(dataset), *folders))
+    folders = [given or _folder_named(key) for given, key in ((asked.photos, "PHOTOS"), (asked.masks, "MASKS"), (asked.meshes, "MESHES"))]
+    return verbs.begin(project(), named(asked.dataset), *folders)
 
 
 def _folder_named(key: str) -> Path | None:
-    """The folder that the environment names."""
+    """The folder or file that the environment names."""
     return Path(os.environ[key]).expanduser() if os.environ.get(key) else None
 
 
-@app.command()
-def compare(
-    first: Annotated[str | None, typer.Argument(help="folder of a result, as build/eames; else A")] = None,
-    second: Annotated[str | None, typer.Argument(help="another; else B")] = None,
-) -> None:
+@verb("compare", _option("first", nargs="?", help="folder of a result, as build/eames; else A"), _option("second", nargs="?", help="another; else B"))
+def compare(asked: argparse.Namespace) -> int:
     """A page that shows two results side by side: what differs in parameters, numbers, materials, lights and re-syntheses."""
-    folders = [given or os.environ.get(key) for given, key in ((first, "A"), (second, "B"))]
+    folders = [given or os.environ.get(key) for given, key in ((asked.first, "A"), (asked.second, "B"))]
     if not all(folders):
         raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
-    raise typer.Exit(verbs.compare(project(), *map(Path, folders)))
+    return verbs.compare(project(), *map(Path, folders))
 
 
-@app.command()
-def validate(
-    dataset: Dataset = None, settings: Settings = None, sheet: Annotated[bool, typer.Option("--sheet", help="as SHEET=1")] = False
-) -> None:
+@verb("validate", DATASET, SETTINGS, _option("--sheet", action="store_true", help="as SHEET=1"))
+def validate(asked: argparse.Namespace) -> int:
     """Check pipeline.yaml, settings and dataset without running anything; with a sheet, draw photos, labels and meshes side by side."""
-    raise typer.Exit(verbs.validate(project(), named(dataset), chosen(settings), switched_on("SHEET", sheet)))
+    return verbs.validate(project(), named(asked.dataset), chosen(asked.settings), switched_on("SHEET", asked.sheet))
 
 
-@app.command()
-def verify(dataset: Dataset = None) -> None:
+@verb("verify", DATASET)
+def verify(asked: argparse.Namespace) -> int:
     """Read every kept result, of a dataset or of all, and name what is damaged."""
-    raise typer.Exit(verbs.verify(project(), named_if_any(dataset)))
+    return verbs.verify(project(), named_if_any(asked.dataset))
 
 
-@app.command()
-def clean(dataset: Dataset = None) -> None:
+@verb("clean", DATASET)
+def clean(asked: argparse.Namespace) -> int:
     """Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all."""
-    raise typer.Exit(verbs.clean(project(), named_if_any(dataset)))
+    return verbs.clean(project(), named_if_any(asked.dataset))
 
 
-@app.command()
-def gc(force: Annotated[bool, typer.Option("--force", help="without asking; as FORCE=1")] = False) -> None:
+@verb("gc", _option("--force", action="store_true", help="without asking; as FORCE=1"))
+def gc(asked: argparse.Namespace) -> int:
     """Show which results in the store are current for no dataset, and delete them; a terminal is asked first, but for --force."""
-    raise typer.Exit(verbs.collect(project(), lambda: agreed(force)))
+    return verbs.collect(project(), lambda: agreed(asked.force))
 
 
 def agreed(force: bool) -> bool:
     """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
-    return forced(force) or not sys.stdin.isatty() or typer.confirm("delete them?")
+    return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
-@app.command()
-def ship(stage: str, dataset: Dataset = None) -> None:
+@verb("ship", _option("stage"), DATASET)
+def ship(asked: argparse.Namespace) -> int:
     """Put a stage's current result into the package (for those who change the stage)."""
-    raise typer.Exit(verbs.ship(project(), stage, named(dataset)))
+    return verbs.ship(project(), asked.stage, named(asked.dataset))
 
 
-def main() -> None:
+# ── reading the command line ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Reads the words of every verb; `run` in what it returns is the verb's function."""
+    whole = argparse.ArgumentParser(program, description="Any other word is the name of a stage: it is run, and what it needs.")
+    add = whole.add_subparsers(title="verbs", metavar="verb", required=True).add_parser
+    for name, (function, options) in VERBS.items():
+        one = add(name, help=function.__doc__, description=function.__doc__, allow_abbrev=False)
+        one.set_defaults(run=function)
+        for names, how in options:
+            one.add_argument(*names, **how)
+    return whole
+
+
+def run(words: list[str], program: str) -> int:
+    """What the verb of the command line returns.  A first word that is neither an option nor a verb is read as `stage <word>`."""
+    if words and not words[0].startswith("-") and words[0] not in VERBS:
+        words = ["stage", *words]
+    asked = parser(program).parse_args(words or ["--help"])
+    return asked.run(asked)
+
+
+def main() -> NoReturn:
     """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
     sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     try:
         with plain_streams(), heed_stops():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
-            app(prog_name="factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib")
+            sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
     except OSError as error:
-        known = disk_error(error, project().build)
-        if known is None and error.errno in NOT_OURS:
-            cure = "check that the folder is there, and that you may read it and write to it"
-            known = InputError(error.strerror, file=error.filename, cure=cure)
-        if known is None:
-            raise
-        sys.exit(printable(f"error: {known}"))
+        _stop_at(error)
+
+
+def _stop_at(error: OSError) -> NoReturn:
+    """End with the system's word where a user can mend it; whatever else is a defect."""
+    from factorlib.disk import disk_error
+
+    known = disk_error(error, project().build)
+    if known is None and error.errno in NOT_OURS:
+        cure = "check that the folder is there, and that you may read it and write to it"
+        known = InputError(error.strerror, file=error.filename, cure=cure)
+    if known is None:
+        raise error
+    sys.exit(printable(f"error: {known}"))
 
 
 if __name__ == "__main__":

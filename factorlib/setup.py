@@ -12,12 +12,17 @@ import ctypes
 import hashlib
 import os
 import platform
+import queue
+import re
 import shutil
 import subprocess
 import sys
+import threading
+import time
 import tomllib
 import urllib.request
 import venv
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,6 +32,9 @@ READY = VENV / "ready"
 TORCH = "torch==2.13.0"
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux draw in gigabytes of CUDA
 PROBE_SECONDS = 5
+PARTS = 3  # installations at once, PyTorch alone in one of them
+BEAT = 3.0  # seconds between two signs of life
+LOADED = ("torch, scipy.optimize, mitsuba, pytest", "open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress, typer")
 LIBRARIES = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}  # of Open3D
 
 
@@ -36,16 +44,14 @@ def main() -> None:
     if READY.exists() and READY.read_text() == state:
         READY.touch()
         return
-    check_system()
-    make_venv()
-    install_torch()  # first, with what it needs: the others are installed as they stand in the lock
-    say("installing the pinned packages (about 400 MB, some minutes)")
-    pip("install", "--no-deps", "-r", str(LOCK))
-    # relative, so that the checkout can be moved; `import factorlib` then works from anywhere, notebooks too
-    next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
-    subprocess.run([VENV / "bin" / "python", "-c", "import open3d, torch, mitsuba, OpenImageIO, pycolmap"], check=True, cwd="/")
+    seconds: dict[str, float] = {}
+    for phase, step in (("system libraries", check_system), (".venv", make_venv), ("packages", install_packages), ("check", check_packages)):
+        started = time.monotonic()
+        step()
+        seconds[phase] = time.monotonic() - started
     READY.write_text(state)
-    say("the environment is ready")
+    said = ", ".join(f"{phase} {took:.0f} s" for phase, took in seconds.items() if took >= 0.5)
+    say(f"the environment is ready, after {sum(seconds.values()):.0f} s ({said})")
 
 
 def install_extras() -> None:
@@ -80,31 +86,139 @@ def make_venv() -> None:
     venv.create(VENV, with_pip=True, symlinks=True)
 
 
+def install_packages() -> None:
+    """Everything that the lock names, without asking what it needs: the lock answers that.  Several installations run at once.
+
+    A PyTorch that is not of its index of CPU wheels may need more (CUDA): that is asked for afterwards.
+    """
+    index = torch_index()
+    locked = [line.strip() for line in LOCK.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    say(f"installing {len(locked) + 1} packages (about 400 MB); PyTorch from {index or 'the default package index'}")
+    torch = [TORCH, *(["--index-url", index] if index else [])]
+    if not (shutil.which("uv") and install([["--no-deps", *locked], ["--no-deps", *torch]], with_uv, len(locked) + 1)):
+        parts = [locked[k :: PARTS - 1] for k in range(PARTS - 1)]
+        ended(install([["--no-deps", *torch], *(["--no-deps", *part] for part in parts)], with_pip, len(locked) + 1))
+    if index != TORCH_CPU:
+        ended(install([["-c", str(LOCK), *torch]], with_pip, 0))
+    # relative, so that the checkout can be moved; `import factorlib` then works from anywhere, notebooks too
+    site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
+
+
+def check_packages() -> None:
+    """Load what the project loads: Python keeps them compiled, which pip would do for many times as much that is never used."""
+    say("loading the packages for the first time")
+    quiet = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    python = [str(VENV / "bin" / "python"), "-c"]
+    running = [subprocess.Popen([*python, f"import {names}"], cwd="/", env=quiet) for names in LOADED]
+    while any(process.poll() is None for process in running):
+        show_life("loading the packages for the first time")
+        time.sleep(0.1)
+    if any(process.returncode for process in running):
+        sys.exit("set-up: the packages are installed, but one does not load: see above")
+
+
 def pip(*words: str) -> None:
-    """Each package is named as it comes; a failed installation ends set-up with pip's own words."""
-    command = [str(VENV / "bin" / "python"), "-m", "pip", *words, "--disable-pip-version-check", "--progress-bar", "off"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        names = (line.split()[1] for line in process.stdout if line.startswith(("Collecting ", "Installing ")))
-        for count, name in enumerate(names, start=1):
-            show_life(f"{count:3} {'installing' if name == 'collected' else name}")
-    show_life("")
-    if process.returncode:
-        sys.exit("set-up: pip could not install the packages: see above; run make again when that is mended")
+    """One command of pip; a failed installation ends set-up with pip's own words."""
+    verb, *rest = words
+    ended(install([rest], with_pip, 0, verb))
 
 
-def show_life(text: str) -> None:
-    """On a terminal one line that is written over, elsewhere a line each."""
+def ended(well: bool) -> None:
+    """Stop where an installation failed; it has said why."""
+    if not well:
+        sys.exit("set-up: the packages could not be installed: see above; run make again when that is mended")
+
+
+def with_pip(words: list[str], verb: str = "install") -> list[str]:
+    """pip's command.  It compiles nothing: that takes longer than all the rest, and most of it is never loaded."""
+    quiet = ["--disable-pip-version-check", "--progress-bar", "off"]
+    return [str(VENV / "bin" / "python"), "-m", "pip", verb, *(["--no-compile"] if verb == "install" else []), *words, *quiet]
+
+
+def with_uv(words: list[str], verb: str = "install") -> list[str]:
+    """The same for uv, where the user has it."""
+    return ["uv", "pip", verb, "-q", "--python", str(VENV / "bin" / "python"), *words]
+
+
+def install(parts: list[list[str]], command: Callable[[list[str], str], list[str]], total: int, verb: str = "install") -> bool:
+    """Run a command for each part, all at once, and show that they live; whether all went well.
+
+    What they warn of is shown once for each kind, errors as they come.  total: of packages, 0 where that is not known
+    """
+    lines: queue.Queue[str | None] = queue.Queue()
+    running = [_started(command(part, verb), lines) for part in parts]
+    open_, warned, started = len(running), Warnings(), time.monotonic()
+    while open_:
+        try:
+            line = lines.get(timeout=0.2)
+        except queue.Empty:
+            line = ""
+        open_ -= line is None
+        warned.hear(line or "")
+        there = f"{len(list(site_packages().glob('*.dist-info')))} of {total} packages installed" if total else "installing"
+        show_life(f"{there}, {time.monotonic() - started:.0f} s")
+    show_life("", always=True)
+    warned.close()
+    return not any(process.wait() for process in running)
+
+
+def _started(command: list[str], lines: queue.Queue) -> subprocess.Popen:
+    """A process whose lines go into a queue, None when it has no more; of standard output only what is an error."""
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace")
+
+    def read() -> None:
+        """Until it ends."""
+        for line in process.stderr:
+            lines.put(line.rstrip())
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    return process
+
+
+class Warnings:
+    """What a package client says on standard error: a warning once for each kind, which is its text without names and numbers."""
+
+    def __init__(self) -> None:
+        self.kinds: dict[str, int] = {}
+
+    def hear(self, line: str) -> None:
+        """Show a line, unless it is a warning of a known kind."""
+        kind = re.sub(r"'[^']*'|\"[^\"]*\"|\w+://\S+|\d+", "…", line)
+        if line.lower().startswith("warning"):
+            self.kinds[kind] = self.kinds.get(kind, 0) + 1
+        if line and self.kinds.get(kind, 0) < 2:
+            show_life("", always=True)
+            print(line, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """How many were left out."""
+        if more := sum(self.kinds.values()) - len(self.kinds):
+            say(f"{more} more {'warning' if more == 1 else 'warnings'} of the same {'kind' if len(self.kinds) == 1 else 'kinds'} left out")
+
+
+_shown = 0.0  # when a sign of life was shown last
+
+
+def show_life(text: str, always: bool = False) -> None:
+    """On a terminal one line that is written over, elsewhere a line every BEAT seconds."""
+    global _shown
+    now = time.monotonic()
     if sys.stdout.isatty():
         print(f"\r\033[K{'set-up: ' + text if text else ''}", end="", flush=True)
-    elif text:
+    elif text and (always or now - _shown >= BEAT):
+        _shown = now
         say(text)
 
 
-def install_torch() -> None:
-    """TORCH_INDEX, if it is set; else PyTorch's own index of CPU wheels, if it answers; else the default index."""
-    index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
-    say(f"installing PyTorch from {index or 'the default package index'}")
-    pip("install", "-c", str(LOCK), TORCH, *(["--index-url", index] if index else []))
+def site_packages() -> Path:
+    """Where .venv keeps packages."""
+    return next(VENV.glob("lib/python*/site-packages"))
+
+
+def torch_index() -> str | None:
+    """TORCH_INDEX, if it is set; else PyTorch's own index of CPU wheels, if it answers; else None, for the default index."""
+    return os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
 
 
 def answers(url: str) -> bool:

@@ -73,7 +73,7 @@ def run(site, *words, cwd):
 
 def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path):
     done = run(installed, str(installed / "bin" / "factorlib"), "--help", cwd=tmp_path)
-    assert done.returncode == 0 and "Usage: factorlib" in done.stdout and "validate" in done.stdout
+    assert done.returncode == 0 and "usage: factorlib" in done.stdout and "validate" in done.stdout
     code = "import factorlib; from factorlib.reflection import reflection_operator; print(factorlib.__file__, reflection_operator('network'))"
     done = run(installed, "-c", code, cwd=tmp_path)
     assert done.returncode == 0 and done.stdout.startswith(str(installed)), done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NoReturn
@@ -16,6 +17,7 @@ class Refusal:
 
     def __init__(self, file: Path, folder: Path):
         self.file, self.folder = file, folder
+        self.inside: dict[str, Path] = {}  # folders that were found to lie in it, by how they are written
 
     def __call__(self, key: str, found: str, cure: str) -> NoReturn:
         raise InputError(found, file=self.file, key=key, cure=cure)
@@ -70,11 +72,25 @@ def is_there(target: Path, key: str) -> bool:
 
 
 def _inside(key: str, path: str, refuse: Refusal, kind: str) -> Path:
+    """Files of one folder that are no links are where that folder is, which is followed once: a set may have thousands."""
+    above, _, name = path.rpartition("/")
+    if above in refuse.inside and name not in ("", ".", "..") and _is_plain(found := refuse.inside[above] / name):
+        return found
     try:
-        return path_inside(refuse.folder, path)
+        target = path_inside(refuse.folder, path)
+        if above and name not in ("", ".", ".."):
+            refuse.inside[above] = path_inside(refuse.folder, above)
+        return target
     except ValueError as error:
         shown = path if len(path) <= 80 else f"{path[:80]}…"
         refuse(key, f"{shown!r} {error}", f"copy the {kind} into {refuse.folder.resolve()} and name it relative to that folder")
+
+
+def _is_plain(target: Path) -> bool:
+    try:
+        return stat.S_ISREG(os.lstat(target).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def _nearby(target: Path) -> str:

@@ -11,12 +11,26 @@ from factorlib.errors import InputError
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Record, Step
 from factorlib.runner.survey import Survey
+from factorlib.runner.worker import Code, value_fault
 
 
 def new_faults(seen: Survey, planned: list[Planned]) -> list[InputError]:
     """Of the files that steps are to read which have no result of them yet, each fault once; files of the dataset and of recipes
     that have all been used cost nothing."""
     return faults(seen, [p.step for p in planned if p.status != "current" and _is_new(seen, p.step)])
+
+
+def wrong_values(seen: Survey, planned: list[Planned]) -> list[InputError]:
+    """Of the parameters that steps would run with: one out of its range, or of another kind.
+
+    Only a stage that is given any is imported, which takes seconds where it computes.
+    """
+    found, project, stages = [], seen.project, seen.spec.pipeline.stages
+    for name in dict.fromkeys(p.step.stage for p in planned if p.status != "current" and stages[p.step.stage].values):
+        code = Code(project.root, project.package, name, stages[name].values, project.pipeline_file, words=seen.words)
+        if fault := value_fault(code):
+            found.append(fault)
+    return found
 
 
 def faults(seen: Survey, steps: Iterable[Step]) -> list[InputError]:

@@ -142,6 +142,8 @@ class Sources:
     def __init__(self, roots: list[Path], hashes: FileHashes):
         self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
         self._found: dict[str, Path | None] = {}
+        self._read: dict[Path, Source] = {}  # each file is looked at once, however many stages import it
+        self._beside: dict[Path, list[Path]] = {}  # data files by folder
 
     def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, str]:
         """A stage's parameters and their defaults as text, read without importing it."""
@@ -224,9 +226,10 @@ class Sources:
         return file
 
     def _source(self, name: str, file: Path) -> Source:
-        if file.is_dir():
-            return Source("", [], Names({}, {}, {}), [], {})
-        return self.hashes.source(file, lambda: self._parse(name, file), Source)
+        if file not in self._read:
+            of_folder = Source("", [], Names({}, {}, {}), [], {})
+            self._read[file] = of_folder if file.is_dir() else self.hashes.source(file, lambda: self._parse(name, file), Source)
+        return self._read[file]
 
     @staticmethod
     def _parse(name: str, file: Path) -> Source:
@@ -244,8 +247,13 @@ class Sources:
         }
         packages |= {name: file.parent for name, file in modules.items() if file.name == "__init__.py"}
         packages.pop("", None)  # beside a module that is in no package lies anything
-        files = {f"{name}:{path.relative_to(folder).as_posix()}": path for name, folder in packages.items() for path in _data_files(folder)}
+        files = {f"{name}:{path.relative_to(folder).as_posix()}": path for name, folder in packages.items() for path in self._data_of(folder)}
         return dict(sorted(files.items()))
+
+    def _data_of(self, folder: Path) -> list[Path]:
+        if folder not in self._beside:
+            self._beside[folder] = _data_files(folder)
+        return self._beside[folder]
 
 
 def _with_parents(name: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from factorlib.runner.home import claim
@@ -10,10 +11,15 @@ from factorlib.runner.plan import Planned, Step
 from factorlib.runner.survey import Survey
 from factorlib.runner.views import point, view_of
 
+LONGEST = 85  # bytes of the name of a step's files, to which suffixes are added
 
-def remember(survey: Survey, more: dict[str, str] | None = None) -> None:
-    """Write down which key each step has now; steps of photos and stages that are no more are dropped."""
-    planned = survey.planned(frozenset()) if more is None else []
+
+def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
+    """Write down which key each step has now; steps of photos and stages that are no more are dropped.
+
+    more: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
+    """
+    planned = [] if more is not None else survey.planned(frozenset()) if planned is None else planned
     pipeline, spec = survey.spec.pipeline, survey.spec
     there = {str(step) for stage in pipeline.stages for step in spec.steps_of(stage)}
     over_recipes = tuple(f"{name}/" for name, stage in pipeline.stages.items() if stage.over == "recipe")  # kept: others were asked for before
@@ -57,8 +63,13 @@ def _drop_errors(survey: Survey, planned: list[Planned]) -> None:
 
 
 def label(step: Step) -> str:
-    """The name of a step's own files."""
-    return str(step).replace("/", "-")
+    """The name of a step's own files, short however long the photo's name is.
+
+    >>> label(Step("masks", "kitchen")), len(label(Step("masks", "k" * 240)))
+    ('masks-kitchen', 70)
+    """
+    name = str(step).replace("/", "-")
+    return name if len(name.encode()) <= LONGEST else f"{step.stage[:20]}-{hashlib.sha256(name.encode()).hexdigest()}"
 
 
 def folder_of(survey: Survey, stage: str, outputs: dict[str | None, str]) -> Path:

@@ -28,14 +28,14 @@ def stamps_of(folder: Path) -> dict[str, Stamp]:
     return {name: _stamp(entry) for name, entry in _entries(folder, "")}
 
 
-def _entries(folder: Path, above: str) -> Iterator[tuple[str, os.DirEntry]]:
+def _entries(folder: str | Path, above: str) -> Iterator[tuple[str, os.DirEntry]]:
     try:
         found = [entry for entry in os.scandir(folder) if not left_over(entry.name)]
     except (FileNotFoundError, NotADirectoryError):
         return
     for entry in found:
         if entry.is_dir(follow_symlinks=False):
-            yield from _entries(Path(entry.path), f"{above}{entry.name}/")
+            yield from _entries(entry.path, f"{above}{entry.name}/")
         else:
             yield above + entry.name, entry
 

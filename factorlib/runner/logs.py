@@ -31,7 +31,7 @@ def sound_lines(path: Path) -> list[bytes]:
 
 def warnings_in(path: Path) -> list[str]:
     """What a step warned of."""
-    events: list[dict[str, Any]] = [msgspec.json.decode(line) for line in sound_lines(path)]
+    events: list[dict[str, Any]] = [msgspec.json.decode(line) for line in sound_lines(path) if b"warning" in line]
     return [str(event.get("text", "")) for event in events if event["event"] == "warning"]
 
 

@@ -149,6 +149,25 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
     return msgspec.structs.replace(pipeline, stages=stages)
 
 
+def words_by_key(settings: list[str]) -> dict[str, str]:
+    """Each setting by the key that it stands for in pipeline.yaml: what is wrong with it is said of the setting.
+
+    >>> words_by_key(["solve.lobes=64"])
+    {'stages.solve.params.lobes': 'solve.lobes=64'}
+    """
+    targets = {word: word.partition("=")[0].partition(".") for text in settings for word in _words(text)}
+    return {f"stages.{stage}.params.{keys}": word for word, (stage, _, keys) in targets.items()}
+
+
+def said_of_settings(error: InputError, words: dict[str, str]) -> InputError:
+    """The same error, of the setting where it is about one, not of the file whose value that replaces."""
+    for key, word in reversed(words.items()):
+        if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
+            shown = word if len(word) <= SHOWN else word[:SHOWN] + "…"
+            return InputError(error.found, key=f"SET {shown}", cure=error.cure)
+    return error
+
+
 def _words(text: str) -> list[str]:
     try:
         return shlex.split(text)

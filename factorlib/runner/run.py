@@ -24,6 +24,7 @@ from factorlib.runner.home import claim
 from factorlib.runner.logs import sound_lines
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
+from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey, given_folder
 from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
@@ -87,6 +88,7 @@ class Run:
         self.keys: dict[Step, str | None] = {}
         self.stale = False  # there are results that the plan does not know
         self.made: set[str] = set()  # keys
+        self.shared = shared_store(survey.store.root)
 
     def go(self) -> None:
         """Run all that can run; returns when nothing is running, and what is left waits for a step that failed."""
@@ -176,7 +178,7 @@ class Run:
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
         cores = self.pools.cores if spec.cores == "all" else min(spec.cores, self.pools.cores)
-        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores)
+        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores, self.survey.words)
 
     def _task(self, planned: Planned) -> Task:
         step, data = planned.step, self.survey.data
@@ -203,6 +205,8 @@ class Run:
             temporary=self.folder / label(step),
             events=self.folder / f"{label(step)}.events.jsonl",
             shipped=None if "forced" in planned.reasons else stage.shipped,
+            shared=self.shared,
+            forced="forced" in planned.reasons,
         )
 
     def _folder(self, step: Step, name: str) -> Path:

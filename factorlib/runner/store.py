@@ -117,11 +117,12 @@ class Outputs(Mapping):
         self.store, self.inspector = store, Inspector(store.root)
         self.damaged: dict[str, list[str]] = {}
         self._known: dict[str, str] = {}
+        self._entries: dict[str, Entry | None] = {}
 
     def get(self, key: str, default: Any = None) -> Any:
         """Tree hash of a key; `default` where there is no result, or its tree is damaged (then `damaged` says how)."""
         if key not in self._known:
-            entry = self.store.entry(key)
+            entry = self.entry(key)
             if entry is None:
                 return default
             self.damaged.pop(key, None)
@@ -131,13 +132,22 @@ class Outputs(Mapping):
             self._known[key] = entry.output
         return self._known[key]
 
+    def entry(self, key: str) -> Entry | None:
+        """`Store.entry`, read once."""
+        if self._entries.get(key) is None:  # what is not there yet may come
+            self._entries[key] = self.store.entry(key)
+        return self._entries[key]
+
     def forget(self, key: str) -> None:
         """Look `key` up again when it is asked for next."""
         self._known.pop(key, None)
+        self._entries.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:
         """Whether those keys have the outputs they had, looked up again."""
-        before = {key: self._known.pop(key, None) for key in keys}
+        before = {key: self._known.get(key) for key in keys}
+        for key in before:
+            self.forget(key)
         now = {key: self.get(key) for key in before}
         return None not in now.values() and now == before
 

@@ -18,7 +18,7 @@ from factorlib.runner.defaults import other_than
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
-from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, with_settings
+from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, said_of_settings, with_settings, words_by_key
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project, Recipe
 from factorlib.runner.recipes import asked_for
@@ -34,6 +34,7 @@ class Survey:
     records:  each step's record but for the results it is handed
     recipes:  those that are asked for, by name
     previous: the record each step had when it last was current for this dataset
+    words:    settings of the command line, by the keys of pipeline.yaml that they stand for
     """
 
     project: Project
@@ -45,6 +46,7 @@ class Survey:
     outputs: Outputs
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
+    words: dict[str, str]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
@@ -59,7 +61,11 @@ def survey(
 
     recipes: paths or names of those that are asked for; without any, stages over recipes have no steps
     """
-    pipeline = check_values(with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings), project.pipeline_file)
+    words, pipeline = words_by_key(settings), with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings)
+    try:
+        check_values(pipeline, project.pipeline_file)
+    except InputError as error:
+        raise said_of_settings(error, words) from None
     for name in targets or []:
         if name not in pipeline.stages:
             raise InputError(f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages))
@@ -72,12 +78,16 @@ def survey(
         forced = pipeline.stages if targets is None else targets
         spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
     hashes, packages = FileHashes(store.cache / "files.json"), Packages(store.cache / "packages.json")
-    records = _records(project, spec, data, hashes, packages, asked)
+    try:
+        records = _records(project, spec, data, hashes, packages, asked)
+    except InputError as error:
+        raise said_of_settings(error, words) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
         packages.save()
-    outputs, entries = Outputs(store), {step: store.entry(key) for step, key in _last_keys(home).items()}
-    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked)
+    outputs = Outputs(store)
+    entries = {step: outputs.entry(key) for step, key in _last_keys(home).items()}
+    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked, words)
 
 
 def _last_keys(home: Home) -> dict[str, str]:

@@ -10,26 +10,31 @@ import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.checks import faults, new_faults
-from factorlib.runner.finish import remember, results
+from factorlib.runner.checks import faults, new_faults, wrong_values
+from factorlib.runner.finish import label, remember, results
 from factorlib.runner.home import Home, claim, made_home, made_homes
-from factorlib.runner.logs import warnings_in
+from factorlib.runner.logs import sound_lines, warnings_in
 from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Planned, difference
 from factorlib.runner.project import Project, is_path
 from factorlib.runner.recipes import ALL
+from factorlib.runner.shared import has, shared_store
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
+
+if TYPE_CHECKING:
+    from factorlib.runner.drawing import State
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 
@@ -74,7 +79,7 @@ def _make(project: Project, wish: Wish) -> int:
     whole = wish.targets is None
     planned = seen.planned()
     if all(p.status == "current" for p in planned):
-        remember(seen)
+        remember(seen, planned=planned)
         print(f"{seen.data.folder.name}: nothing to do, all {len(seen.records)} steps are current")
         _name_results(seen, whole)
         return 0
@@ -118,9 +123,9 @@ def _run(seen: Survey, whole: bool, started: float) -> int:
 
 def _name_results(seen: Survey, whole: bool) -> None:
     """Of the whole pipeline what a user looks at first, else the folder of each stage; pictures of recipes either way."""
-    for label, path in results(seen) if whole else ():
+    for what, path in results(seen) if whole else ():
         shown = seen.project.shown(path)
-        print(f"  {label}: {shown}" + ("/*.exr" if path.is_dir() else ""))
+        print(f"  {what}: {shown}" + ("/*.exr" if path.is_dir() else ""))
     for name in seen.spec.targets or ():
         over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
         if over_recipes or not whole:
@@ -129,15 +134,31 @@ def _name_results(seen: Survey, whole: bool) -> None:
 
 
 def show_plan(project: Project, wish: Wish) -> int:
-    """Print what would run."""
-    print("\n".join(words.plan_lines(_looked_at(project, wish).planned())))
-    return 0
+    """Print what would run; 1 where a value of a parameter would not do."""
+    return _shown(project, wish, words.plan_lines)
 
 
 def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run."""
-    print("\n".join(words.why_lines(_looked_at(project, wish).planned())))
+    """Print why each step would run; 1 where a value of a parameter would not do."""
+    return _shown(project, wish, words.why_lines)
+
+
+def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]]) -> int:
+    seen = _looked_at(project, wish)
+    planned = seen.planned()
+    if found := wrong_values(seen, planned):
+        return _refused(seen, found, "parameters")
+    if folder := shared_store(seen.store.root):
+        planned = [_with_shared(p, Store(folder)) for p in planned]
+    print("\n".join(lines(planned)))
     return 0
+
+
+def _with_shared(planned: Planned, shared: Store) -> Planned:
+    """With a word of it where a step need only be copied."""
+    if planned.status == "current" or planned.key is None or "forced" in planned.reasons or not has(shared, planned.key):
+        return planned
+    return msgspec.structs.replace(planned, reasons=[*planned.reasons, "the shared store has it"])
 
 
 def _looked_at(project: Project, wish: Wish) -> Survey:
@@ -173,11 +194,50 @@ def warnings_of(seen: Survey, planned: Planned) -> list[str]:
     return warnings_in(seen.store.log(planned.key))
 
 
-def show_graph(project: Project, mermaid: bool) -> int:
-    """Print the stages and what each takes, as text or as a Mermaid diagram."""
+def show_graph(project: Project, mermaid: bool = False, svg: Path | None = None, wish: Wish | None = None) -> int:
+    """Print the stages and what each takes, as text or as a Mermaid diagram, or draw them.
+
+    svg: file to draw to;  wish: with a data set the drawing has its numbers of photos, and how far each stage is
+    """
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
+    if svg is not None:
+        from factorlib.runner.drawing import drawing
+
+        if svg.suffix.lower() != ".svg":
+            raise InputError("is no name of an SVG file", file=svg, key="SVG", cure="name one, as in SVG=build/graph.svg")
+        svg.parent.mkdir(parents=True, exist_ok=True)
+        write_text(svg, drawing(pipeline, states_of(surveyed(project, wish)) if wish else None))
+        print(f"graph: {project.shown(svg)}")
+        return 0
     print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
     return 0
+
+
+def states_of(seen: Survey) -> dict[str, State]:
+    """How far each stage of a survey is, for a drawing."""
+    from factorlib.runner.drawing import State
+
+    planned: dict[str, list[str]] = {}
+    for p in seen.planned():
+        planned.setdefault(p.step.stage, []).append("running" if p.key and p.status != "current" and is_running(seen, p) else p.status)
+    return {stage: State(len(found), {status: found.count(status) for status in dict.fromkeys(found)}) for stage, found in planned.items()}
+
+
+def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
+    """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
+    seen = _looked_at(project, wish)
+    found = [p for p in seen.planned() if (not wish.targets or p.step.stage in wish.targets) and photo in (None, p.step.of)]
+    if not found:
+        known = [name for name in [*seen.data.photos, *seen.recipes] if name]
+        raise InputError(f"no step is of {photo!r}", key="PHOTO", cure=did_you_mean(str(photo), known))
+    print("\n".join(words.log_lines([_logged(seen, p) for p in found])))
+    return 0
+
+
+def _logged(seen: Survey, planned: Planned) -> words.Logged:
+    events = [msgspec.json.decode(line) for line in sound_lines(seen.store.log(planned.key))] if planned.status == "current" else []
+    error = seen.home.errors / f"{label(planned.step)}.txt"
+    return words.Logged(planned, events, seen.project.shown(error) if error.is_file() else None)
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
@@ -239,6 +299,8 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes
     """
     seen = survey(project, dataset, None, settings)
+    if found := wrong_values(seen, seen.planned()):
+        return _refused(seen, found, "parameters")
     if found := faults(seen, seen.records):
         return _refused(seen, found)
     print(
@@ -256,11 +318,11 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     return 0
 
 
-def _refused(seen: Survey, found: list[InputError]) -> int:
+def _refused(seen: Survey, found: list[InputError], where: str = "files") -> int:
     """Every fault at once, before anything has run."""
     for fault in found:
         print(f"error: {fault}", file=sys.stderr)
-    print(f"{seen.data.folder.name}: {len(found)} {'fault' if len(found) == 1 else 'faults'} in its files; nothing was run", file=sys.stderr)
+    print(f"{seen.data.folder.name}: {len(found)} {'fault' if len(found) == 1 else 'faults'} in its {where}; nothing was run", file=sys.stderr)
     return 1
 
 

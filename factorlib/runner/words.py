@@ -7,15 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec import structs
 
 from factorlib.runner.params import Parameter
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.verify import Verdict
 
 if TYPE_CHECKING:
     from factorlib.runner.gc import Unneeded
+    from factorlib.runner.verify import Verdict
 
 SHOWN = 8  # reasons of one step that are written out
 
@@ -86,6 +87,50 @@ def mermaid_lines(pipeline: Pipeline) -> list[str]:
     edges = [f"  {above} --> {name}" for name in pipeline.order() for above in pipeline.stages[name].upstream]
     nodes = [f"  {name}[[{name}]]" if pipeline.stages[name].over else f"  {name}[{name}]" for name in pipeline.order()]
     return ["graph TD", *nodes, *edges]
+
+
+class Logged(msgspec.Struct, frozen=True):
+    """A step with the events of its result's log, and the file that says by which defect it failed."""
+
+    planned: Planned
+    events: list[dict]
+    failed: str | None
+
+
+def log_lines(logged: list[Logged]) -> list[str]:
+    """Of each step what it cost, what it was made with where that is not as for the step above, and what it warned of."""
+    lines, last = [], None
+    for one in logged:
+        lines.append(f"{one.planned.step!s:<26} {_cost(one)}".rstrip())
+        if one.planned.status == "current" and (made_with := _made_with(one)) != last:
+            unbroken = made_with.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")  # a name and its version
+            wrapped = textwrap.wrap(unbroken, 110, initial_indent="    ", subsequent_indent="    ")
+            lines += [line.replace("\N{NO-BREAK SPACE}", " ") for line in wrapped]
+            last = made_with
+        lines += [f"    warning: {event.get('text', '')}" for event in one.events if event["event"] == "warning"]
+        lines += [f"    it failed by a defect of the program: {one.failed}"] if one.failed else []
+    return lines
+
+
+def _cost(logged: Logged) -> str:
+    done = next((event for event in reversed(logged.events) if event["event"] == "done"), None)
+    if logged.planned.status != "current":
+        return f"{logged.planned.status}: {_short(logged.planned.reasons)}"
+    if done is None:
+        return "its log is not there"
+    if done.get("shared"):
+        return "from the shared store, without its log"
+    cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
+    return f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
+
+
+def _made_with(logged: Logged) -> str:
+    """Python, the machine's kind and the packages whose versions count."""
+    record = logged.planned.record or {}
+    machine = next((event["machine"] for event in reversed(logged.events) if "machine" in event), {})
+    packages = [f"{name.removeprefix('package:')} {version}" for name, version in sorted(record.items()) if name.startswith("package:")]
+    python = f"Python {machine.get('python', record.get('python', ''))}"
+    return ", ".join([python, *([f"{machine['system']} {machine['processor']}"] if machine else []), *packages])
 
 
 def _alike(planned: list[Planned]) -> list[list[Planned]]:

@@ -31,9 +31,11 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.integrity import Stamp, stamps_of
-from factorlib.runner.pipeline import Shipping
+from factorlib.runner.logs import warnings_in
+from factorlib.runner.pipeline import Shipping, said_of_settings
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.shared import fetch, offer
 from factorlib.runner.shipped import copy_shipped, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Store
@@ -49,6 +51,7 @@ class Code(msgspec.Struct, frozen=True):
     """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
+    words: settings of the command line, by the keys that they stand for
     """
 
     root: Path
@@ -58,6 +61,7 @@ class Code(msgspec.Struct, frozen=True):
     settings: Path
     threads: int = 1
     cores: int = 1
+    words: dict[str, str] = {}
 
     @property
     def taken(self) -> int:
@@ -70,6 +74,7 @@ class Task(msgspec.Struct, frozen=True):
 
     hashes:  of the dataset's files, as they were when the key was made
     shipped: where the package may have the result already; None where it is to be made in any case
+    shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
     """
 
     code: Code
@@ -87,6 +92,8 @@ class Task(msgspec.Struct, frozen=True):
     temporary: Path
     events: Path
     shipped: Shipping | None = None
+    shared: Path | None = None
+    forced: bool = False
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -105,10 +112,15 @@ def run_step(task: Task) -> Outcome:
     meter = Meter()
     with Events(task) as events:
         try:
+            if found := _fetched(task, events):
+                _keep(task, found[0])
+                return Outcome(output=found[0].output, damaged=found[1], seconds=meter.read(0, 0)["seconds"])
             entry, damaged = _made(task, events)
             cost = meter.read(task.code.threads, task.code.cores)
             _write_log(task, events, cost)
             _keep(task, entry)
+            if task.shared:
+                offer(Store(task.store), Store(task.shared), task.key, entry, events.say)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
@@ -122,6 +134,16 @@ def check_params(code: Code) -> Outcome:
         return Outcome()
     except BaseException as error:
         return _failed(error, code.root)
+
+
+def value_fault(code: Code) -> InputError | None:
+    """What is wrong with the parameters, in this process; a stage that cannot be loaded says so when it is run."""
+    with contextlib.suppress(ImportError):
+        try:
+            params_of(load_stage(code), code)
+        except InputError as error:
+            return error
+    return None
 
 
 def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
@@ -151,7 +173,10 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
 
 def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
     """The stage's parameters as its own struct, every bound checked."""
-    return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
+    try:
+        return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
+    except InputError as error:
+        raise said_of_settings(error, code.words) from None
 
 
 def limit_threads(threads: int) -> None:
@@ -196,6 +221,19 @@ def _run_main(
         _check_files_still(task)
         _check_results_still(results)
         raise
+
+
+def _fetched(task: Task, events: Events) -> tuple[Entry, Path | None] | None:
+    """The result as others have made it, and what they were warned of; None where it is to be made here."""
+    if task.shared is None or task.forced:
+        return None
+    store = Store(task.store)
+    found = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
+    for text in warnings_in(store.log(task.key)) if found else ():
+        events.say(text)
+    if found and not store.log(task.key).exists():
+        _write_log(task, events, {"seconds": 0.0, "shared": True})
+    return found
 
 
 def _keep(task: Task, entry: Entry) -> None:
@@ -286,6 +324,10 @@ class Events(logging.Handler):
         if text not in self.warnings:
             self.warnings.append(text)
             self._say({"warning": text})
+
+    def say(self, text: str) -> None:
+        """A warning that is no part of the result's log."""
+        self._say({"warning": text})
 
     def _say(self, event: dict) -> None:
         """On a full disk nothing more is said: the step itself fails there, or finds room again."""

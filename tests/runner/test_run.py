@@ -138,8 +138,46 @@ def test_a_setting_nobody_takes_is_refused_at_once(project, setting, words):
 def test_a_value_out_of_bounds_is_refused_before_anything_runs(project, capsys, setting):
     before = ran(project)
     assert make(project, settings=[setting]) == 1
-    assert f"stages.{setting.split('=')[0].replace('.', '.params.')}" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"SET {setting}: " in said and "pipeline.yaml" not in said
     assert ran(project) == before
+
+
+@pytest.mark.parametrize("setting", ["upper.times=0", "upper.times=two", "table.scale=1.5"])
+@pytest.mark.parametrize("verb", [verbs.show_plan, verbs.show_why])
+def test_a_plan_checks_values_and_says_who_gave_them(project, capsys, verb, setting):
+    assert verb(project, verbs.Wish("set", settings=[setting])) == 1
+    said = capsys.readouterr()
+    assert f"error: SET {setting}: " in said.err and "pipeline.yaml" not in said.err and not said.out
+    name, value = setting.split("=")
+    stage, param = name.split(".")
+    of_file = {"upper": toy.PIPELINE.replace("[dataset.photo], ", f"[dataset.photo], params: {{{param}: {value}}}, "),
+               "table": toy.PIPELINE.replace("table: {}", f"table: {{params: {{{param}: {value}}}}}")}  # fmt: skip
+    write(project.root / "pipeline.yaml", of_file[stage])
+    assert verb(project, verbs.Wish("set")) == 1
+    said = capsys.readouterr().err
+    assert "pipeline.yaml: " in said and f"stages.{stage}.params.{param}: " in said and "SET" not in said
+
+
+def test_an_unknown_parameter_of_a_setting_is_said_of_the_setting(project):
+    with pytest.raises(InputError) as caught:
+        verbs.show_plan(project, verbs.Wish("set", settings=["table.scael=3"]))
+    assert str(caught.value).startswith("SET table.scael=3: ")
+
+
+def test_a_name_as_long_as_the_file_system_allows_is_as_good_as_a_short_one(tmp_path, capsys):
+    long = ["k" * 239 + end for end in "ab"]
+    project = make_project(tmp_path, **{long[0]: "Alpha", long[1]: "1/0"})
+    write(project.root / "stages" / "count.py", toy.COUNT.replace("import json", "import json\nassert True", 1).replace(
+        "    (out", "    assert not inputs.photo.endswith('b')\n    (out"))  # fmt: skip
+    assert make(project) == 1
+    assert (project.build / "set" / "upper" / f"{long[0]}.txt").read_text() == "ALPHA"
+    assert state(project)[f"count/{long[0]}"] == "current" and "AssertionError" in capsys.readouterr().err
+    assert len(list((project.build / "set" / "errors").iterdir())) == 1
+    write(project.root / "stages" / "count.py", toy.COUNT)
+    assert make(project) == 0 and not (project.build / "set" / "errors").exists()
+    places = [path for path in (project.build / "store").rglob("*") if "kkk" in str(path) and path.name.startswith("k") is False]
+    assert places == []
 
 
 def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
