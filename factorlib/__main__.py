@@ -198,6 +198,18 @@ def gc(force: Annotated[bool, typer.Option("--force", help="without asking; as F
     raise typer.Exit(verbs.collect(project(), lambda: not ask or typer.confirm("delete them?")))
 
 
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def worker(
+    context: typer.Context,
+    scheduler: Annotated[str, typer.Argument(help="its address, as tcp://10.0.0.1:8786")],
+    cores: Annotated[int | None, typer.Option(min=1, help="that it computes on; default: all of this machine")] = None,
+) -> None:
+    """Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md)."""
+    from factorlib.runner.cluster import start_worker
+
+    start_worker(scheduler, cores, context.args)
+
+
 @app.command()
 def ship(stage: str, dataset: Dataset = None) -> None:
     """Put a stage's current result into the package (for those who change the stage)."""
