@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import forced, switched_on
+from factorlib.__main__ import chosen, forced, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.pipeline import executor_words
 from factorlib.runner.stop import heed_stops
 from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK
@@ -27,14 +28,14 @@ def run(
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
     force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
 ) -> None:
-    """Run studies, as far as anything must run."""
+    """Run studies, as far as anything must run; SET="executor=dask scheduler=tcp://…" says where."""
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
     project = studies(QUICK if switched_on("QUICK", quick) else FULL)
     for name in named:
         project.dataset_folder(name)
-    raise typer.Exit(make(project, named or list(STUDIES), forced(force)))
+    raise typer.Exit(make(project, named or list(STUDIES), forced(force), executor_words(chosen(None))))
 
 
 def main() -> None:

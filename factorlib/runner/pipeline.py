@@ -176,6 +176,20 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
     return msgspec.structs.replace(pipeline, stages=stages)
 
 
+def executor_words(settings: list[str]) -> list[str]:
+    """Settings of a run whose stages take none: where it runs.  InputError for any other.
+
+    >>> executor_words(["executor=dask scheduler=tcp://10.0.0.1:8786"])
+    ['executor=dask', 'scheduler=tcp://10.0.0.1:8786']
+    """
+    words = [word for text in settings for word in _words(text)]
+    for word in words:
+        if not _is_of_executor(word):
+            cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
+            raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
+    return words
+
+
 def _is_of_executor(word: str) -> bool:
     return word.startswith(("executor=", "scheduler="))
 
