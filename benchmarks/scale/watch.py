@@ -56,7 +56,7 @@ class Watch:
     def _look(self) -> None:
         together = 0.0
         for pid in _offspring(os.getpid()):
-            with contextlib.suppress(OSError, ValueError, IndexError):
+            with contextlib.suppress(OSError, ValueError, LookupError):
                 fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
                 status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
                 command = Path(f"/proc/{pid}/cmdline").read_text()
