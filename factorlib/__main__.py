@@ -214,6 +214,25 @@ def agreed(force: bool) -> bool:
     return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
+def _cores(word: str) -> int:
+    if not word.isdigit() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"{word!r} is no number of cores: a whole number from 1")
+    return int(word)
+
+
+@verb(
+    "worker",
+    _option("scheduler", help="its address, as tcp://10.0.0.1:8786"),
+    _option("--cores", type=_cores, help="that it computes on; default: all of this machine"),
+)
+def worker(asked: argparse.Namespace) -> int:
+    """Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md)."""
+    from factorlib.runner.cluster import start_worker
+
+    start_worker(asked.scheduler, asked.cores, asked.further)
+    return 0
+
+
 @verb("ship", _option("stage"), DATASET)
 def ship(asked: argparse.Namespace) -> int:
     """Put a stage's current result into the package (for those who change the stage)."""
@@ -239,7 +258,11 @@ def run(words: list[str], program: str) -> int:
     """What the verb of the command line returns.  A first word that is neither an option nor a verb is read as `stage <word>`."""
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
-    asked = parser(program).parse_args(words or ["--help"])
+    known = parser(program)
+    asked, further = known.parse_known_args(words or ["--help"])
+    if further and asked.run is not worker:
+        known.error(f"unrecognized arguments: {' '.join(further)}")
+    asked.further = further
     return asked.run(asked)
 
 

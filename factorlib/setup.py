@@ -3,7 +3,7 @@
 Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
-    .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="blender interchange": extras of pyproject.toml, into .venv)
+    .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ PROBE_SECONDS = 5
 PARTS = 3  # installations at once, PyTorch alone in one of them
 BEAT = 3.0  # seconds between two signs of life
 LOADED = ("torch, scipy.optimize, mitsuba, pytest", "open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress, typer")
+ALONE = ("blender", "interchange")  # extras: .venv has what they need, and bpy would ask for an older NumPy
 LIBRARIES = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}  # of Open3D
 
 
@@ -55,12 +56,14 @@ def main() -> None:
 
 
 def install_extras() -> None:
-    """EXTRAS of pyproject.toml, each package alone: .venv has what they need, and bpy would ask for an older NumPy."""
+    """EXTRAS of pyproject.toml: those that are ALONE without what they ask for, the others with it, but no package of the lock moves."""
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     asked = os.environ.get("EXTRAS", "").replace(",", " ").split()
     if unknown := [name for name in asked if name not in known]:
         sys.exit(f"set-up: there is no extra {unknown[0]!r} in pyproject.toml; there are {', '.join(known)}")
-    pip("install", "--no-deps", *(package for name in asked for package in known[name]))
+    for how, names in ((["--no-deps"], [name for name in asked if name in ALONE]), (["-c", str(LOCK)], [name for name in asked if name not in ALONE])):
+        if names:
+            pip("install", *how, *(package for name in names for package in known[name]))
 
 
 def say(text: str) -> None:

@@ -11,9 +11,10 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import agreed, forced, switched_on
+from factorlib.__main__ import agreed, chosen, forced, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
+from factorlib.runner.pipeline import executor_words
 from factorlib.runner.stop import heed_stops
 from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK
@@ -32,7 +33,7 @@ def run(
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
-    """Run studies, as far as anything must run."""
+    """Run studies, as far as anything must run; SET="executor=dask scheduler=tcp://…" says where."""
     if gc:
         raise typer.Exit(collect(lambda: agreed(force)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
@@ -43,7 +44,7 @@ def run(
         project.dataset_folder(name)
     if clean:
         raise typer.Exit(forget(project, named or list(STUDIES)))
-    raise typer.Exit(make(project, named or list(STUDIES), forced(force)))
+    raise typer.Exit(make(project, named or list(STUDIES), forced(force), executor_words(chosen(None))))
 
 
 def main() -> None:

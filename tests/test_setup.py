@@ -41,6 +41,16 @@ def test_extras_are_installed_alone(monkeypatch):
     assert [package.split("=")[0].split(">")[0] for package in packages] == ["bpy", "MaterialX", "usd-core"]
 
 
+def test_an_extra_with_packages_of_its_own_gets_them_and_moves_none_of_the_lock(monkeypatch):
+    called = []
+    monkeypatch.setattr(setup, "pip", lambda *words: called.append(words))
+    monkeypatch.setenv("EXTRAS", "dask blender")
+    setup.install_extras()
+    alone, (command, how, lock, *packages) = called
+    assert alone[1] == "--no-deps" and (command, how, lock) == ("install", "-c", str(setup.LOCK))
+    assert [package.split(">")[0] for package in packages] == ["cloudpickle", "dask-jobqueue", "distributed"]
+
+
 def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
     monkeypatch.setenv("EXTRAS", "blunder")
     with pytest.raises(SystemExit, match=r"'blunder'.*blender, interchange"):

@@ -26,7 +26,7 @@ class Pools:
     """Executors by number of threads; `free` says whether a step that needs so many cores may start now."""
 
     def __init__(self, cores: int | None = None):
-        self.cores = cores or _cores()
+        self.cores = cores or machine_cores()
         self._spare: dict[int, list[Executor]] = {}
         self._busy: dict[Future, tuple[int, Executor]] = {}
 
@@ -65,7 +65,8 @@ class Pools:
             executor.shutdown(wait=True)
 
 
-def _cores() -> int:
+def machine_cores() -> int:
+    """The processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -21,6 +21,9 @@ SHOWN = 80  # characters of a setting that messages repeat
 LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
+PROCESSES, DASK = "processes", "dask"
+EXECUTORS = (PROCESSES, DASK)
+ADDRESS = re.compile(r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+")
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -81,10 +84,16 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """pipeline.yaml."""
+    """pipeline.yaml.
+
+    executor:  where steps run, which changes no bit and no key: `processes` of this machine, or the workers of a cluster of `dask`
+    scheduler: the address of that cluster's scheduler; without one, a cluster of this machine's cores
+    """
 
     format: int
     stages: dict[str, Stage]
+    executor: str = PROCESSES
+    scheduler: str | None = None
 
     def order(self) -> list[str]:
         """Stages, each after what it takes; otherwise as they stand in the file."""
@@ -108,6 +117,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     pipeline = read_yaml(path, Pipeline)
     if pipeline.format != FORMAT:
         raise InputError(f"format {pipeline.format} is not known", file=path, key="format", cure=f"this version reads format: {FORMAT}")
+    _check_executor(pipeline, path, "")
     for name, stage in pipeline.stages.items():
         _check_stage(name, stage, pipeline, known_slices, path)
     try:
@@ -118,6 +128,20 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
             f"stages that need each other: {circle}", file=path, key="stages", cure="make the second pass a stage of its own"
         ) from None
     return pipeline
+
+
+def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
+    if pipeline.executor not in EXECUTORS:
+        shown = repr(pipeline.executor[:SHOWN])
+        raise InputError(f"there is no executor {shown}", file=file, key=f"{prefix}executor", cure=did_you_mean(pipeline.executor, EXECUTORS))
+    if pipeline.scheduler is None:
+        return
+    if pipeline.executor != DASK:
+        cure = "add executor: dask" if file else 'write SET="executor=dask scheduler=…"'
+        raise InputError("only Dask has a scheduler", file=file, key=f"{prefix}scheduler", cure=cure)
+    if not ADDRESS.fullmatch(pipeline.scheduler):
+        shown = repr(pipeline.scheduler[:SHOWN])
+        raise InputError(f"{shown} is no address", file=file, key=f"{prefix}scheduler", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786")
 
 
 def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
@@ -137,13 +161,16 @@ def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tupl
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
-    """The pipeline with `stage.parameter=value` words in place of its own; several words in one string are split.
+    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…` and `scheduler=…`; several words
+    in one string are split.
 
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
     """
+    words = [word for text in settings for word in _words(text)]
+    pipeline = _with_executor(pipeline, [word for word in words if _is_of_executor(word)])
     stages = dict(pipeline.stages)
-    for word in (word for text in settings for word in _words(text)):
+    for word in (word for word in words if not _is_of_executor(word)):
         stage, keys, value = _setting(word, stages)
         stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
     return msgspec.structs.replace(pipeline, stages=stages)
@@ -168,6 +195,36 @@ def said_of_settings(error: InputError, words: dict[str, str]) -> InputError:
     return error
 
 
+def executor_words(settings: list[str]) -> list[str]:
+    """Settings of a run whose stages take none: where it runs.  InputError for any other.
+
+    >>> executor_words(["executor=dask scheduler=tcp://10.0.0.1:8786"])
+    ['executor=dask', 'scheduler=tcp://10.0.0.1:8786']
+    """
+    words = [word for text in settings for word in _words(text)]
+    for word in words:
+        if not _is_of_executor(word):
+            cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
+            raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
+    return words
+
+
+def _is_of_executor(word: str) -> bool:
+    return word.startswith(("executor=", "scheduler="))
+
+
+def _with_executor(pipeline: Pipeline, words: list[str]) -> Pipeline:
+    """The last word of each kind counts; `executor=processes` drops the scheduler of pipeline.yaml."""
+    given = dict(word.split("=", 1) for word in words)
+    if not given:
+        return pipeline
+    kept = None if given.get("executor") == PROCESSES else pipeline.scheduler
+    scheduler = given.get("scheduler", kept) or None
+    found = msgspec.structs.replace(pipeline, executor=given.get("executor", pipeline.executor), scheduler=scheduler)
+    _check_executor(found, None, "SET ")
+    return found
+
+
 def _words(text: str) -> list[str]:
     try:
         return shlex.split(text)
@@ -180,13 +237,18 @@ def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
     stage, *keys = target.split(".")
     shown = word if len(word) <= SHOWN else word[:SHOWN] + "…"
     if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
-        raise InputError(f"{shown!r} is no setting", key="SET", cure='write stage.parameter=value, as in SET="solve.lobes=64"')
+        raise InputError(f"{shown!r} is no setting", key="SET", cure=_how(target, keys))
     if stage not in stages:
         raise InputError(f"there is no stage {stage!r}", key=f"SET {shown}", cure=did_you_mean(stage, stages))
     try:
         return stage, keys, parse_yaml(value, f"SET {shown}")
     except (ValueError, RecursionError) as error:  # thousands of digits or brackets
         raise InputError(f"not readable as a value ({error})", key=f"SET {shown}", cure="write a number, a word, or a short list") from error
+
+
+def _how(target: str, keys: list[str]) -> str:
+    near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
+    return near if near.startswith("did") else 'write stage.parameter=value, as in SET="solve.lobes=64"'
 
 
 def check_values(pipeline: Pipeline, file: Path) -> Pipeline:

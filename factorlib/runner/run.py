@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
@@ -22,7 +24,7 @@ from factorlib.runner.executors import Pools
 from factorlib.runner.finish import label, remember
 from factorlib.runner.home import claim
 from factorlib.runner.logs import sound_lines
-from factorlib.runner.pipeline import DATASET
+from factorlib.runner.pipeline import DASK, DATASET, Pipeline
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey, given_folder
@@ -30,6 +32,9 @@ from factorlib.runner.tenancy import tenant
 from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
+
+if TYPE_CHECKING:
+    from factorlib.runner.cluster import Cluster
 
 POLL = 0.1  # seconds between two looks at what the workers say
 
@@ -55,11 +60,12 @@ class Tally:
     seconds: float = 0.0
 
 
-def run(survey: Survey, display: Display, pools: Pools | None = None) -> Tally:
+def run(survey: Survey, display: Display, pools: Pools | Cluster | None = None) -> Tally:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
-    pools, started = pools or Pools(), time.perf_counter()
+    started = time.perf_counter()
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
+        pools = pools or pools_for(survey.spec.pipeline, folder, display.say)
         work = Run(survey, display, pools, folder)
         try:
             work.check()
@@ -75,10 +81,19 @@ def run(survey: Survey, display: Display, pools: Pools | None = None) -> Tally:
     return work.tally
 
 
+def pools_for(pipeline: Pipeline, folder: Path, say: Callable[[str], None]) -> Pools | Cluster:
+    """Where the steps of a run with that folder run: processes of this machine, or a Dask cluster, which is loaded only then."""
+    if pipeline.executor != DASK:
+        return Pools()
+    from factorlib.runner.cluster import Cluster
+
+    return Cluster(pipeline.scheduler, folder, say)
+
+
 class Run:
     """The state of one run."""
 
-    def __init__(self, survey: Survey, display: Display, pools: Pools, folder: Path):
+    def __init__(self, survey: Survey, display: Display, pools: Pools | Cluster, folder: Path):
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()
@@ -257,7 +272,10 @@ class Run:
         whole = text[: text.rfind(b"\n") + 1]
         work.read += len(whole)
         for line in whole.splitlines():
-            event = json.loads(line)
+            try:
+                event = json.loads(line)
+            except ValueError:  # cut where a try of the step was killed
+                continue
             if "warning" in event:
                 self.display.warn(work.planned.step, event["warning"])
             else:

@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -107,16 +107,29 @@ class Outcome(msgspec.Struct, frozen=True):
     seconds: float = 0.0
 
 
-def run_step(task: Task) -> Outcome:
-    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
+class Spread(Protocol):
+    """An ordered map over independent work, and what of it was spent outside this process: `cpu_seconds`, and whatever else is worth a log."""
+
+    spent: dict[str, float]
+
+    def __call__(self, function: Callable, items: Iterable) -> list: ...
+
+
+def run_step(task: Task, spread_over: Spread | None = None) -> Outcome:
+    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome.
+
+    spread_over: where its independent work goes; without, over threads of this process
+    """
     meter = Meter()
     with Events(task) as events:
         try:
             if found := _fetched(task, events):
                 _keep(task, found[0])
                 return Outcome(output=found[0].output, damaged=found[1], seconds=meter.read(0, 0)["seconds"])
-            entry, damaged = _made(task, events)
+            entry, damaged = _made(task, events, spread_over or partial(spread, task.code.cores))
             cost = meter.read(task.code.threads, task.code.cores)
+            if spread_over is not None:
+                cost |= {"cpu_seconds": round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3), "spread": spread_over.spent}
             _write_log(task, events, cost)
             _keep(task, entry)
             if task.shared:
@@ -189,7 +202,7 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
+def _made(task: Task, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
     """Run the step; its tree is in the store afterwards, its key is not."""
     module = load_stage(task.code)
     params = params_of(module, task.code)
@@ -199,7 +212,7 @@ def _made(task: Task, events: Events) -> tuple[Entry, Path | None]:
     _check_code_still(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
-    inputs = Inputs(task.folders, task.facts, task.files, task.photo, partial(spread, task.code.cores), task.log, unfinished)
+    inputs = Inputs(task.folders, task.facts, task.files, task.photo, map_, task.log, unfinished)
     if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
         copy_shipped(folder, task.temporary)
     else:

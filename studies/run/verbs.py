@@ -14,20 +14,22 @@ from studies.core.study import FULL, QUICK
 from studies.run.project import FINISHED, Studies, studies
 
 
-def make(project: Studies, names: list[str], force: bool = False) -> int:
+def make(project: Studies, names: list[str], force: bool = False, settings: list[str] | None = None) -> int:
     """Run studies as far as anything must run; their results and the page are under `project.build` afterwards.
+
+    settings: where their steps run, as `executor=dask`
 
     A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
     """
-    codes = [_make(project, name, force) for name in names]
+    codes = [_make(project, name, force, settings or []) for name in names]
     return next((code for code in codes if code), 0)
 
 
-def _make(studies_: Studies, name: str, force: bool) -> int:
+def _make(studies_: Studies, name: str, force: bool, settings: list[str]) -> int:
     project = studies(studies_.scale, studies_.root, STUDIES[name].kind)
     if project.scale.name == "quick":
         print(f"{name}: quick: one seed, smallest sets: no conclusion")
-    code = verbs.make(project, verbs.Wish(name, force=force))
+    code = verbs.make(project, verbs.Wish(name, settings=settings, force=force))
     if code == 0:
         home = project.build / name
         for file in FINISHED:

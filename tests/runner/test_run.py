@@ -414,7 +414,7 @@ def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machin
 
 @pytest.mark.parametrize("cores, expected", [("all", 2), ("1", 1), ("64", 2)])
 def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(tmp_path, monkeypatch, cores, expected):
-    monkeypatch.setattr("factorlib.runner.executors._cores", lambda: 2)
+    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 2)
     project = make_project(tmp_path)
     many = "len(set(inputs.map(lambda _: (__import__('time').sleep(0.1), __import__('threading').get_ident())[1], range(6))))"
     write(tmp_path / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", f"str({many})"))

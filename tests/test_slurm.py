@@ -1,0 +1,82 @@
+"""The worked example for Slurm, docs/slurm.py: the job script that it generates, shown in docs/distributed.md, starts a worker that serves a run."""
+
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("dask_jobqueue", reason="make setup EXTRAS=dask")
+
+from factorlib.runner import verbs
+from factorlib.runner.project import LIBRARY
+from tests.runner import toy
+from tests.runner.toy import files_of
+
+SLURM = LIBRARY / "docs" / "slurm.py"
+
+
+@pytest.fixture(scope="module")
+def example():
+    return runpy.run_path(str(SLURM))
+
+
+@pytest.fixture
+def cluster(example, tmp_path):
+    options = {"dashboard_address": ":0", "host": "127.0.0.1"}
+    with example["slurm_cluster"](scheduler_options=options, log_directory=str(tmp_path)) as found:
+        yield found
+
+
+def without_address(script):
+    return re.sub(r"tcp://\S+", "tcp://<scheduler>", script).replace(str(LIBRARY), "<checkout>").strip()
+
+
+def test_the_job_script_asks_slurm_for_what_the_example_says_and_its_worker_declares_its_cores(cluster, example):
+    script = cluster.job_script()
+    for line in ("#SBATCH -p compute", "#SBATCH -A my-project", "#SBATCH --cpus-per-task=16", "#SBATCH -t 08:00:00"):
+        assert line in script.splitlines(), script
+    command = script.strip().splitlines()[-1]
+    assert command.startswith(f"{LIBRARY}/.venv/bin/python -m distributed.cli.dask_worker {cluster.scheduler_address} ")
+    assert "--nthreads 16" in command and "--resources cores=16" in command and "--memory-limit 0" in command
+
+
+def test_the_job_script_of_the_docs_is_the_one_that_is_generated(example):
+    with example["slurm_cluster"](scheduler_options={"dashboard_address": ":0", "host": "127.0.0.1"}) as found:
+        script = without_address(found.job_script())
+    assert script in (LIBRARY / "docs" / "distributed.md").read_text()
+
+
+def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(cluster, tmp_path):
+    """Every line of it but the interpreter's path, which is that of the tests."""
+    script = cluster.job_script().replace(f"{LIBRARY}/.venv/bin/python", sys.executable)
+    project = toy.make_project(tmp_path / "root")
+    other = toy.copy(project, tmp_path / "beside")
+    job = subprocess.Popen(["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True)
+    try:
+        settings = ["executor=dask", f"scheduler={cluster.scheduler_address}"]
+        assert verbs.make(project, verbs.Wish("set", settings=settings)) == 0
+    finally:
+        os.killpg(job.pid, signal.SIGTERM)
+        job.wait(60)
+    assert verbs.make(other, verbs.Wish("set")) == 0
+    assert files_of(project.build / "store" / "trees") == files_of(other.build / "store" / "trees")
+
+
+def test_the_example_hands_the_run_its_schedulers_address_and_ends_as_the_run_does(example, monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(sys, "argv", ["slurm.py", "eames", "solve.lobes=64"])
+    monkeypatch.setattr(subprocess, "call", lambda command, cwd: called.append((command, cwd)) or 3)
+    jobs = tmp_path / "jobs"
+    for name, text in {"sbatch": f"echo asked >> {jobs}; echo Submitted batch job 1", "scancel": ":"}.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert example["main"]() == 3
+    ((command, cwd),) = called
+    assert command[:3] == ["make", "all", "DATASET=eames"] and cwd == LIBRARY
+    assert re.fullmatch(r"SET=executor=dask scheduler=tcp://\S+:\d+ solve.lobes=64", command[3])
+
