@@ -275,6 +275,9 @@ def main() -> NoReturn:
             sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
+    except BrokenPipeError:  # whoever reads has enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that the flush at exit says nothing
+        sys.exit(1)
     except OSError as error:
         _stop_at(error)
 

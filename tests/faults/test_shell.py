@@ -1,4 +1,4 @@
-"""What is given to make as NAME=value reaches programs as it was written, whatever make and the shell would read in it."""
+"""What is given to make as NAME=value reaches programs as it was written, whatever make and the shell would read in it; closed pipes."""
 
 import json
 import os
@@ -117,3 +117,10 @@ def test_a_folder_with_any_name_is_a_dataset(checkout):
         assert (checkout / "build" / ODD / "masks" / "photos.json").exists()
         assert make(checkout, "status", words[0]).stdout.startswith("masks      3 current")
     assert make(checkout, "clean", f"DATASET={folder}").returncode == 0 and not (checkout / "build" / ODD).exists()
+
+
+def test_who_reads_no_further_gets_no_traceback():
+    """As `make params | head -1` does."""
+    process = subprocess.Popen([sys.executable, "-m", "factorlib", "params"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 1
