@@ -75,7 +75,7 @@ def check(what, stage, project, done, wanted):
     assert "Traceback" not in said and "defect" not in said
     assert not any((project.build / "store" / "tmp").iterdir()) and stage not in {step.partition("/")[0] for step in battered.kept(project).values()}
     losses = lost_in(project, wanted)
-    note("faults", {"disk": "a disk that is full", "quota": "a quota that is used up", "limit": "a limit on the size of files"}[what], 1, bool(losses), stages={stage: 1})
+    note("faults", {"disk": "a disk that is full", "quota": "a quota that is used up", "limit": "a limit on the size of files"}[what], 1, int(bool(losses)), stages={stage: 1})
     assert not losses
 
 
@@ -149,5 +149,5 @@ def test_wherever_a_quota_ends_nothing_is_lost(tmp_path, left):
     done = run(project, env={"LD_PRELOAD": str(library), "QUOTA_FOLDER": str(project.build), "QUOTA_FILE": str(file)})
     said = WORDS["quota"] in done.stdout or done.returncode == 0
     losses = [*([] if said else [done.stdout]), *lost_in(project, results(usual))]
-    note("faults", "a quota that ends anywhere", 1, bool(losses))
+    note("faults", "a quota that ends anywhere", 1, int(bool(losses)))
     assert not losses
