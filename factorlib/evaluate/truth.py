@@ -23,7 +23,7 @@ def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
     if not finite.all():
         found = f"{int((~finite).any(axis=-1).sum())} texels are NaN or infinite"
         raise InputError(found, file=path, key=key, cure="render the map again")
-    if radiance.min() < LEAST * np.abs(radiance).mean():
+    if radiance.min() < LEAST * np.abs(radiance).mean(dtype=float):
         found = f"a radiance of {radiance.min():.4g} is less than 0"
         raise InputError(found, file=path, key=key, cure="give linear radiance: was a filter with negative lobes used? cut it at 0")
     return radiance

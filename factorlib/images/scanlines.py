@@ -15,6 +15,7 @@ from jaxtyping import Shaped
 
 from factorlib.errors import InputError
 from factorlib.images.stored import Rows, Stored
+from factorlib.reading import one_line
 
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
 log = logging.getLogger("factorlib.images")
@@ -26,7 +27,7 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)
     if source is None:
-        found = f"not readable as an image ({_line(oiio.geterror())})"
+        found = f"not readable as an image ({one_line(oiio.geterror())})"
         raise InputError(found, file=path, key=key, cure="is it whole, and of the kind its suffix says?")
     spec = source.spec()
     orientation, white = spec.get_int_attribute("Orientation", 1), WHITE.get(spec.format.basetype)
@@ -67,11 +68,11 @@ def _of_tiles(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int],
 
 
 def _checked(source: oiio.ImageInput, pixels: np.ndarray | None, path: str | Path, key: str | None) -> np.ndarray:
-    error = _line(source.geterror())
+    error = source.geterror()
     if pixels is None or "Premature end" in error:
-        raise InputError(f"truncated or damaged ({error})", file=path, key=key, cure="copy it again from where it came")
+        raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure="copy it again from where it came")
     if error:
-        log.warning("%s: %s", path, error)
+        log.warning("%s: %s", path, one_line(error))
     return pixels
 
 
@@ -84,7 +85,3 @@ def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[in
     if len(colours) != 1:
         raise InputError(f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer")
     return 3 * colours
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split())

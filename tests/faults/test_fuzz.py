@@ -14,11 +14,13 @@ import struct
 import time
 import warnings
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from faults.tries import note
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -279,6 +281,9 @@ PARTS = {  # name -> (file, source, its contents, reader)
 }
 
 
+CAME = Counter()  # of the files so far: how many were read, how many refused
+
+
 def read_or_refused(read, folder: Path) -> None:
     """The only exception that may come out is InputError; and no raw warning."""
     begin, refused = time.process_time(), None
@@ -290,6 +295,7 @@ def read_or_refused(read, folder: Path) -> None:
             refused = error
     assert refused is None or (refused.found and refused.cure and len(str(refused)) < 3000)
     assert time.process_time() - begin < MOST_SECONDS
+    CAME["refused" if refused else "accepted"] += 1
 
 
 def fuzz(folder: Path, part: str, **options) -> None:
@@ -310,10 +316,12 @@ def fuzz(folder: Path, part: str, **options) -> None:
     if not options.get("derandomize"):
         seed(time.time_ns())(spoil)
     logging.disable(logging.WARNING)
+    CAME.clear()
     try:
         spoil()
     finally:
         logging.disable(logging.NOTSET)
+    note("fuzz", part, CAME.total(), **CAME)
 
 
 @pytest.mark.parametrize("part", PARTS)

@@ -9,12 +9,14 @@ import json
 import os
 import resource
 import warnings
+from collections import Counter
 from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
 from faults.mesh_files import GOOD, glb, gltf_text
+from faults.tries import note
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -155,6 +157,9 @@ def spoiled(name: str) -> st.SearchStrategy:
     return spoiled_words(content) | spoiled_bytes(content)
 
 
+CAME = Counter()  # of the meshes so far: how many were read, how many refused
+
+
 def attempt(folder: Path, name: str, content: bytes) -> None:
     """Read it as the dataset's reader and the stages do."""
     (folder / name).write_bytes(content)
@@ -165,13 +170,16 @@ def attempt(folder: Path, name: str, content: bytes) -> None:
             lambda: companions_of_mesh(name, "meshes.a.file", Refusal(folder / "dataset.yaml", folder)),
             lambda: read_mesh(folder / name, ["red"], **parts),
         ):
+            refused = False
             try:
                 found = work()
             except InputError as error:
                 check_clear(error)
+                refused = True
             else:
                 if isinstance(found, Mesh):
                     check_usable(found)
+    CAME["refused" if refused else "accepted"] += 1
 
 
 def check_clear(error: InputError) -> None:
@@ -208,7 +216,9 @@ def test_a_spoiled_mesh_is_read_or_refused(folder, name):
     def search(content):
         attempt(folder, name, content)
 
+    CAME.clear()
     search()
+    note("fuzz", name, CAME.total(), **CAME)
 
 
 @pytest.mark.long
@@ -226,6 +236,8 @@ def test_a_spoiled_mesh_is_read_or_refused_for_long(folder, name):
         if time.monotonic() < end:
             attempt(folder, name, content)
 
+    CAME.clear()
     while time.monotonic() < end:
         search()
+    note("fuzz", name, CAME.total(), **CAME)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
