@@ -73,9 +73,9 @@ def test_a_warning_of_another_kind_and_every_error_are_shown(installing, capfd):
 
 
 def test_a_silent_installation_shows_that_it_lives(installing, capfd, tmp_path):
-    (tmp_path / "one-1.0.dist-info").mkdir()
-    assert installing("import time; time.sleep(1.5)")
-    assert 3 <= capfd.readouterr().out.count("set-up: 1 of 9 packages installed") <= 8
+    (tmp_path / "pip-1.0.dist-info").mkdir()
+    assert installing(f"import os, time; os.mkdir({str(tmp_path / 'one-1.0.dist-info')!r}); time.sleep(1.5)")
+    assert 2 <= capfd.readouterr().out.count("set-up: 1 of 9 packages installed") <= 8
 
 
 def test_installations_run_at_once(installing, tmp_path):
