@@ -150,7 +150,7 @@ def install(parts: list[list[str]], command: Callable[[list[str], str], list[str
     """
     lines: queue.Queue[str | None] = queue.Queue()
     running = [_started(command(part, verb), lines) for part in parts]
-    open_, warned, started = len(running), Warnings(), time.monotonic()
+    open_, warned, started, before = len(running), Warnings(), time.monotonic(), _installed()
     while open_:
         try:
             line = lines.get(timeout=0.2)
@@ -158,11 +158,15 @@ def install(parts: list[list[str]], command: Callable[[list[str], str], list[str
             line = ""
         open_ -= line is None
         warned.hear(line or "")
-        there = f"{len(list(site_packages().glob('*.dist-info')))} of {total} packages installed" if total else "installing"
+        there = f"{_installed() - before} of {total} packages installed" if total else "installing"
         show_life(f"{there}, {time.monotonic() - started:.0f} s")
     show_life("", always=True)
     warned.close()
     return not any(process.wait() for process in running)
+
+
+def _installed() -> int:
+    return sum(1 for _ in site_packages().glob("*.dist-info"))
 
 
 def _started(command: list[str], lines: queue.Queue) -> subprocess.Popen:

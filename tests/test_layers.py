@@ -16,7 +16,7 @@ def test_the_contracts_of_pyproject_hold():
 def test_the_command_line_loads_no_science():
     code = (
         "import sys, factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import survey\n"
-        "heavy = {'numpy', 'torch', 'scipy', 'OpenImageIO', 'rich', 'filelock'} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
+        "heavy = {'numpy', 'torch', 'scipy', 'OpenImageIO', 'rich', 'filelock', 'typer', 'pydantic'} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

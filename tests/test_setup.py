@@ -55,3 +55,74 @@ def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
     monkeypatch.setenv("EXTRAS", "blunder")
     with pytest.raises(SystemExit, match=r"'blunder'.*blender, interchange"):
         setup.install_extras()
+
+
+SAY = "import sys, time\nfor k in range(3):\n    print(f\"WARNING: Location 'file:///x/{word}{k}/' is ignored\", file=sys.stderr)\n"
+
+
+@pytest.fixture
+def installing(monkeypatch, tmp_path):
+    """`install` with a Python program in place of a package client."""
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup, "BEAT", 0.3)
+    monkeypatch.setattr(setup, "_shown", 0.0)
+    python = lambda words, verb: [setup.sys.executable, "-c", words[0]]  # noqa: E731
+    return lambda *programs: setup.install([[program] for program in programs], python, 9)
+
+
+def test_warnings_of_the_package_client_are_shown_once(installing, capfd):
+    assert installing(SAY.replace("{word}", "a"), SAY.replace("{word}", "b"))
+    said = capfd.readouterr()
+    assert said.err.count("WARNING: Location") == 1 and "5 more warnings of the same kind left out" in said.out
+
+
+def test_a_warning_of_another_kind_and_every_error_are_shown(installing, capfd):
+    assert not installing(SAY.replace("{word}", "") + "print('WARNING: other', file=sys.stderr)\nprint('ERROR: no such package a', file=sys.stderr)\nsys.exit(1)", "pass")
+    said = capfd.readouterr().err
+    assert said.count("WARNING") == 2 and "ERROR: no such package a" in said
+
+
+def test_a_silent_installation_shows_that_it_lives(installing, capfd, tmp_path):
+    (tmp_path / "pip-1.0.dist-info").mkdir()
+    assert installing(f"import os, time; os.mkdir({str(tmp_path / 'one-1.0.dist-info')!r}); time.sleep(1.5)")
+    assert 2 <= capfd.readouterr().out.count("set-up: 1 of 9 packages installed") <= 8
+
+
+def test_installations_run_at_once(installing, tmp_path):
+    met = "import pathlib, sys, time\nhere = pathlib.Path({!r})\n(here / {!r}).touch()\nfor _ in range(400):\n    if (here / {!r}).exists(): sys.exit(0)\n    time.sleep(.05)\nsys.exit(1)"
+    assert installing(met.format(str(tmp_path), "a", "b"), met.format(str(tmp_path), "b", "a")), "each waits for the other"
+
+
+def test_every_package_of_the_lock_is_installed_once_and_torch_apart(monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append((parts, total)) or True)
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
+    monkeypatch.setattr(setup, "torch_index", lambda: setup.TORCH_CPU)
+    setup.install_packages()
+    ((parts, total),) = called
+    assert all(part[0] == "--no-deps" for part in parts) and setup.TORCH in parts[0]
+    packages = [word for part in parts[1:] for word in part[1:]]
+    locked = [line for line in setup.LOCK.read_text().splitlines() if line and not line.startswith("#")]
+    assert sorted(packages) == sorted(locked) and total == len(locked) + 1
+    assert (tmp_path / "factorlib.pth").read_text() == "../../../..\n"
+
+
+def test_a_torch_of_another_index_is_asked_what_it_needs(monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append((command, parts)) or True)
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
+    monkeypatch.setattr(setup, "torch_index", lambda: "https://example.org/cuda")
+    setup.install_packages()
+    assert called[-1] == (setup.with_pip, [["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"]])
+
+
+def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append(command) or command is setup.with_pip)
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(setup, "torch_index", lambda: setup.TORCH_CPU)
+    setup.install_packages()
+    assert called == [setup.with_uv, setup.with_pip]

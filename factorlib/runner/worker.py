@@ -204,8 +204,9 @@ def limit_threads(threads: int) -> None:
 
 def _made(task: Task, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
     """Run the step; its tree is in the store afterwards, its key is not."""
-    module = load_stage(task.code)
-    params = params_of(module, task.code)
+    shipped = shipped_folder([task.code.root, LIBRARY], task.shipped, task.record) if task.shipped else None
+    module = None if shipped else load_stage(task.code)  # which takes seconds
+    params = params_of(module, task.code) if module else None
     task.temporary.mkdir(parents=True)
     store = Store(task.store)
     hashes = FileHashes(store.cache / "files.json")
@@ -213,8 +214,8 @@ def _made(task: Task, events: Events, map_: Callable) -> tuple[Entry, Path | Non
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
     inputs = Inputs(task.folders, task.facts, task.files, task.photo, map_, task.log, unfinished)
-    if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
-        copy_shipped(folder, task.temporary)
+    if shipped:
+        copy_shipped(shipped, task.temporary)
     else:
         _run_main(module, params, inputs, task, results, events)
     _check_files_still(task)
