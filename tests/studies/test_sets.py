@@ -1,0 +1,64 @@
+"""The paper's patterns as data sets on disk, and real sets that are not there."""
+
+import numpy as np
+import pytest
+
+from factorlib.dataset.read import read_dataset
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import rasterise
+from factorlib.images.exr import read_rgb_exr
+from factorlib.images.picture import read_png
+from factorlib.meshes.read import read_mesh
+from studies import real, sets
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Two materials in one light, one of them in a second."""
+    folder = tmp_path_factory.mktemp("sets") / "pair"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sets, "light_map", lambda seed, number, rows, spp: np.ones((16, 32, 3), np.float32) * (1 + number))
+        sets.write_set(folder, 0, [(0, 0), (5, 0), (5, 1)])
+    return folder
+
+
+def test_the_set_names_the_materials_of_its_entries(written):
+    spec = read_dataset(written).spec
+    assert spec.materials == ["brick", "tile"]
+    assert {photo.name: [obj.name for obj in photo.objects] for photo in spec.photos} == {"photo0": ["brick", "tile"], "photo1": ["tile"]}
+
+
+def test_meshes_at_the_given_poses_lie_under_the_masks(written):
+    """Read as the stages read them."""
+    dataset = read_dataset(written)
+    for photo in dataset.spec.photos:
+        label = read_png(written / photo.masks)[..., 0]
+        height, width = label.shape
+        camera = Camera(width, height, photo.camera.focal_px, tuple(photo.camera.principal_point))
+        meshes = [
+            read_mesh(written / dataset.spec.meshes[obj.mesh].file, dataset.spec.materials, None, dataset.spec.meshes[obj.mesh].material, obj.materials)
+            for obj in photo.objects
+        ]
+        poses = [Pose(np.array(obj.pose.rotation), np.array(obj.pose.translation)) for obj in photo.objects]
+        said = label < 255
+        assert (rasterise(meshes, camera, poses).label[said] == label[said]).all() and (label[said] > 0).sum() > 5000
+        assert (read_rgb_exr(written / photo.image)[label == 0] == 0).all()
+
+
+def test_twice_the_light_is_twice_the_radiance(written):
+    """Of the tile, but for noise and for which normals its two bodies show."""
+    first, second = (read_rgb_exr(written / f"photos/photo{k}.exr") for k in range(2))
+    tile = read_png(written / "masks/photo0.png")[..., 0] == 2
+    assert np.median(second[second.max(-1) > 0], axis=0) == pytest.approx(2 * np.median(first[tile], axis=0), rel=0.05)
+
+
+def test_a_set_that_there_is_not_is_answered_with_those_there_are(tmp_path):
+    with pytest.raises(InputError, match="docksta"):
+        sets.main(tmp_path, which="dockta")
+
+
+def test_a_real_set_that_is_not_there_is_said_to_be_absent(tmp_path, capsys):
+    before = real.DOCS.read_bytes()
+    real.main([tmp_path / "liberty"], docs=True)
+    assert "absent" in capsys.readouterr().out and real.DOCS.read_bytes() == before
