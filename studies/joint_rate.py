@@ -1,6 +1,6 @@
-"""At which rate does Mitsuba's joint optimisation do best?  `python -m studies.joint_rate [rate …] [--seed 100]`.
+"""At which rate does Mitsuba's joint optimisation do best?  `python -m studies.joint_rate [rate …] [--seed 100] [--side 2]`.
 
-On a seed that no study reports, at the full study's size, each rate until its loss is flat.  The best, by the mean of its last losses, is
+On a seed that no study reports, with pictures as large as the full study's, each rate until its loss is flat.  The best, by the mean of its last losses, is
 `studies.core.baselines.joint.RATE`.
 """
 
@@ -10,6 +10,7 @@ import os
 import sys
 from typing import Annotated
 
+import msgspec
 import numpy as np
 import typer
 
@@ -23,9 +24,10 @@ from studies.core.study import FULL
 from studies.core.world import light_map, materials_of
 
 
-def tried(seed: int, rate: float) -> Optimised:
-    """Where a rate ends on the photos of a seed."""
-    setting = next(s for s in STUDIES["comparison"].settings(FULL) if s.name == "mitsuba")
+def tried(seed: int, side: int, rate: float) -> Optimised:
+    """Where a rate ends on the photos of a seed, of `side` materials in as many lights."""
+    scale = msgspec.structs.replace(FULL, side=side)
+    setting = next(s for s in STUDIES["comparison"].settings(scale) if s.name == "mitsuba")
     case = setting.case(seed)
     lights = {li: light_map(seed, li, FULL.light_rows, FULL.light_spp) for li in case.lights}
     return optimised(seed, photographed(case, materials_of(seed), lights), case.joint, rate)
@@ -34,6 +36,7 @@ def tried(seed: int, rate: float) -> Optimised:
 def main(
     rates: Annotated[list[float] | None, typer.Argument(help="all that are compared without it")] = None,
     seed: Annotated[int, typer.Option(help="not one of those that are reported")] = 100,
+    side: Annotated[int, typer.Option(min=1, max=FULL.largest, help="materials, and lights")] = FULL.side,
 ) -> None:
     """Print a row for each rate."""
     if seed in FULL.seeds:
@@ -41,7 +44,7 @@ def main(
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # of the lights, as in studies
     rows = []
     for rate in rates or RATES:
-        found = tried(seed, rate)
+        found = tried(seed, side, rate)
         numbers = (f"{np.mean(found.losses[-FLAT:]):.3g}", str(len(found.losses)), "yes" if found.flat else "no", f"{found.processor:.0f}")
         rows.append([f"{rate:g}", *numbers])
     print(table(["rate", "loss at the end", "steps", "flat", "processor, s"], rows))

@@ -179,7 +179,7 @@ def test_the_gauge_is_taken_out_and_nothing_else():
 
 
 def scores(prediction):
-    of = case("ours", side=2, size=16)
+    of = case("ours", side=2, size=12)
     world = World(materials_of(0), lights(0, 3))
     found = shots(of, world, prediction(world))
     return score_of(world, prediction(world), found, 1.0), found
@@ -196,12 +196,12 @@ def test_the_truth_in_any_gauge_scores_nothing_and_a_grey_ball_does():
     assert {shot.asked.kind for shot in found} == set(KINDS) and len({shot.asked.name for shot in found}) == len(found) == 8 + 2 + 6
     measures = [kind + suffix for kind in KINDS for suffix in SUFFIXES.values()]
     assert max(score.values[m] for m in measures) < 1e-6 and score.values["mirror"] < 1e-6 and score.values["roughness"] == 0
-    worse, _ = scores(lambda world: grey(photos(case("grey", side=2, size=16)), world.materials))
+    worse, _ = scores(lambda world: grey(photos(case("grey", side=2, size=12)), world.materials))
     assert min(worse.values[m] for m in measures) > 0.02 and "roughness" not in worse.values
 
 
 def test_what_a_method_does_not_state_has_no_score():
-    score, found = scores(lambda world: projective(photos(case("projective", side=2, size=16))))
+    score, found = scores(lambda world: projective(photos(case("projective", side=2, size=12))))
     assert not {"diffuse", "mirror", "novel_material"} & score.values.keys() and {"novel_view", "novel_light"} <= score.values.keys()
     assert all(shot.asked.kind != "novel_material" for shot in found)
 

@@ -128,6 +128,15 @@ def test_a_browser_that_a_program_drives_is_marked_even_where_it_says_nothing(ht
 
 
 @needs_chromium
+def test_a_phone_needs_no_scrolling_sideways(html):
+    with opened(html, viewport={"width": 360, "height": 740}) as (browser, complaints):
+        browser.click("#begin")
+        browser.wait_for_function("ready")
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 360 and complaints == []
+        assert all(browser.locator(f"#{side}").bounding_box()["x"] >= 0 for side in ("left", "right"))
+
+
+@needs_chromium
 def test_order_and_sides_are_the_seeds_and_sides_are_fair(html):
     with opened(html) as (browser, _):
         script = "(seed) => drawn(data.pictures, seed).map((q) => [q.picture.name, q.ours])"

@@ -12,6 +12,8 @@ Process  its own, for the variant of Mitsuba is the process' own affair, with on
 from __future__ import annotations
 
 import os
+import threading
+import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -143,8 +145,20 @@ def flat(losses: list[float]) -> bool:
 
 def optimised(seed: int, photos: Photos, how: case.Joint, rate: float = RATE) -> Optimised:
     """Optimise in a process of its own.  InputError where Mitsuba has no derivatives on this machine."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_end_with, initargs=(os.getpid(),)) as pool:
         return pool.submit(_optimised, seed, photos.seen, photos.radiance, how, rate).result()
+
+
+def _end_with(parent: int) -> None:
+    """Nobody waits for an optimisation whose step was killed."""
+
+    def watch() -> None:
+        """Looks twice a second."""
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _optimised(seed: int, seen: body.Seen, radiance: Mapping, how: case.Joint, rate: float) -> Optimised:
