@@ -12,6 +12,7 @@ from studies.catalogue import (
     parts,
     prior,
     row_and_column,
+    seeds_and_machines,
     speed,
     structure,
 )
@@ -31,5 +32,6 @@ STUDIES: dict[str, Study] = {
         speed,
         parts,
         hard_cases,
+        seeds_and_machines,
     )
 }
