@@ -24,8 +24,9 @@ import typer
 from scipy.stats import t as student
 
 from benchmarks.markdown import refresh
+from benchmarks.numbers import NUMBERS
 from factorlib.errors import InputError
-from factorlib.evaluate.table import SYNTHETIC, value_at
+from factorlib.evaluate.table import value_at
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.metrics import read_metrics
 from factorlib.runner import verbs
@@ -37,12 +38,6 @@ STORED = LIBRARY / "tests" / "regression" / "synthetic.json"
 SEEDS = 5
 DOUBT = 0.01
 COMMAND = 'make bench-reference REASON="why the numbers changed"'
-NUMBERS = {
-    **{bound.path: bound.meaning for bound in SYNTHETIC},
-    "materials.mean_roughness": "roughness, mean over materials",
-    "materials.mean_diffuse": "diffuse, mean, relative",
-    "materials.mean_specular": "specular, mean, relative",
-}
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -121,7 +116,7 @@ def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored
     """From the metrics of all seeds, the default one first.  InputError where a number is missing."""
     values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
     for path in (p for p, v in values.items() if None in v):
-        raise InputError("there is no such number", file=Path("metrics.json"), key=path, cure="correct NUMBERS in benchmarks/reference.py")
+        raise InputError("there is no such number", file=Path("metrics.json"), key=path, cure="correct benchmarks/numbers.py")
     numbers = {p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()}
     old: Mapping[str, Number] = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}

@@ -17,6 +17,7 @@ from studies.catalogue import (
     prior,
     progressive,
     row_and_column,
+    seeds_and_machines,
     speed,
     structure,
 )
@@ -41,5 +42,6 @@ STUDIES: dict[str, Study] = {
         speed,
         parts,
         hard_cases,
+        seeds_and_machines,
     )
 }

@@ -15,7 +15,6 @@ import numpy as np
 from benchmarks.splits import Split, flat, solved, splits_of, unseen
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
-from factorlib.dataset.slices import dataset_slice
 from factorlib.diagnose.answer import Answer
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.evaluate.lights import compare_lights
@@ -26,13 +25,12 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
-from factorlib.stage import Inputs, silent
+from factorlib.stage import silent
 from factorlib.urm.observations import read_observations
-from stages import align, masks, urm
 from studies.core.case import Score
 from studies.core.part import PARTS, Chairs, Part
+from studies.core.pipeline import run_stages
 
-STAGES = {"masks": (masks, ("materials", "photo")), "align": (align, ("materials", "objects")), "urm": (urm, ("materials", "objects", "light"))}
 MAP_ROWS = 128  # of recovered lights
 GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
 
@@ -45,15 +43,7 @@ def make_set(folder: Path, seed: int, chairs: Chairs) -> None:
 
 def observe(folder: Path, out: Path) -> None:
     """masks/, align/ and urm/ of a set, in `out`."""
-    dataset = read_dataset(folder)
-    for name, (stage, slices) in STAGES.items():
-        (out / name).mkdir(parents=True)
-        for photo in dataset.spec.photos:
-            found = {slice_: dataset_slice(dataset, slice_, photo.name) for slice_ in slices}
-            facts = {f"dataset.{slice_}": each.facts for slice_, each in found.items()}
-            files = {file: dataset.folder / file for each in found.values() for file in each.files}
-            inputs = Inputs({before: out / before for before in STAGES}, facts, files, photo.name)
-            stage.main(stage.Params(), inputs, out / name, silent)
+    run_stages(folder, out, {}, ("masks", "align", "urm"))
 
 
 def score_of(case: Part, folder: Path, observed: Path) -> Score:

@@ -4,7 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.reference import NUMBERS, Number, Stored, checked, complaint, differences, quoted, read_stored, stored, tolerance
+from benchmarks.numbers import NUMBERS
+from benchmarks.reference import Number, Stored, checked, complaint, differences, quoted, read_stored, stored, tolerance
 from factorlib.errors import InputError
 
 PATH = "materials.worst_roughness"
