@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ from benchmarks.scale.scenes import write_set
 from benchmarks.scale.watch import Cost, Watch
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
+from factorlib.runner.cluster import QUIET
 
 FOLDER = ROOT / "build" / "bench" / "scale"
 DOCS = ROOT / "docs" / "distributed.md"
@@ -134,7 +136,7 @@ def cluster(logs: Path, workers: int) -> Iterator[str]:
         def started(name: str, *words: str) -> Path:
             """The log of a process that ends with the cluster."""
             stream = ends.enter_context(open(logs / f"{name}.log", "wb"))
-            process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream)
+            process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream, env={**QUIET, **os.environ})
             ends.callback(process.wait)
             ends.callback(process.terminate)
             return logs / f"{name}.log"
