@@ -205,7 +205,7 @@ def of_live(live, word):
     return [pid for process in live.processes for pid in offspring(process.pid) if doing(pid, word)]
 
 
-@pytest.mark.parametrize("victim", ["worker", "child"])
+@pytest.mark.parametrize("victim", ["worker", pytest.param("child", marks=pytest.mark.long)])
 def test_what_is_killed_in_mid_step_costs_that_step_alone_and_the_run_ends_with_the_same_bytes(project, live, tmp_path, victim):
     go, tries = waiting_for_a_file(project, tmp_path)
     other = toy.copy(project, tmp_path / "beside")
@@ -257,7 +257,7 @@ def test_a_step_whose_process_dies_each_time_fails_as_one_and_says_so(project, l
     assert state(project)["table"] == "current"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGKILL))])
 def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(project, live, tmp_path, number):
     go, _ = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
