@@ -345,6 +345,25 @@ def test_a_scheduler_that_does_not_answer_is_named(project, monkeypatch):
     assert "dask scheduler --port" in str(refused.value)
 
 
+def test_a_worker_is_not_started_for_what_is_no_address():
+    with pytest.raises(InputError, match="'10.0.0.1' is no address"):
+        cluster.start_worker("10.0.0.1", None, [])
+
+
+@pytest.mark.long
+def test_a_run_waits_for_the_first_worker_and_says_how_one_is_started(project, beside, tmp_path):
+    live = LiveCluster(0, tmp_path)
+    try:
+        process = start(project, *live.settings)
+        said = process.stdout.readline()
+        assert "waiting: no worker yet" in said and f"-m factorlib worker {live.address}" in said
+        live.add_worker()
+        process.communicate(timeout=180)
+    finally:
+        live.close()
+    assert process.returncode == 0 and kept(project) == kept(beside)
+
+
 PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: dask\nscheduler: tcp://a:1\nstages: {}\n"
 
 
