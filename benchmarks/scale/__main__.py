@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ from benchmarks.scale.scenes import write_set
 from benchmarks.scale.watch import Cost, Watch
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
+from factorlib.runner.cluster import QUIET
 
 FOLDER = ROOT / "build" / "bench" / "scale"
 DOCS = ROOT / "docs" / "distributed.md"
@@ -75,7 +77,8 @@ def main(
 ) -> None:
     """Measure one size, or write the table."""
     if docs:
-        refresh(DOCS, {"scale": rows()}, "benchmarks.scale")
+        sizes = [msgspec.json.decode(path.read_bytes(), type=Measured) for path in sorted(FOLDER.glob("*.json"), key=lambda path: int(path.stem))]
+        refresh(DOCS, {"scale": rows(sizes), "worked out": worked_out(sizes[-2], sizes[-1])}, "benchmarks.scale")
         return
     folder = FOLDER / "sets" / f"scale-{photos}-{materials}"
     if not (folder / "dataset.yaml").is_file():
@@ -134,7 +137,7 @@ def cluster(logs: Path, workers: int) -> Iterator[str]:
         def started(name: str, *words: str) -> Path:
             """The log of a process that ends with the cluster."""
             stream = ends.enter_context(open(logs / f"{name}.log", "wb"))
-            process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream)
+            process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream, env={**QUIET, **os.environ})
             ends.callback(process.wait)
             ends.callback(process.terminate)
             return logs / f"{name}.log"
@@ -156,10 +159,8 @@ def _said(log: Path, pattern: str, patience: float = 120.0) -> str:
     return found[1]
 
 
-def rows() -> str:
+def rows(sizes: list[Measured]) -> str:
     """The table of all sizes that were measured."""
-    files = sorted(FOLDER.glob("*.json"), key=lambda path: int(path.stem))
-    sizes = [msgspec.json.decode(path.read_bytes(), type=Measured) for path in files]
     lines = {
         "steps": lambda m: str(sum(stage.processes for stage in m.stages.values())),
         "masks, align, urm: processor s": lambda m: exact(sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")), 3),
@@ -183,6 +184,38 @@ def rows() -> str:
         "bytes as in processes of this machine": lambda m: {True: "yes", False: "NO", None: "not compared"}[m.same_bytes],
     }
     return table(["photos", *(str(m.photos) for m in sizes)], [[name, *map(of, sizes)] for name, of in lines.items()])
+
+
+MANY = 100_000
+
+
+def worked_out(small: Measured, large: Measured) -> str:
+    """The table for MANY photos, by the straight line through the two largest sizes that were measured."""
+    lines = {
+        "masks, align, urm: processor hours": lambda m: sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")) / 3600,
+        "solve: processor hours": lambda m: m.stages["solve"].cpu_seconds / 3600,
+        "of these in its own process, one after the other": lambda m: (m.stages["solve"].cpu_seconds - m.spread["cpu_seconds"]) / 3600,
+        "memory of its own process, GB": lambda m: m.stages["solve"].peak_mb / 1024,
+        "scheduler: processor hours": lambda m: m.costs["scheduler"].cpu_seconds / 3600,
+        "scheduler's memory, GB": lambda m: m.costs["scheduler"].peak_mb / 1024,
+        "the run's own: processor hours": lambda m: m.costs["run"].cpu_seconds / 3600,
+        "the run's memory, GB": lambda m: m.costs["run"].peak_mb / 1024,
+        "sent to blocks once, GB": lambda m: m.spread["bytes_shelved"] / 2**30,
+        "sent each time, all maps together, GB": lambda m: m.spread["bytes_sent"] / 2**30,
+        "back from blocks, GB": lambda m: m.spread["bytes_back"] / 2**30,
+        "store, GB": lambda m: m.store_mb / 1024,
+        "files in the store, millions": lambda m: m.store_files / 1e6,
+    }
+    head = [f"{MANY:,} photos", f"from {small.photos} and {large.photos}"]
+    return table(head, [[name, exact(_at(of(small), of(large), small.photos, large.photos), 2)] for name, of in lines.items()])
+
+
+def _at(small: float, large: float, few: int, more: int) -> float:
+    """
+    >>> _at(1.0, 2.0, 100, 200)
+    1000.0
+    """
+    return large + (large - small) / (more - few) * (MANY - more)
 
 
 if __name__ == "__main__":

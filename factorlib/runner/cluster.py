@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
@@ -21,12 +22,20 @@ from typing import Any
 from factorlib.errors import InputError
 from factorlib.runner.blocks import CORES, TRIES, Site, params_at, started_by, step_at
 from factorlib.runner.executors import machine_cores
+from factorlib.runner.pipeline import ADDRESS
+from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
 from factorlib.runner.worker import check_params, run_step
 from factorlib.wholefile import write_text
 
 AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for the next
+FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, and for steps to end that are cancelled
+QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
+}
 AT = {run_step: step_at, check_params: params_at}  # what a child calls in place of it
 
 
@@ -42,7 +51,8 @@ class Cluster:
             raise InputError("Dask is not installed", key="executor", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'")
         self.site = Site(run, run / "mark")
         write_text(self.site.mark, "")
-        self._executors: dict[tuple, Executor] = {}
+        self._executors: dict[int | None, Executor] = {}
+        self._known: tuple[float, dict[str, int]] = (-FRESH, {})
         self._busy: dict[Future, int] = {}
         self._ends = contextlib.ExitStack()
         with whole(), contextlib.ExitStack() as ends:
@@ -89,22 +99,26 @@ class Cluster:
         self._ends.close()
 
     def _executor(self, cores: int | None) -> Executor:
-        if (cores,) not in self._executors:
+        if cores not in self._executors:
             resources = {} if cores is None else {"resources": {CORES: cores}}
-            self._executors[(cores,)] = self.client.get_executor(pure=False, retries=TRIES - 1, **resources)
-        return self._executors[(cores,)]
+            self._executors[cores] = self.client.get_executor(pure=False, retries=TRIES - 1, **resources)
+        return self._executors[cores]
 
     def _declared(self) -> dict[str, int]:
-        """The cores that each worker declares, by its address."""
-        workers = self.client.scheduler_info(n_workers=-1)["workers"]
-        return {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
+        """The cores that each worker declares, by its address, as the scheduler said not long ago."""
+        asked, known = self._known
+        if time.monotonic() - asked >= FRESH:
+            workers = self.client.scheduler_info(n_workers=-1)["workers"]
+            known = {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
+            self._known = time.monotonic(), known
+        return known
 
     def _check(self, scheduler: str | None, say: Callable[[str], None]) -> None:
         """Wait for a worker; InputError where any of those that are there cannot do what it must."""
         if not self._declared():
             say(f"waiting: no worker yet at {scheduler}; {started_by(str(scheduler))}")
             while not self._declared():
-                time.sleep(0.5)
+                time.sleep(FRESH)
         if lacking := [address for address, cores in self._declared().items() if not cores]:
             cure = f"{started_by(str(scheduler))}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
             raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="scheduler", cure=cure)
@@ -140,7 +154,7 @@ def _client(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         workers, threads = nprocesses_nthreads(machine_cores())
         with (
-            dask.config.set({"distributed.worker.daemon": True}),
+            dask.config.set(dask.config.collect_env(QUIET)),
             LocalCluster(
                 workers, threads, host="127.0.0.1", dashboard_address=None, memory_limit=0, resources={CORES: threads}, silence_logs=logging.CRITICAL
             ) as cluster,
@@ -179,12 +193,10 @@ def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), started as steps need it."""
     if find_spec("distributed") is None:
         raise InputError("Dask is not installed", key="worker", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'")
-    import sys
-
-    from factorlib.runner.project import LIBRARY
-
+    if not ADDRESS.fullmatch(scheduler):
+        raise InputError(f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786")
     count = str(cores or machine_cores())
     options = ["--nthreads", count, "--nworkers", "1", "--resources", f"{CORES}={count}", "--memory-limit", "0", "--no-dashboard"]
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
-    os.execve(sys.executable, command, {**os.environ, "PYTHONPATH": path})
+    os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})

@@ -205,7 +205,7 @@ def of_live(live, word):
     return [pid for process in live.processes for pid in offspring(process.pid) if doing(pid, word)]
 
 
-@pytest.mark.parametrize("victim", ["worker", "child"])
+@pytest.mark.parametrize("victim", ["worker", pytest.param("child", marks=pytest.mark.long)])
 def test_what_is_killed_in_mid_step_costs_that_step_alone_and_the_run_ends_with_the_same_bytes(project, live, tmp_path, victim):
     go, tries = waiting_for_a_file(project, tmp_path)
     other = toy.copy(project, tmp_path / "beside")
@@ -257,7 +257,7 @@ def test_a_step_whose_process_dies_each_time_fails_as_one_and_says_so(project, l
     assert state(project)["table"] == "current"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGKILL))])
 def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(project, live, tmp_path, number):
     go, _ = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
@@ -343,6 +343,25 @@ def test_a_scheduler_that_does_not_answer_is_named(project, monkeypatch):
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9") as refused:
         verbs.make(project, verbs.Wish("set", settings=["executor=dask", "scheduler=tcp://127.0.0.1:9"]))
     assert "dask scheduler --port" in str(refused.value)
+
+
+def test_a_worker_is_not_started_for_what_is_no_address():
+    with pytest.raises(InputError, match="'10.0.0.1' is no address"):
+        cluster.start_worker("10.0.0.1", None, [])
+
+
+@pytest.mark.long
+def test_a_run_waits_for_the_first_worker_and_says_how_one_is_started(project, beside, tmp_path):
+    live = LiveCluster(0, tmp_path)
+    try:
+        process = start(project, *live.settings)
+        said = process.stdout.readline()
+        assert "waiting: no worker yet" in said and f"-m factorlib worker {live.address}" in said
+        live.add_worker()
+        process.communicate(timeout=180)
+    finally:
+        live.close()
+    assert process.returncode == 0 and kept(project) == kept(beside)
 
 
 PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: dask\nscheduler: tcp://a:1\nstages: {}\n"
