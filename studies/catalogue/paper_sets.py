@@ -67,7 +67,7 @@ def claims(scale: Scale) -> list[Claim]:
 
 STUDY = Study(
     name="paper-sets",
-    title="The paper's sets",
+    title="Sets of the paper",
     question="Which entries of the matrices of the paper's photo sets can be predicted?",
     paper="Sets as sparse as Docksta (one linking chair) and as small as LAPD (two materials) are factored, as are full ones.",
     varied="observation pattern of a set",

@@ -30,7 +30,7 @@ MEASURES = {
     "chair": Measure("DSSIM of a chair", "1", "DSSIM of a chair"),
     "chair_scaled": Measure("DSSIM of a chair, a factor per channel taken out", "1", "DSSIM of a chair, a factor per channel taken out,"),
     "normals": Measure("median error of the normals given", "degrees", "the error of the normals given"),
-    "seconds": Measure("time of the solve", "processor seconds", "the time of the solve"),
+    "seconds": Measure("processor seconds of a solve", "s", "the processor time of a solve"),
     "stated_roughness": Measure("stated standard error of roughness", "1", "the stated standard error of roughness"),
     "stated_reflectance": Measure("stated standard error of k_d and k_s", "relative to k_d + k_s", "the stated standard error of k_d and k_s"),
     "novel_view": Measure("DSSIM, new view", "1", "DSSIM of new views"),
