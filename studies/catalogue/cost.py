@@ -19,8 +19,8 @@ def settings(scale: Scale) -> list[Setting]:
     """By entries; then as the solve is by default."""
     short, default = SIDES[scale.name], BY_DEFAULT[scale.name]
     return [
-        *(Setting(f"{n * n}", f"{n * n:,}", x, lambda seed, n=n: Sized(seed, n, SHORT)) for x, n in enumerate(short)),
-        *(Setting(f"default-{n * n}", f"{n * n:,} default", len(short) + x, lambda seed, n=n: Sized(seed, n)) for x, n in enumerate(default)),
+        *(Setting(f"{n * n}", f"12 lobes, {n * n:,}", x, lambda seed, n=n: Sized(seed, n, SHORT)) for x, n in enumerate(short)),
+        *(Setting(f"default-{n * n}", f"by default, {n * n:,}", len(short) + x, lambda seed, n=n: Sized(seed, n)) for x, n in enumerate(default)),
     ]
 
 
@@ -35,7 +35,7 @@ STUDY = Study(
     title="Cost",
     question="How do time and memory grow with the entries of the matrix?",
     paper="Linear in the entries; 30 minutes for 5 × 5 on a Titan X, after 3 hours of training.",
-    varied="entries of the matrix, 12 lobes a light; default: as the solve is",
+    varied="most lobes of a light, entries of the matrix",
     measures=("seconds", "seconds_an_entry", "peak", "grown"),
     settings=settings,
     claims=claims,

@@ -10,6 +10,7 @@ from factorlib.stage import Inputs, Progress
 from studies.core.exponents import called, exponents
 from studies.core.measures import MEASURES
 from studies.core.table import Conclusion, Spread
+from studies.report.curves import curves
 from studies.steps.conclusion import conclude
 
 ANSWERS = {"linear": "agrees", "less than linear": "disagrees: less than linear", "more than linear": "disagrees: more than linear"}
@@ -21,7 +22,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Sum up the costs of all cases."""
-    conclude(inputs, out, notes=notes, answer=answer)
+    conclude(inputs, out, notes=notes, answer=answer, drawn=curves)
 
 
 def notes(found: Conclusion) -> list[str]:
