@@ -5,6 +5,7 @@ The seconds that it took, in optimised.json, are a result of this study; they di
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import msgspec
@@ -14,6 +15,8 @@ from factorlib.stage import Inputs, Progress
 from studies.core.baselines.case import Comparison
 from studies.core.baselines.joint import optimised
 from studies.core.baselines.photos import read_photos
+
+log = logging.getLogger("factorlib.studies.optimise")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -27,4 +30,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / inputs.photo / "method.json", case.method)
     if case.method == "mitsuba":
         photos = read_photos(case, inputs["observe"] / inputs.photo)
-        write_json(out / inputs.photo / "optimised.json", optimised(case.seed, photos, case.joint))
+        found = optimised(case.seed, photos, case.joint)
+        if not found.flat:
+            log.warning(f"Mitsuba's optimisation was ended after {len(found.losses)} steps, before its loss was flat")
+        write_json(out / inputs.photo / "optimised.json", found)
