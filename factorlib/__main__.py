@@ -1,6 +1,6 @@
 """The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
 
-Read by `argparse`, for a run with nothing to do must not wait for a library: it takes a fifth of a second in all.
+Read by `argparse`, for a run with nothing to do must not wait: libraries that read it take longer than all that follows.
 """
 
 from __future__ import annotations

@@ -22,7 +22,6 @@ import time
 import tomllib
 import urllib.request
 import venv
-from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -98,11 +97,12 @@ def install_packages() -> None:
     locked = [line.strip() for line in LOCK.read_text().splitlines() if line.strip() and not line.startswith("#")]
     say(f"installing {len(locked) + 1} packages (about 400 MB); PyTorch from {index or 'the default package index'}")
     torch = [TORCH, *(["--index-url", index] if index else [])]
-    if not (shutil.which("uv") and install([["--no-deps", *locked], ["--no-deps", *torch]], with_uv, len(locked) + 1)):
-        parts = [locked[k :: PARTS - 1] for k in range(PARTS - 1)]
-        ended(install([["--no-deps", *torch], *(["--no-deps", *part] for part in parts)], with_pip, len(locked) + 1))
+    of_torch = (with_uv if shutil.which("uv") and index else with_pip)(["--no-deps", *torch])  # pip alone knows a user's own wheels
+    if not (shutil.which("uv") and install([of_torch, with_uv(["--no-deps", *locked])], len(locked) + 1)):
+        parts = [["--no-deps", *torch], *(["--no-deps", *locked[k :: PARTS - 1]] for k in range(PARTS - 1))]
+        ended(install([with_pip(part) for part in parts], len(locked) + 1))
     if index != TORCH_CPU:
-        ended(install([["-c", str(LOCK), *torch]], with_pip, 0))
+        ended(install([with_pip(["-c", str(LOCK), *torch])]))
     # relative, so that the checkout can be moved; `import factorlib` then works from anywhere, notebooks too
     site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
 
@@ -123,7 +123,7 @@ def check_packages() -> None:
 def pip(*words: str) -> None:
     """One command of pip; a failed installation ends set-up with pip's own words."""
     verb, *rest = words
-    ended(install([rest], with_pip, 0, verb))
+    ended(install([with_pip(rest, verb)]))
 
 
 def ended(well: bool) -> None:
@@ -138,18 +138,18 @@ def with_pip(words: list[str], verb: str = "install") -> list[str]:
     return [str(VENV / "bin" / "python"), "-m", "pip", verb, *(["--no-compile"] if verb == "install" else []), *words, *quiet]
 
 
-def with_uv(words: list[str], verb: str = "install") -> list[str]:
+def with_uv(words: list[str]) -> list[str]:
     """The same for uv, where the user has it."""
-    return ["uv", "pip", verb, "-q", "--python", str(VENV / "bin" / "python"), *words]
+    return ["uv", "pip", "install", "-q", "--python", str(VENV / "bin" / "python"), *words]
 
 
-def install(parts: list[list[str]], command: Callable[[list[str], str], list[str]], total: int, verb: str = "install") -> bool:
-    """Run a command for each part, all at once, and show that they live; whether all went well.
+def install(commands: list[list[str]], total: int = 0) -> bool:
+    """Run the commands, all at once, and show that they live; whether all went well.
 
     What they warn of is shown once for each kind, errors as they come.  total: of packages, 0 where that is not known
     """
     lines: queue.Queue[str | None] = queue.Queue()
-    running = [_started(command(part, verb), lines) for part in parts]
+    running = [_started(command, lines) for command in commands]
     open_, warned, started, before = len(running), Warnings(), time.monotonic(), _installed()
     while open_:
         try:

@@ -66,8 +66,7 @@ def installing(monkeypatch, tmp_path):
     monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
     monkeypatch.setattr(setup, "BEAT", 0.3)
     monkeypatch.setattr(setup, "_shown", 0.0)
-    python = lambda words, verb: [setup.sys.executable, "-c", words[0]]  # noqa: E731
-    return lambda *programs: setup.install([[program] for program in programs], python, 9)
+    return lambda *programs: setup.install([[setup.sys.executable, "-c", program] for program in programs], 9)
 
 
 def test_warnings_of_the_package_client_are_shown_once(installing, capfd):
@@ -93,36 +92,39 @@ def test_installations_run_at_once(installing, tmp_path):
     assert installing(met.format(str(tmp_path), "a", "b"), met.format(str(tmp_path), "b", "a")), "each waits for the other"
 
 
-def test_every_package_of_the_lock_is_installed_once_and_torch_apart(monkeypatch, tmp_path):
-    called = []
-    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append((parts, total)) or True)
+@pytest.fixture
+def called(monkeypatch, tmp_path):
+    """What `install_packages` would run: lists of commands.  There is no uv, and PyTorch's index of CPU wheels answers."""
+    calls = []
+    monkeypatch.setattr(setup, "install", lambda commands, total=0: calls.append(commands) or True)
     monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
     monkeypatch.setattr(setup.shutil, "which", lambda name: None)
     monkeypatch.setattr(setup, "torch_index", lambda: setup.TORCH_CPU)
+    return calls
+
+
+def test_every_package_of_the_lock_is_installed_once_and_torch_apart(called, tmp_path):
     setup.install_packages()
-    ((parts, total),) = called
-    assert all(part[0] == "--no-deps" for part in parts) and setup.TORCH in parts[0]
-    packages = [word for part in parts[1:] for word in part[1:]]
+    ((torch, *others),) = called
+    assert all("--no-deps" in command for command in (torch, *others)) and setup.TORCH in torch
+    packages = [word for command in others for word in command if "==" in word]
     locked = [line for line in setup.LOCK.read_text().splitlines() if line and not line.startswith("#")]
-    assert sorted(packages) == sorted(locked) and total == len(locked) + 1
+    assert sorted(packages) == sorted(locked)
     assert (tmp_path / "factorlib.pth").read_text() == "../../../..\n"
 
 
-def test_a_torch_of_another_index_is_asked_what_it_needs(monkeypatch, tmp_path):
-    called = []
-    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append((command, parts)) or True)
-    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
-    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
+def test_a_torch_of_another_index_is_asked_what_it_needs(called, monkeypatch):
     monkeypatch.setattr(setup, "torch_index", lambda: "https://example.org/cuda")
     setup.install_packages()
-    assert called[-1] == (setup.with_pip, [["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"]])
+    assert called[-1] == [setup.with_pip(["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"])]
 
 
-def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(monkeypatch, tmp_path):
-    called = []
-    monkeypatch.setattr(setup, "install", lambda parts, command, total, verb="install": called.append(command) or command is setup.with_pip)
-    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+@pytest.mark.parametrize("index, torch_by", [(setup.TORCH_CPU, "uv"), (None, "pip")])
+def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(called, monkeypatch, index, torch_by):
+    monkeypatch.setattr(setup, "install", lambda commands, total=0: called.append(commands) or len(called) > 1)
     monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(setup, "torch_index", lambda: setup.TORCH_CPU)
+    monkeypatch.setattr(setup, "torch_index", lambda: index)
     setup.install_packages()
-    assert called == [setup.with_uv, setup.with_pip]
+    (torch, others), by_pip = called[:2]
+    assert others[0] == "uv" and (torch[0] == "uv") == (torch_by == "uv") and setup.TORCH in torch
+    assert all(command[1:3] == ["-m", "pip"] for command in by_pip)

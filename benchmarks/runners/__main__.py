@@ -160,11 +160,16 @@ def as_table(timings: list[Timing]) -> str:
     for photos, verb in dict.fromkeys((one.photos, one.verb) for one in timings):
         of = {one.program: one for one in timings if (one.photos, one.verb) == (photos, verb)}
         ours = of[OURS]
-        row = [f"{3 * photos + 1} steps ({photos} photos), {verb}", f"{exact(median(ours.wall))} s"]
+        row = [f"{3 * photos + 1} steps ({photos} photos), {verb}", _seconds(ours)]
         for program in ("dvc", "snakemake"):
-            row += [f"{exact(median(of[program].wall))} s", f"{ratio(of[program], ours):.1f}×"] if program in of else ["", ""]
+            row += [_seconds(of[program]), f"{ratio(of[program], ours):.1f}×"] if program in of else ["", ""]
         rows.append(row)
     return table(["", "factorlib", "DVC", "", "Snakemake", ""], rows)
+
+
+def _seconds(one: Timing) -> str:
+    """Wall time, and in brackets that of processors."""
+    return f"{exact(median(one.wall))} s ({exact(median(one.processor))})"
 
 
 def ratio(other: Timing, ours: Timing) -> float:

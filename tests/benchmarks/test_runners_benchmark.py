@@ -57,5 +57,5 @@ def test_programs_that_are_not_there_are_left_out(tmp_path, capsys):
 
 def test_a_ratio_is_that_of_the_rounds():
     ours, theirs = Timing(6, "plan", "factorlib", [0.1, 0.2, 1.0], [0.1] * 3), Timing(6, "plan", "dvc", [0.5, 1.0, 5.0], [0.4] * 3)
-    assert "| 19 steps (6 photos), plan | .2 s | 1 s | 5.0× |  |  |" in as_table([ours, theirs])
+    assert "| 19 steps (6 photos), plan | .2 s (.1) | 1 s (.4) | 5.0× |  |  |" in as_table([ours, theirs])
     ElementTree.fromstring(picture([ours, theirs]))

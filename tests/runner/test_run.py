@@ -17,6 +17,7 @@ from factorlib.runner import verbs
 from factorlib.runner.gc import collect
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import Store
+from tests.faults.test_many_photos import own_modules
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, reasons, state, write
 
@@ -146,7 +147,8 @@ def test_a_value_out_of_bounds_is_refused_before_anything_runs(project, capsys, 
 @pytest.mark.parametrize("setting", ["upper.times=0", "upper.times=two", "table.scale=1.5"])
 @pytest.mark.parametrize("verb", [verbs.show_plan, verbs.show_why])
 def test_a_plan_checks_values_and_says_who_gave_them(project, capsys, verb, setting):
-    assert verb(project, verbs.Wish("set", settings=[setting])) == 1
+    with own_modules("stages", "toylib"):
+        assert verb(project, verbs.Wish("set", settings=[setting])) == 1
     said = capsys.readouterr()
     assert f"error: SET {setting}: " in said.err and "pipeline.yaml" not in said.err and not said.out
     name, value = setting.split("=")
@@ -154,7 +156,8 @@ def test_a_plan_checks_values_and_says_who_gave_them(project, capsys, verb, sett
     of_file = {"upper": toy.PIPELINE.replace("[dataset.photo], ", f"[dataset.photo], params: {{{param}: {value}}}, "),
                "table": toy.PIPELINE.replace("table: {}", f"table: {{params: {{{param}: {value}}}}}")}  # fmt: skip
     write(project.root / "pipeline.yaml", of_file[stage])
-    assert verb(project, verbs.Wish("set")) == 1
+    with own_modules("stages", "toylib"):
+        assert verb(project, verbs.Wish("set")) == 1
     said = capsys.readouterr().err
     assert "pipeline.yaml: " in said and f"stages.{stage}.params.{param}: " in said and "SET" not in said
 
