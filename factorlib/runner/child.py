@@ -26,6 +26,7 @@ from factorlib import arithmetic
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
+TRIM = "MALLOC_TRIM_THRESHOLD_"
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
 MAIN = f"import sys; sys.path.insert(0, {str(LIBRARY)!r}); from factorlib.runner.child import main; main()"
 
@@ -39,9 +40,13 @@ class Unwanted(Exception):
 
 
 def environment(threads: int) -> dict[str, str]:
-    """What a process that computes is started with: `threads` threads of every library, the same order of sets and the same instructions."""
+    """What a process that computes is started with: `threads` threads of every library, the same order of sets and the same instructions.
+
+    Dask's nanny has its workers give memory back at once, and glibc then asks the system for each large array anew: sums of
+    700 × 700 numbers take three times as long.  Children are started without that.
+    """
     fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
-    return {**os.environ, **fixed}
+    return {name: value for name, value in os.environ.items() if name != TRIM} | fixed
 
 
 class Child:

@@ -18,6 +18,7 @@ from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner import blocks, cluster, verbs
 from factorlib.runner.blocks import Site
+from factorlib.runner.child import TRIM
 from factorlib.runner.pipeline import read_pipeline, with_settings
 from factorlib.runner.project import LIBRARY
 from tests.runner import toy
@@ -165,12 +166,13 @@ def test_a_cluster_of_this_machine_gives_the_same_bytes(project, beside):
 
 
 def test_steps_have_the_environment_that_their_bits_ask_for_whatever_the_workers_were_started_in(project, live):
-    text = PROOF.replace('json.loads(os.environ["PROOF"])', repr(list(arithmetic.VARIABLES))).replace('if "PROOF" in os.environ else []', "")
+    text = PROOF.replace('json.loads(os.environ["PROOF"])', repr([*arithmetic.VARIABLES, TRIM])).replace('if "PROOF" in os.environ else []', "")
     write(project.root / "stages" / "proof.py", text)
     assert verbs.make(project, verbs.Wish("set", ["proof"], settings=live.settings)) == 0
     found = json.loads((project.build / "set" / "proof" / "environment.json").read_text())
     assert {name: found[name] for name in arithmetic.VARIABLES} == arithmetic.VARIABLES
     assert (found["PYTHONHASHSEED"], found["OMP_NUM_THREADS"]) == ("0", "2")
+    assert found[TRIM] is None, "Dask sets it, and large arrays are slow with it"
 
 
 def test_code_that_was_edited_between_two_runs_is_what_the_same_workers_run(project, live):
