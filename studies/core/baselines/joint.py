@@ -38,8 +38,8 @@ from studies.core.baselines.photos import Photos
 from studies.core.baselines.scene import Map
 from studies.core.case import light_name
 
-RATES = (0.003, 0.01, 0.03)
-RATE = 0.01
+RATES = (0.003, 0.01, 0.03, 0.1)
+RATE = 0.03
 PEAK = 99.9  # percentile of a picture
 AWAY = 5.0  # of the camera from the body's middle
 MAP_ROWS = 64  # of the lights that are written
