@@ -48,7 +48,7 @@ def test_an_extra_with_packages_of_its_own_gets_them_and_moves_none_of_the_lock(
     setup.install_extras()
     alone, (command, how, lock, *packages) = called
     assert alone[1] == "--no-deps" and (command, how, lock) == ("install", "-c", str(setup.LOCK))
-    assert [package.split(">")[0] for package in packages] == ["cloudpickle", "dask-jobqueue", "distributed"]
+    assert [package.split(">")[0] for package in packages] == ["cloudpickle", "dask", "dask-jobqueue", "distributed"]
 
 
 def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
