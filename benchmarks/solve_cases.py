@@ -12,7 +12,8 @@ import numpy as np
 import torch
 import typer
 
-from benchmarks.markdown import exact, refresh, table
+from benchmarks.markdown import refresh, table
+from benchmarks.numbers import exact
 from benchmarks.solve.hard_cases import BOUNDS, CASES, answered, of_random_starts
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator

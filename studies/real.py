@@ -14,7 +14,8 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.markdown import exact, refresh, table
+from benchmarks.markdown import refresh, table
+from benchmarks.numbers import exact
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets

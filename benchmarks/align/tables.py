@@ -10,7 +10,8 @@ from benchmarks.align.cases import RIGHT, WRONG
 from benchmarks.align.measure import RIGHT_DEG
 from benchmarks.align.real import common_turn
 from benchmarks.align.shapes import SHAPES
-from benchmarks.markdown import exact, table
+from benchmarks.markdown import table
+from benchmarks.numbers import exact
 
 
 def as_tables(rows: list[dict]) -> dict[str, str]:

@@ -11,7 +11,8 @@ from typing import Annotated
 import torch
 import typer
 
-from benchmarks.markdown import exact, refresh, table
+from benchmarks.markdown import refresh, table
+from benchmarks.numbers import exact
 from benchmarks.operator import laws
 from benchmarks.operator.cases import ALL, CASES, case
 from benchmarks.operator.rounding import measures

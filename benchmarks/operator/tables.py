@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.markdown import exact, table
+from benchmarks.markdown import table
+from benchmarks.numbers import exact
 from benchmarks.operator.figures import name_of, variant_of
 
 QUANTILES = ("median", "p95", "p99", "worst")

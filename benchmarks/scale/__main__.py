@@ -25,7 +25,8 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from benchmarks.markdown import ROOT, exact, refresh, table
+from benchmarks.markdown import ROOT, refresh, table
+from benchmarks.numbers import exact
 from benchmarks.scale.scenes import write_set
 from benchmarks.scale.watch import Cost, Watch
 from factorlib.errors import InputError

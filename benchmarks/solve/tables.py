@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.markdown import exact, table
+from benchmarks.markdown import table
+from benchmarks.numbers import exact
 
 LEVELS = (42, 45)  # dB
 

@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 import msgspec
 
+from benchmarks.numbers import exact
 from studies.core.measures import MEASURES
 from studies.core.table import Cell, Conclusion, Picture
 from studies.report.tables import answer_to_the_paper
@@ -37,12 +38,9 @@ def number(cell: Cell | None) -> str:
 
     >>> from studies.core.statistics import spread
     >>> number(Cell(spread([0.1, 0.12]), {})), number(Cell(spread([0.1]), {})), number(None)
-    ('.11 ± .127', '.1', '–')
+    ('.11 ± .13', '.1', '–')
     """
     if cell is None:
         return "–"
-    mean = f"{cell.spread.mean:.3g}".replace("0.", ".", 1) if abs(cell.spread.mean) < 1 else f"{cell.spread.mean:.3g}"
-    if cell.spread.high is None:
-        return mean
-    half = f"{cell.spread.high - cell.spread.mean:.3g}"
-    return f"{mean} ± {half.replace('0.', '.', 1) if half.startswith('0.') else half}"
+    mean = exact(cell.spread.mean, 3)
+    return mean if cell.spread.high is None else f"{mean} ± {exact(cell.spread.high - cell.spread.mean)}"

@@ -5,7 +5,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from benchmarks.markdown import exact, refresh, table
+from benchmarks.markdown import refresh, table
+from benchmarks.numbers import exact
 from benchmarks.operator import spheres
 from benchmarks.operator.figures import QUANTITIES, errors_by_input, time_against_error
 from benchmarks.operator.stability import DOCS
