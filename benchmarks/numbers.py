@@ -1,21 +1,12 @@
-"""Numbers as people write them."""
+"""The numbers of data/synthetic that are stored, quoted and spread over seeds and machines: dotted paths in metrics.json, and what they are."""
 
 from __future__ import annotations
 
-import re
+from factorlib.evaluate.table import SYNTHETIC
 
-
-def exact(value: float, digits: int = 2) -> str:
-    """That many significant digits, powers of ten for what is tiny or huge.
-
-    >>> exact(0.00123), exact(0.000012), exact(0.0), exact(12.3), exact(48000.0)
-    ('.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
-    """
-    if value == 0:
-        return "0"
-    value = float(f"{value:.{digits}g}")
-    if 1e-3 <= abs(value) < 1e4:
-        text = f"{value:.10f}".rstrip("0").rstrip(".")
-        return re.sub(r"^(-?)0\.", r"\1.", text)
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-    return f"{mantissa}·10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+NUMBERS = {
+    **{bound.path: bound.meaning for bound in SYNTHETIC},
+    "materials.mean_roughness": "roughness, mean over materials",
+    "materials.mean_diffuse": "diffuse, mean, relative",
+    "materials.mean_specular": "specular, mean, relative",
+}

@@ -13,7 +13,7 @@ import torch
 import typer
 
 from benchmarks.markdown import refresh, table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 from benchmarks.solve.hard_cases import BOUNDS, CASES, answered, of_random_starts
 from factorlib.jsonfile import json_text
 from factorlib.reflection import reflection_operator

@@ -13,7 +13,7 @@ import torch
 import typer
 
 from benchmarks.markdown import table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 from benchmarks.solve import hard_cases
 from benchmarks.solve.hard_cases import BOUNDS, CASES, answered
 from factorlib.reflection import reflection_operator

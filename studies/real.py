@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.markdown import refresh, table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets

@@ -11,7 +11,7 @@ from benchmarks.align.measure import RIGHT_DEG
 from benchmarks.align.real import common_turn
 from benchmarks.align.shapes import SHAPES
 from benchmarks.markdown import table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 
 
 def as_tables(rows: list[dict]) -> dict[str, str]:

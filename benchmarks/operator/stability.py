@@ -12,11 +12,11 @@ import torch
 import typer
 
 from benchmarks.markdown import refresh, table
-from benchmarks.numbers import exact
 from benchmarks.operator import laws
 from benchmarks.operator.cases import ALL, CASES, case
 from benchmarks.operator.rounding import measures
 from benchmarks.operator.variants import variants
+from benchmarks.rounded import exact
 from factorlib.jsonfile import json_text
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "operator.md"

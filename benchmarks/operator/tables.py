@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from benchmarks.markdown import table
-from benchmarks.numbers import exact
 from benchmarks.operator.figures import name_of, variant_of
+from benchmarks.rounded import exact
 
 QUANTILES = ("median", "p95", "p99", "worst")
 SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}

@@ -26,7 +26,7 @@ import msgspec
 import typer
 
 from benchmarks.markdown import ROOT, refresh, table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 from benchmarks.runners.picture import picture
 from benchmarks.runners.projects import WORK, WRITERS, make_outputs, names, write_photos
 from factorlib.wholefile import write_text

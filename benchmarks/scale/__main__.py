@@ -26,7 +26,7 @@ import msgspec
 import typer
 
 from benchmarks.markdown import ROOT, refresh, table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 from benchmarks.scale.scenes import write_set
 from benchmarks.scale.watch import Cost, Watch
 from factorlib.errors import InputError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.markdown import table
-from benchmarks.numbers import exact
+from benchmarks.rounded import exact
 
 LEVELS = (42, 45)  # dB
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.markdown import refresh, table
-from benchmarks.numbers import exact
 from benchmarks.operator import spheres
 from benchmarks.operator.figures import QUANTITIES, errors_by_input, time_against_error
 from benchmarks.operator.stability import DOCS
 from benchmarks.operator.tables import SLOPES, as_tables
+from benchmarks.rounded import exact
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.evaluate.ball import ball_normals
