@@ -37,7 +37,9 @@ def sentences(found: Conclusion) -> list[str]:
 
 
 def answer_to_the_paper(found: Conclusion) -> str:
-    """Agrees where all claims that are the paper's are shown, disagrees where the opposite of one is, else why it is not decided.
+    """Agrees where all claims that are the paper's are shown, in part where some are, disagrees where the opposite of one is.
+
+    Where none is shown, it says why.
 
     Studies without a claim of the paper's are said to have none.
     """
@@ -48,7 +50,9 @@ def answer_to_the_paper(found: Conclusion) -> str:
         return found.answer
     if not answers:
         return "the paper claims nothing that is tested here"
-    for answer in ("disagrees", "not tested: too few seeds", "no difference is shown"):
-        if answer in answers:
-            return answer
-    return "agrees"
+    if "disagrees" in answers:
+        return "disagrees"
+    shown = answers.count("agrees")
+    if 0 < shown < len(answers):
+        return f"agrees in part: {shown} of {len(answers)} claims are shown"
+    return answers[0]

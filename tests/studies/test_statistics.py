@@ -99,6 +99,14 @@ def test_rises_are_compared_per_unit(b, c, answer):
     assert found.claims[0].difference.spread.mean == pytest.approx((c - b) / 2 - (b - 0.1), abs=1e-4)
 
 
+def test_an_answer_in_part_says_of_how_many():
+    """a < b is shown for the one measure; of the other there is nothing to see."""
+    given = {name: Score(s.values | {"roughness": 0.2 + 0.01 * (k % 2)}, s.nulls) for k, (name, s) in enumerate(scores(FULL, a=0.1, b=0.2).items())}
+    found = concluded(study(CLAIM, Claim("roughness", "a", "b", "…")), FULL, given)
+    assert answer_to_the_paper(found) == "agrees in part: 1 of 2 claims are shown"
+    assert answer_to_the_paper(concluded(study(Claim("roughness", "a", "b", "…")), FULL, given)) == "no difference is shown"
+
+
 def test_a_quick_study_concludes_nothing_and_says_so():
     found = concluded(study(CLAIM), QUICK, scores(QUICK, a=0.1, b=0.9))
     assert "no conclusion" in paragraph(found) and "not tested" in paragraph(found)
