@@ -154,7 +154,7 @@ def _client(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         workers, threads = nprocesses_nthreads(machine_cores())
         with (
-            dask.config.set(dask.config.collect_env(QUIET)),
+            dask.config.set(dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))),  # `set` replaces whole branches
             LocalCluster(
                 workers, threads, host="127.0.0.1", dashboard_address=None, memory_limit=0, resources={CORES: threads}, silence_logs=logging.CRITICAL
             ) as cluster,

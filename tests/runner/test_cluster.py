@@ -159,7 +159,6 @@ def test_any_number_of_workers_gives_the_same_bytes(project, beside, tmp_path, w
     assert kept(project) == kept(beside)
 
 
-@pytest.mark.long
 def test_a_cluster_of_this_machine_gives_the_same_bytes(project, beside):
     assert start(project, "executor=dask").wait(300) == 0
     assert kept(project) == kept(beside)
