@@ -7,7 +7,7 @@ A default may stand in a base class, or be taken from an instance that a module 
     class Params(Bundle, frozen=True):
         noise_absolute: float = NOISE.absolute
 
-As a value, so that a parameter that is set to its default can be told from one that changes something, a default is also
+As a value, so that a parameter that is set to its default can be distinguished from one that changes something, a default is also
 followed to a constant of a module (`CREASE_DEG`) and into a struct of parameters (`Limits()`).
 """
 
