@@ -2,7 +2,7 @@
 
 Noise     each radiance times 1 + .01 · normal, drawn for each entry by itself, so that an entry that two cases show has
           the same noise in both.
-Normals   harmed after rendering: the solve gets a normal that is not the pixel's.
+Normals   perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels    likewise: the pixel is of one material, its label names another one of the same photo.
 Facets    rendered so: a flat-sided object, whose normals are true but few.
 """

@@ -1,4 +1,4 @@
-"""What no photo tells, a factor per channel between all materials and all lights, taken out of an answer by the true materials."""
+"""What no photo determines, a factor per channel between all materials and all lights, taken out of an answer by the true materials."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ Shading    S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflec
 Albedo     a, one a material and channel: in turn with e by weighted least squares of I − a S.
 Highlight  max(I − a S, 0).  So that it does not pull at albedo and shading, a pixel's weight is 1 / (1 + (r/s)²) where its residual
            r is positive in the mean over channels, s the median size of those that are negative, or `LEAST` of the mean if that is more.
-Average    a photo tells albedos but for a factor per channel: ln a_mi = α_m + β_i in least squares over photos i.  α is the answer,
+Average    a photo determines albedos but for a factor per channel: ln a_mi = α_m + β_i in least squares over photos i.  α is the answer,
            β goes into the photo's shading.
 New light  its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over photos.
 """
@@ -116,7 +116,7 @@ class Intrinsic(msgspec.Struct, frozen=True):
         return self._shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, seen)
 
     def new_material(self, material: Reflectance, light: int, seen: Seen) -> Radiance | None:
-        """The light that the shading tells of, of nine harmonics, reflected by the given material."""
+        """The light that the shading determines, of nine harmonics, reflected by the given material."""
         return Scene(self.lights[light], seen).of(material)
 
     def _shaded(self, material: str, shading: Coefficients, highlight: Radiance, seen: Seen) -> Radiance:

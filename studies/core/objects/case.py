@@ -36,7 +36,7 @@ class ObjectsCase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pixels:      most observations of an entry
     harm:        of every object alike, toward random sides
     robust:      whether the solve has its robust loss
-    confidence:  whether it hears how sure each normal is, as the stage `align` says it
+    confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
     refined:     whether every pose is first fitted to the outline of its mask by `factorlib.align.refine`, from where the harm left it
     start:       nothing, or the solution of all photos but the last (the stage's parameter `start`)
     solve:       parameters of the stage `solve` that differ from their defaults
