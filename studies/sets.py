@@ -33,7 +33,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from studies.catalogue.paper_sets import patterns
-from studies.core.case import Entry
+from studies.core.entries import Entry
 from studies.core.objects.case import SEVEN
 from studies.core.objects.world import BODIES, CAMERA, SIDE, body, body_of, materials_of, pose_of
 from studies.core.observed import NOISE

@@ -31,7 +31,7 @@ def settings(scale: Scale) -> list[Setting]:
 def _setting(scale: Scale, x: int, method: Method) -> Setting:
     entries = tuple(full_matrix(scale.side, scale.side))
     size, joint = SIZES[scale.name], JOINT[scale.name]
-    return Setting(method, LABELS[method], x, lambda seed: Comparison(seed, method, entries, size, joint, scale.solve))
+    return Setting(method, LABELS[method], x, lambda seed: Comparison(seed, entries, method, size, joint, scale.solve))
 
 
 def claims(scale: Scale) -> list[Claim]:

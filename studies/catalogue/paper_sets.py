@@ -11,7 +11,7 @@ Measured   entries that were observed and those that were not.  The paper's phot
 
 from __future__ import annotations
 
-from studies.core.case import Entry
+from studies.core.entries import Entry
 from studies.core.objects.case import ObjectsCase
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 

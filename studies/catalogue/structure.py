@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from studies.core.case import Entry
+from studies.core.entries import Entry
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 

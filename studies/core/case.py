@@ -7,19 +7,18 @@ show equal materials in equal lights, so that settings are compared seed by seed
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
+from studies.core.entries import Entries
+
 NAMES = ("brick", "leaf", "lacquer", "chalk", "gold")  # of the materials of every world
 
-Entry = tuple[int, int]  # a material and a light
 
-
-class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Case(Entries, frozen=True, forbid_unknown_fields=True):
     """What one solve sees.
 
-    entries:       observed ones
     size:          pixels across a sphere
     normal_deg:    normals are turned by |N(0, normal_deg)| degrees toward random sides
     wrong_labels:  share of each sphere's pixels whose label names another material of the same photo
@@ -27,28 +26,13 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     solve:         parameters of the stage `solve` that differ from their defaults
     """
 
-    seed: int
-    entries: tuple[Entry, ...]
+    names: ClassVar[tuple[str, ...]] = NAMES
+
     size: int
     normal_deg: float = 0.0
     wrong_labels: float = 0.0
     facets: int | None = None
-    solve: dict[str, Any] = {}
-
-    @property
-    def materials(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({m for m, _ in self.entries})
-
-    @property
-    def material_names(self) -> list[str]:
-        """The same by name, in the order of their numbers in the case's observations."""
-        return [NAMES[m] for m in self.materials]
-
-    @property
-    def lights(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({li for _, li in self.entries})
+    solve: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

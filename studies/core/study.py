@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from studies.core.case import NAMES, Case, Entry, World
+from studies.core.case import NAMES, Case, World
+from studies.core.entries import Entry
 
 
 class Scale(msgspec.Struct, frozen=True):

@@ -20,7 +20,7 @@ def light(seed: int, rows: int = 32) -> np.ndarray:
 
 def case(method: str, side: int = 3, size: int = 24, seed: int = 0) -> Comparison:
     """All of so many materials in as many lights."""
-    return Comparison(seed, method, tuple(full_matrix(side, side)), size, Joint(12, 2))
+    return Comparison(seed, tuple(full_matrix(side, side)), method, size, Joint(12, 2))
 
 
 def lights(seed: int, count: int = 4) -> dict[int, np.ndarray]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from studies.core.case import NAMES, Entry
+from studies.core.case import NAMES
+from studies.core.entries import Entries
 
 Method = Literal["projective", "intrinsic", "grey", "mitsuba", "ours"]
 
@@ -21,34 +22,19 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     steps: int
 
 
-class Comparison(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Comparison(Entries, frozen=True, forbid_unknown_fields=True):
     """What a method sees, and which method.
 
-    entries: observed ones: materials × lights;  size: pixels across a photo of one object, as its camera sees it and as it is predicted
-    solve:   parameters of the stage `solve` that differ from their defaults
+    size:   pixels across a photo of one object, as its camera sees it and as it is predicted
+    solve:  parameters of the stage `solve` that differ from their defaults
     """
 
-    seed: int
+    names: ClassVar[tuple[str, ...]] = NAMES
+
     method: Method
-    entries: tuple[Entry, ...]
     size: int
     joint: Joint
-    solve: dict[str, Any] = {}
-
-    @property
-    def materials(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({m for m, _ in self.entries})
-
-    @property
-    def material_names(self) -> list[str]:
-        """The same by name, in the order of their numbers in the photos."""
-        return [NAMES[m] for m in self.materials]
-
-    @property
-    def lights(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({li for _, li in self.entries})
+    solve: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -5,11 +5,12 @@ Materials are seven, the first five about those of `studies.core.case.NAMES`; li
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from studies.core.case import NAMES, Entry
+from studies.core.case import NAMES
+from studies.core.entries import Entries
 
 SEVEN = (*NAMES, "tile", "bronze")
 
@@ -29,10 +30,9 @@ class Harm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     triangles: int | None = None
 
 
-class ObjectsCase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one solve sees.
+class ObjectsCase(Entries, frozen=True, forbid_unknown_fields=True):
+    """What one solve sees: an object for each entry.
 
-    entries:     observed ones, an object each
     pixels:      most observations of an entry
     harm:        of every object alike, toward random sides
     robust:      whether the solve has its robust loss
@@ -42,31 +42,12 @@ class ObjectsCase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     solve:       parameters of the stage `solve` that differ from their defaults
     """
 
-    seed: int
-    entries: tuple[Entry, ...]
+    names: ClassVar[tuple[str, ...]] = SEVEN
+
     pixels: int
     harm: Harm = Harm()
     robust: bool = True
     confidence: bool = True
     refined: bool = False
     start: Literal["nothing", "earlier"] = "nothing"
-    solve: dict[str, Any] = {}
-
-    @property
-    def materials(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({m for m, _ in self.entries})
-
-    @property
-    def material_names(self) -> list[str]:
-        """The same by name, in the order of their numbers in the case's observations."""
-        return [SEVEN[m] for m in self.materials]
-
-    @property
-    def lights(self) -> list[int]:
-        """Those that are seen, in order."""
-        return sorted({li for _, li in self.entries})
-
-    def names_in(self, light: int) -> list[str]:
-        """Of the materials that are seen in a light."""
-        return [SEVEN[m] for m, at in self.entries if at == light]
+    solve: dict[str, Any] = msgspec.field(default_factory=dict)
