@@ -7,6 +7,7 @@ show equal materials in equal lights, so that settings are compared seed by seed
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import msgspec
@@ -48,9 +49,18 @@ class Score(msgspec.Struct, frozen=True):
     """values: by measure;  nulls: of those that have one.  A measure that the case does not have is left out."""
 
     values: dict[str, float]
-    nulls: dict[str, float]
+    nulls: dict[str, float] = {}
+
+    def __or__(self, other: Score) -> Score:
+        """The measures of both."""
+        return Score(self.values | other.values, self.nulls | other.nulls)
 
 
 def light_name(light: int) -> str:
     """Of the illumination, and of the photo that is in it."""
     return f"light{light}"
+
+
+def named(lights: Mapping[int, Any]) -> dict[str, Any]:
+    """What lights are by number, by their names."""
+    return {light_name(li): of for li, of in lights.items()}

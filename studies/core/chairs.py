@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from benchmarks.splits import Split, flat, solved, splits_of, unseen
@@ -17,21 +16,19 @@ from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.diagnose.answer import Answer
 from factorlib.evaluate.ball import Light, light_of_lat_long
-from factorlib.evaluate.lights import compare_lights
-from factorlib.evaluate.materials import compare_materials
 from factorlib.generate.eames import SET, Parameters, generate
 from factorlib.images.exr import read_rgb_exr
-from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.stage import silent
 from factorlib.urm.observations import read_observations
 from studies.core.case import Score
+from studies.core.errors import light_errors, material_errors
+from studies.core.lights import map_of
 from studies.core.part import PARTS, Chairs, Part
 from studies.core.pipeline import run_stages
 
-MAP_ROWS = 128  # of recovered lights
 GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
 
 
@@ -55,7 +52,8 @@ def score_of(case: Part, folder: Path, observed: Path) -> Score:
     solution = solved(blocks, len(names), operator, how)
     answer = Answer(names, JointProblem(blocks, operator), solution, {}, "bundle")
     values = {"unseen": relative(unseen(splits, solution, operator)), "kept_parts": kept(answer)}
-    return _joined(Score(values, {"unseen": relative([flat(split) for split in splits])}), _against_truth(dataset, answer, splits))
+    of_cells = Score(values, {"unseen": relative([flat(split) for split in splits])})
+    return of_cells | _of_materials(dataset, answer, splits) | _of_lights(dataset, answer)
 
 
 def relative(decibels: Sequence[float]) -> float:
@@ -73,23 +71,15 @@ def kept(answer: Answer) -> float:
     return float(found.shadows.kept + found.interreflection.kept + found.light_prior.kept + any(one.kept for one in found.tone))
 
 
-def _against_truth(dataset: Dataset, answer: Answer, splits: Sequence[Split]) -> Score:
+def _of_materials(dataset: Dataset, answer: Answer, splits: Sequence[Split]) -> Score:
     seen = {answer.names[m] for split in splits for m in np.unique(split.seen.material)}
     of = answer.solution.point.materials
     rows = {n: Reflectance(tuple(of.diffuse[k].tolist()), tuple(of.specular[k].tolist()), float(of.roughness[k])) for k, n in enumerate(answer.names)}
     truths = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in dataset.truth.materials.items()}
-    errors = compare_materials({n: rows[n] for n in sorted(seen)}, truths, dict.fromkeys(seen, 0))
-    parts = ("diffuse", "specular", "roughness")
-    materials = Score(*({part: getattr(errors, f"{prefix}_{part}") for part in parts} for prefix in ("mean", "null_mean")))
-    return _joined(materials, _of_lights(dataset, answer))
+    return material_errors({n: rows[n] for n in sorted(seen)}, truths, dict.fromkeys(seen, 0))
 
 
 def _of_lights(dataset: Dataset, answer: Answer) -> Score:
-    found = {name: light_of_lat_long(lat_long_of_lobes(lobes, MAP_ROWS, 2 * MAP_ROWS)) for name, lobes in answer.lights().items()}
+    found = {name: light_of_lat_long(map_of(lobes)) for name, lobes in answer.lights().items()}
     truths: dict[str, Light] = {name: light_of_lat_long(read_rgb_exr(dataset.folder / dataset.truth.illumination[name])) for name in found}
-    scored = {view: compare_lights(found, truths, {}).mean[GAUGE][view] for view in ("glossy", "mirror")}
-    return Score({v: s.estimate.rmse for v, s in scored.items()}, {v: s.null.rmse for v, s in scored.items()})
-
-
-def _joined(one: Score, other: Score) -> Score:
-    return msgspec.structs.replace(one, values=one.values | other.values, nulls=one.nulls | other.nulls)
+    return light_errors(found, truths, GAUGE, ("glossy", "mirror"))

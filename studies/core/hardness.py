@@ -18,7 +18,7 @@ from studies.core.hard import Hard
 def score_of(case: Hard) -> Score:
     """By the table that the case is of."""
     values = {"operator": operator, "solve": solve, "align": align}[case.table](case)
-    return Score({measure: float(value) for measure, value in values.items()}, {})
+    return Score({measure: float(value) for measure, value in values.items()})
 
 
 def operator(case: Hard) -> dict[str, float]:

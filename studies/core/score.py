@@ -1,8 +1,8 @@
 """How far a solve is from the truth of its world.
 
-Pictures are spheres, compared by DSSIM inside the disc after the tone map of `factorlib.evaluate.picture`, nothing scaled but
-for one thing: what no observation tells, a factor per channel between the materials and the lights of a connected
-component, is taken out first (`common_factor`, from the materials).
+Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by DSSIM inside the
+disc after the tone map of `factorlib.evaluate.picture`, nothing scaled but for one thing: what no observation tells, a factor per
+channel between the materials and the lights of a connected component, is taken out first (`studies.core.gauge`).
 
     entries        recovered materials in recovered lights: every entry of the rows and columns that were seen; observed,
                    unobserved: those entries alone; no factor is in it where a material and a light are connected
@@ -11,7 +11,8 @@ component, is taken out first (`common_factor`, from the materials).
     first_material, first_light   of those, the material 0 and the light 0 of the world alone, which cases of all sizes share
 
 The rest are errors of the materials' numbers, of the three spheres in the recovered lights (RMSE over the truth's RMS), and
-the standard errors that the solve states.  Nulls: what a guess scores that knows nothing but mean colours.
+the standard errors that the solve states.  Nulls: what a guess scores that knows nothing but mean colours; that of observed
+entries is of these alone, as that of unobserved ones is.
 """
 
 from __future__ import annotations
@@ -23,130 +24,105 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, constant_light, light_of_lat_long
+from factorlib.evaluate.ball import Light, constant_light
 from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.lights import compare_lights
-from factorlib.evaluate.materials import GREY, common_factor, compare_materials
+from factorlib.evaluate.materials import GREY
 from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.evaluate.relighting import Appearances
-from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, Solved, read_materials
-from studies.core.case import NAMES, Case, Score, light_name
-from studies.core.world import materials_of
+from studies.core.case import Score, light_name, named
+from studies.core.entries import Entries
+from studies.core.errors import light_errors, material_errors
+from studies.core.gauge import Answer, factor_of, in_true_gauge, times
+from studies.core.lights import lights_of
 
-MAP_ROWS = 128  # of recovered lights, as the stage `export` writes them
 LEAST = 1e-3  # of a reflectance, below which a relative standard error means nothing
 
 
-class Answer(msgspec.Struct, frozen=True):
-    """What was solved, in the truth's gauge: materials by name, lights by number."""
+class Scored(msgspec.Struct, frozen=True):
+    """The scores of a case, and the spheres that they compare."""
 
-    materials: dict[str, Reflectance]
-    lights: dict[int, Light]
+    score: Score
+    pictures: Pictures
 
 
-def score_of(case: Case, solved: Path, lights: Mapping[int, Light]) -> Score:
-    """The scores of the files that `solve` wrote; lights: all true ones of the world."""
+def scored(case: Entries, truths: Mapping[str, Reflectance], solved: Path, lights: Mapping[int, Light]) -> Scored:
+    """Of the files that `solve` wrote; truths, lights: all true ones of the world."""
     table = read_materials(solved / "materials.json").materials
-    truths = materials_of(case.seed)
-    component = connected_components({light_name(li): [NAMES[m] for m, at in case.entries if at == li] for li in case.lights})
-    answer = in_true_gauge(case, table, _lights(case, solved), truths, component)
+    component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
+    answer = in_true_gauge(case, table, lights_of(solved, case.lights), truths, component)
     pictures = Pictures(case, answer, truths, lights)
-    values, nulls = pictures.scores()
-    errors = compare_materials({n: table[n].reflectance for n in component}, truths, component)
-    for part in ("diffuse", "specular", "roughness"):
-        values[part], nulls[part] = getattr(errors, f"mean_{part}"), getattr(errors, f"null_mean_{part}")
-    spheres = compare_lights(*({light_name(li): of[li] for li in case.lights} for of in (answer.lights, lights)), {})
-    for view in ("mirror", "glossy", "matte"):
-        scored = spheres.mean["none"][view]
-        values[view], nulls[view] = scored.estimate.rmse, scored.null.rmse
-    return Score(values | stated_errors({n: table[n] for n in component}), nulls)
+    materials = material_errors({n: table[n].reflectance for n in component}, truths, component)
+    spheres = light_errors(named(answer.lights), named(lights))
+    return Scored(pictures.score() | materials | spheres | stated_errors({n: table[n] for n in component}), pictures)
 
 
-def _lights(case: Case, solved: Path) -> dict[int, Light]:
-    lobes = read_lobes(solved / "lobes.parquet")
-    return {li: light_of_lat_long(lat_long_of_lobes(lobes[light_name(li)], MAP_ROWS, 2 * MAP_ROWS)) for li in case.lights}
-
-
-def in_true_gauge(
-    case: Case,
-    table: Mapping[str, Reflectance],
-    lights: Mapping[int, Light],
-    truths: Mapping[str, Reflectance],
-    component: Mapping[str, int],
-) -> Answer:
-    """Each component's materials times its factor per channel, its lights divided by it."""
-    materials, scaled = {}, {}
-    for number in sorted(set(component.values())):
-        names = [n for n in case.material_names if component[n] == number]
-        factor = np.array(common_factor([table[n] for n in names], [truths[n] for n in names]))
-        materials |= {n: _times(table[n], factor) for n in names}
-        for li in {at for m, at in case.entries if NAMES[m] in names}:
-            scaled[li] = Light(tuple((level / factor).astype(np.float32) for level in lights[li].levels))
-    return Answer(materials, {li: scaled[li] for li in case.lights})
-
-
-def _times(material: Reflectance, factor: Float[np.ndarray, "3"]) -> Reflectance:
-    diffuse, specular = (tuple((np.array(k) * factor).tolist()) for k in (material.diffuse, material.specular))
-    return Reflectance(diffuse, specular, material.roughness)
-
-
-def stated_errors(table: Mapping[str, Solved]) -> dict[str, float]:
+def stated_errors(table: Mapping[str, Solved]) -> Score:
     """Means over materials of the standard errors that the solve states: of roughness, and of k_d + k_s relative to it."""
     relative = [
         float(np.mean(np.hypot(m.stderr.diffuse, m.stderr.specular) / np.maximum(np.add(m.diffuse, m.specular), LEAST))) for m in table.values()
     ]
-    return {
+    return Score({
         "stated_roughness": float(np.mean([m.stderr.roughness for m in table.values()])),
         "stated_reflectance": float(np.mean(relative)),
-    }
+    })  # fmt: skip
 
 
 class Pictures:
     """Spheres of true and recovered materials in true and recovered lights, each rendered once."""
 
-    def __init__(self, case: Case, answer: Answer, truths: Mapping[str, Reflectance], lights: Mapping[int, Light]):
+    def __init__(self, case: Entries, answer: Answer, truths: Mapping[str, Reflectance], lights: Mapping[int, Light]):
         self.case, self.answer, self.truths = case, answer, truths
         self.true = {li: Appearances(light) for li, light in lights.items()}
         self.found = {li: Appearances(light) for li, light in answer.lights.items()}
         self.inside = next(iter(self.true.values())).inside
 
-    def scores(self) -> tuple[dict[str, float], dict[str, float]]:
+    def score(self) -> Score:
         """DSSIM of what is predicted, and of what nulls predict."""
-        case, names = self.case, self.case.material_names
-        entries = {(n, li): self._entry(n, li) for n in names for li in case.lights}
-        observed = {(NAMES[m], li) for m, li in case.entries}
-        parts = {"entries": entries, "observed": entries.keys() & observed, "unobserved": entries.keys() - observed}
-        values = {part: _mean(entries[e] for e in sorted(of)) for part, of in parts.items() if of}
-        flat = _mean(self._dssim(self._truth(n, li).mean(axis=0, keepdims=True), n, li) for n, li in entries)
-        grey = _times(GREY, np.array(common_factor([GREY] * len(names), [self.truths[n] for n in names])))
+        return self._of_entries() | self._of_all()
+
+    def _of_entries(self) -> Score:
+        """Recovered materials in recovered lights; the null knows each true sphere's mean colour."""
+        entries = {(n, li) for n in self.case.material_names for li in self.case.lights}
+        observed = {(self.case.names[m], li) for m, li in self.case.entries}
+        parts = {"entries": entries, "observed": observed, "unobserved": entries - observed}
+        found = {e: self._dssim(self.recovered(*e), *e) for e in entries}
+        flat = {e: self._dssim(self.truth(*e).mean(axis=0, keepdims=True), *e) for e in entries}
+        return Score(*({part: _mean(error[e] for e in sorted(of)) for part, of in parts.items() if of} for error in (found, flat)))
+
+    def _of_all(self) -> Score:
+        """Recovered materials in all true lights, and all true materials in the recovered lights."""
+        names, lights = self.case.material_names, self.case.lights
+        grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
         in_lights = {n: _mean(self._dssim(self.true[li].ball(self.answer.materials[n]), n, li) for li in self.true) for n in names}
-        of_materials = {li: _mean(self._dssim(self.found[li].ball(of), n, li) for n, of in self.truths.items()) for li in case.lights}
-        values |= {"new_light": _mean(in_lights.values()), "new_material": _mean(of_materials.values())}
-        values |= {"first_material": in_lights[NAMES[0]]} if NAMES[0] in in_lights else {}
+        of_materials = {li: _mean(self._dssim(self.found[li].ball(of), n, li) for n, of in self.truths.items()) for li in lights}
+        values = {"new_light": _mean(in_lights.values()), "new_material": _mean(of_materials.values())}
+        values |= {"first_material": in_lights[first]} if (first := self.case.names[0]) in in_lights else {}
         values |= {"first_light": of_materials[0]} if 0 in of_materials else {}
-        return values, dict.fromkeys(parts.keys() & values.keys(), flat) | {
+        return Score(values, {
             "new_light": _mean(self._dssim(self.true[li].ball(grey), n, li) for n in names for li in self.true),
             "new_material": self._null_of_lights(),
-        }
-
-    def _entry(self, name: str, light: int) -> float:
-        return self._dssim(self.found[light].ball(self.answer.materials[name]), name, light)
+        })  # fmt: skip
 
     def _null_of_lights(self) -> float:
         """Of constant lights of the true ones' mean colours."""
         white = Appearances(constant_light(np.ones(3)))
         return _mean(self._dssim(white.ball(of) * self.true[li].light.mean, n, li) for n, of in self.truths.items() for li in self.case.lights)
 
-    def _truth(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
+    def truth(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
+        """Radiance of a true material in a true light, a row for each pixel inside the disc."""
         return self.true[light].ball(self.truths[name])
 
-    def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
-        truth = self._picture(self._truth(name, light))
-        return picture_error(self._picture(predicted), truth, self.inside, white_of(truth, self.inside)).dssim
+    def recovered(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
+        """Likewise of a recovered material in a recovered light."""
+        return self.found[light].ball(self.answer.materials[name])
 
-    def _picture(self, samples: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "h w 3"]:
+    def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
+        truth = self.picture(self.truth(name, light))
+        return picture_error(self.picture(predicted), truth, self.inside, white_of(truth, self.inside)).dssim
+
+    def picture(self, samples: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "h w 3"]:
+        """Radiance of the pixels inside the disc as a picture, black outside."""
         picture = np.zeros((*self.inside.shape, 3))
         picture[self.inside] = samples
         return picture

@@ -15,24 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
-from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.ball import Light
 from factorlib.evaluate.lights import compare_lights
-from factorlib.evaluate.materials import common_factor
-from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import read_materials
-from studies.core.case import Case, Score, light_name
-from studies.core.score import MAP_ROWS, in_true_gauge
+from studies.core.case import Case, Score, named
+from studies.core.gauge import factor_of, in_true_gauge
+from studies.core.lights import lights_of
 from studies.core.world import materials_of
 
 
 def tints_of(case: Case, solved: Path, lights: Mapping[int, Light]) -> Score:
     """By measure, of the files that `solve` wrote; the case's materials and lights are linked; lights: true ones."""
-    table, truths, found = read_materials(solved / "materials.json").materials, materials_of(case.seed), recovered(case, solved)
+    table, truths, found = read_materials(solved / "materials.json").materials, materials_of(case.seed), lights_of(solved, case.lights)
     names = case.material_names
-    factor = np.log(common_factor([table[n].reflectance for n in names], [truths[n] for n in names]))
+    factor = np.log(factor_of({n: table[n] for n in names}, truths))
     scaled = in_true_gauge(case, table, found, truths, dict.fromkeys(names, 0)).lights
-    spheres = compare_lights(*({light_name(li): of[li] for li in case.lights} for of in (scaled, lights)), {})
+    spheres = compare_lights(named(scaled), named(lights), {})
     mirror = spheres.mean["none"]["mirror"]
     values = {
         "chromaticity": chromaticity([found[li] for li in case.lights]),
@@ -41,12 +39,6 @@ def tints_of(case: Case, solved: Path, lights: Mapping[int, Light]) -> Score:
         "tint": float(np.std(factor)),
     }
     return Score(values, {"colour": mirror.null.rgb_angle_deg})
-
-
-def recovered(case: Case, solved: Path) -> dict[int, Light]:
-    """The lights that `solve` wrote, in its own gauge."""
-    lobes = read_lobes(solved / "lobes.parquet")
-    return {li: light_of_lat_long(lat_long_of_lobes(lobes[light_name(li)], MAP_ROWS, 2 * MAP_ROWS)) for li in case.lights}
 
 
 def chromaticity(lights: list[Light]) -> float:

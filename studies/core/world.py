@@ -38,9 +38,9 @@ SPREAD = 0.15
 GRAZING = 0.15  # n·o below which no pixel is seen
 
 
-def materials_of(seed: int) -> dict[str, Reflectance]:
+def materials_of(seed: int, about: dict[str, Material] = ABOUT) -> dict[str, Reflectance]:
     """The materials of a world by name."""
-    drawn = drawn_materials(np.random.default_rng([11, seed]), SPREAD, ABOUT)
+    drawn = drawn_materials(np.random.default_rng([11, seed]), SPREAD, about)
     return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
 
 

@@ -8,7 +8,7 @@ from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.evaluate.materials import compare_materials
 from factorlib.results.materials import Reflectance
 from studies.core.baselines.body import level, mesh, pose, seen, turn
-from studies.core.baselines.gauge import factor_of, in_gauge, lambertian_part, times
+from studies.core.baselines.gauge import in_gauge, lambertian_part
 from studies.core.baselines.grey import grey
 from studies.core.baselines.intrinsic import LAMBERT, averaged, decomposed, harmonics, intrinsic, light_coefficients, light_map
 from studies.core.baselines.photos import Photos, observations_of, read_photos
@@ -17,6 +17,7 @@ from studies.core.baselines.projective import Texture, projective
 from studies.core.baselines.scene import Scene
 from studies.core.baselines.score import KINDS, SUFFIXES, World, score_of, shots
 from studies.core.baselines.show import sheet
+from studies.core.gauge import factor_of, times
 from studies.core.world import materials_of
 from tests.studies.made_body import case, light, lights, photos
 

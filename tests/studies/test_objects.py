@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import FRONT
-from factorlib.evaluate.ball import Light, constant_light
+from factorlib.evaluate.ball import constant_light
 from factorlib.evaluate.gauge import connected_components
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.results.materials import Reflectance
 from factorlib.solve import natural, rounds
 from factorlib.stage import Inputs, silent
 from studies.catalogue.paper_sets import docksta, unlinked
 from studies.core.case import World, light_name
-from studies.core.objects.case import SEVEN, Harm, ObjectsCase
+from studies.core.objects.case import Harm, ObjectsCase
 from studies.core.objects.observed import observations_of, together
-from studies.core.objects.score import SevenPictures, in_true_gauge
 from studies.core.objects.treatment import BEYOND_ALL, robust_loss
 from studies.core.objects.world import BODIES, SIDE, body, materials_of, with_one_light_more
 from studies.core.study import full_matrix
@@ -98,38 +96,6 @@ def test_docksta_is_linked_by_one_material():
         case = ObjectsCase(0, tuple(entries), 10)
         component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
         assert len(set(component.values())) == parts
-
-
-def times(material, factor):
-    return Reflectance(tuple(np.array(material.diffuse) * factor), tuple(np.array(material.specular) * factor), material.roughness)
-
-
-CASE = ObjectsCase(0, ((5, 0), (6, 0), (2, 1)), 10)  # two components, and the two materials that spheres do not have
-COMPONENT = {SEVEN[5]: 0, SEVEN[6]: 0, SEVEN[2]: 1}
-
-
-def pictures(factors, roughness=0.0):
-    """The truth, each component's materials times a factor per channel, its lights divided by it."""
-    table = {n: times(TRUTHS[n], factors[c]) for n, c in COMPONENT.items()}
-    table = {n: Reflectance(m.diffuse, m.specular, m.roughness + roughness) for n, m in table.items()}
-    lights = {li: Light(tuple(level / factors[li] for level in LIGHTS[li].levels)) for li in CASE.lights}
-    return SevenPictures(CASE, in_true_gauge(CASE, table, lights, COMPONENT), TRUTHS, LIGHTS)
-
-
-ONES, FACTORS = np.ones((2, 3)), np.array([[0.5, 0.7, 0.9], [0.3, 0.9, 0.6]])
-
-
-def test_the_truth_in_any_gauge_scores_nothing():
-    values, nulls = pictures(FACTORS).scores()
-    assert max(values.values()) < 1e-6 < 1e-3 < min(nulls.values())
-    assert {"observed", "unobserved", "entries", "new_light", "first_light"} == values.keys()
-
-
-def test_an_error_scores_the_same_in_any_gauge_and_pictures_show_it():
-    plain, scaled = pictures(ONES, 0.2), pictures(FACTORS, 0.2)
-    assert plain.scores()[0] == pytest.approx(scaled.scores()[0], rel=1e-3) and plain.scores()[0]["new_light"] > 1e-5
-    true, found = (plain.matrix(of).astype(int) for of in (True, False))
-    assert true.shape == found.shape == (3 * 70, 2 * 70, 3) and np.abs(true - found).max() > 5
 
 
 SOLVE = {"light_prior": "none", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}

@@ -1,26 +1,12 @@
-"""What no photo determines, a factor per channel between all materials and all lights, taken out of an answer by the true materials."""
+"""An answer in the truth's gauge (`studies.core.gauge`), where photos link all materials and all lights, which are maps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-from jaxtyping import Float
-
-from factorlib.evaluate.materials import common_factor
 from factorlib.results.materials import Reflectance
 from studies.core.baselines.scene import Map
-
-
-def factor_of(materials: Mapping[str, Reflectance], truths: Mapping[str, Reflectance]) -> Float[np.ndarray, "3"]:
-    """That takes the materials nearest to the true ones of their names."""
-    return np.array(common_factor(list(materials.values()), [truths[name] for name in materials]))
-
-
-def times(material: Reflectance, factor: Float[np.ndarray, "3"]) -> Reflectance:
-    """A material that reflects so many times as much."""
-    diffuse, specular = (tuple((np.array(k) * factor).tolist()) for k in (material.diffuse, material.specular))
-    return Reflectance(diffuse, specular, material.roughness)
+from studies.core.gauge import factor_of, times
 
 
 def in_gauge(

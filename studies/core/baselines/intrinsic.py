@@ -23,10 +23,11 @@ from jaxtyping import Float
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
 from studies.core.baselines.body import Seen
-from studies.core.baselines.gauge import factor_of, lambertian_part
+from studies.core.baselines.gauge import lambertian_part
 from studies.core.baselines.photos import Photos
 from studies.core.baselines.projective import Texture
 from studies.core.baselines.scene import Map, Radiance, Scene
+from studies.core.gauge import factor_of
 
 LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic of a light
 ITERATIONS, LEAST, DARKEST = 60, 0.01, 1e-4

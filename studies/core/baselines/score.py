@@ -23,8 +23,6 @@ import numpy as np
 
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.gauge import gauge_factors
-from factorlib.evaluate.lights import compare_lights
-from factorlib.evaluate.materials import compare_materials
 from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.results.materials import Reflectance
 from studies.core.baselines.body import Seen, seen, turn
@@ -32,13 +30,13 @@ from studies.core.baselines.case import Asked, Comparison
 from studies.core.baselines.gauge import lambertian_part
 from studies.core.baselines.prediction import Prediction
 from studies.core.baselines.scene import Map, Radiance, Scene
-from studies.core.case import Score, light_name
+from studies.core.case import Score, named
+from studies.core.errors import PARTS, light_errors, material_errors
 
 VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0)}  # azimuth and elevation of the camera, degrees
 FRONT = {"front": (0.0, 0.0)}  # the photos' own side
 KINDS = ("novel_view", "novel_light", "novel_material")
 SUFFIXES = {"none": "", "scalar_per_set": "_scaled", "channel_per_photo": "_balanced"}
-SPHERES = ("mirror", "glossy", "matte")
 
 
 class Shot(msgspec.Struct, frozen=True):
@@ -94,9 +92,7 @@ def score_of(world: World, prediction: Prediction, found: list[Shot], seconds: f
     for kind in KINDS:
         of_kind = [shot for shot in found if shot.asked.kind == kind]
         values |= {kind + SUFFIXES[gauge]: error for gauge, error in _errors(of_kind).items()} if of_kind else {}
-    materials, nulls = _material_errors(prediction, world)
-    lights, light_nulls = _light_errors(prediction, world)
-    return Score(values | materials | lights | {"processor": seconds}, nulls | light_nulls)
+    return Score(values | {"processor": seconds}) | _of_materials(prediction, world) | _of_lights(prediction, world)
 
 
 def _errors(found: list[Shot]) -> dict[str, float]:
@@ -106,20 +102,16 @@ def _errors(found: list[Shot]) -> dict[str, float]:
     return {gauge: float(np.mean([shot.dssim(f) for shot, f in zip(found, factor, strict=True)])) for gauge, factor in factors.items()}
 
 
-def _material_errors(prediction: Prediction, world: World) -> tuple[dict[str, float], dict[str, float]]:
+def _of_materials(prediction: Prediction, world: World) -> Score:
     """Of a Lambertian method those of k_d alone, against the true k_d."""
     if not prediction.materials:
-        return {}, {}
+        return Score({})
     truths = lambertian_part(world.materials) if prediction.lambertian else world.materials
-    errors = compare_materials(prediction.materials, truths, dict.fromkeys(prediction.materials, 0))
-    parts = ("diffuse",) if prediction.lambertian else ("diffuse", "specular", "roughness")
-    return tuple({part: getattr(errors, kind + part) for part in parts} for kind in ("mean_", "null_mean_"))
+    return material_errors(prediction.materials, truths, dict.fromkeys(prediction.materials, 0), PARTS[:1] if prediction.lambertian else PARTS)
 
 
-def _light_errors(prediction: Prediction, world: World) -> tuple[dict[str, float], dict[str, float]]:
+def _of_lights(prediction: Prediction, world: World) -> Score:
     if not prediction.lights:
-        return {}, {}
-    estimates, truths = ({light_name(li): light_of_lat_long(of[li]) for li in prediction.lights} for of in (prediction.lights, world.lights))
-    errors = compare_lights(estimates, truths, {}).mean["none"]
-    return tuple({view: getattr(errors[view], which).rmse for view in SPHERES} for which in ("estimate", "null"))
-
+        return Score({})
+    estimates, truths = ({li: light_of_lat_long(of[li]) for li in prediction.lights} for of in (prediction.lights, world.lights))
+    return light_errors(named(estimates), named(truths))

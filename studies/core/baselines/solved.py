@@ -7,22 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from studies.core.baselines.gauge import in_gauge
 from studies.core.baselines.joint import Optimised
 from studies.core.baselines.prediction import Rendered
-from studies.core.case import light_name
-
-MAP_ROWS = 128  # of recovered lights, as the stage `export` writes them
+from studies.core.lights import maps_of
 
 
 def ours(folder: Path, numbers: list[int], truths: Mapping[str, Reflectance]) -> Rendered:
     """What the stage `solve` wrote; numbers: of the lights.  truths: for the gauge alone."""
-    table, lobes = read_materials(folder / "materials.json").materials, read_lobes(folder / "lobes.parquet")
-    lights = {li: lat_long_of_lobes(lobes[light_name(li)], MAP_ROWS, 2 * MAP_ROWS) for li in numbers}
-    return Rendered(*in_gauge({name: solved.reflectance for name, solved in table.items()}, lights, truths))
+    table = read_materials(folder / "materials.json").materials
+    return Rendered(*in_gauge({name: solved.reflectance for name, solved in table.items()}, maps_of(folder, numbers), truths))
 
 
 def mitsubas(found: Optimised, truths: Mapping[str, Reflectance]) -> Rendered:

@@ -13,15 +13,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.align import shapes
-from factorlib.generate.synthetic import drawn_materials
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import Material
+from studies.core import world
 from studies.core.case import World
 from studies.core.objects.case import SEVEN
-from studies.core.world import ABOUT, SPREAD
 
 FURTHER = (Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45), Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38))
 BODIES = ("blob", "jug", "hook")
@@ -30,14 +29,12 @@ SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; of it, the mesh's diam
 
 def materials_of(seed: int) -> dict[str, Reflectance]:
     """The materials of a world by name."""
-    about = dict(zip(SEVEN, (*ABOUT.values(), *FURTHER), strict=True))
-    drawn = drawn_materials(np.random.default_rng([11, seed]), SPREAD, about)
-    return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
+    return world.materials_of(seed, dict(zip(SEVEN, (*world.ABOUT.values(), *FURTHER), strict=True)))
 
 
-def with_one_light_more(world: World) -> World:
+def with_one_light_more(worlds: World) -> World:
     """The lights of these worlds: the paper's Docksta set has six."""
-    return World(world.seeds, world.lights + 1, world.rows, world.spp)
+    return World(worlds.seeds, worlds.lights + 1, worlds.rows, worlds.spp)
 
 
 @cache

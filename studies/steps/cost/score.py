@@ -28,4 +28,4 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         "peak": cost.peak / GB,
         "grown": (cost.peak - cost.before) / GB,
     }
-    write_json(out / f"{inputs.photo}.json", Score(values, {}))
+    write_json(out / f"{inputs.photo}.json", Score(values))

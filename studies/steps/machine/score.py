@@ -18,4 +18,4 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """In another process."""
-    write_json(out / f"{inputs.photo}.json", Score(numbers_of(msgspec.convert(inputs.facts["dataset.case"], Machine)), {}))
+    write_json(out / f"{inputs.photo}.json", Score(numbers_of(msgspec.convert(inputs.facts["dataset.case"], Machine))))

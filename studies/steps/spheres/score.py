@@ -10,8 +10,8 @@ from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.stage import Inputs, Progress
 from studies.core.case import Case, World
-from studies.core.score import score_of
-from studies.core.world import light
+from studies.core.score import scored
+from studies.core.world import light, materials_of
 from studies.steps.spheres.worlds import light_file
 
 
@@ -23,4 +23,4 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with all lights of the world."""
     case, world = (msgspec.convert(inputs.facts[f"dataset.{name}"], of) for name, of in (("case", Case), ("worlds", World)))
     lights = {li: light(read_rgb_exr(inputs["worlds"] / light_file(case.seed, li))) for li in range(world.lights)}
-    write_json(out / f"{inputs.photo}.json", score_of(case, inputs["solve"] / inputs.photo, lights))
+    write_json(out / f"{inputs.photo}.json", scored(case, materials_of(case.seed), inputs["solve"] / inputs.photo, lights).score)
