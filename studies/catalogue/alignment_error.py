@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from studies.core.objects.case import Harm, ObjectsCase
+from studies.core.objects.case import Harm
+from studies.core.objects.setting import setting
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 HARMS: dict[str, tuple[str, Harm]] = {
@@ -50,11 +51,8 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def _setting(scale: Scale, x: int, harm: str, arm: str) -> Setting:
-    label, how = HARMS[harm][0] + ARMS[arm][0], ARMS[arm][1]
-    entries = tuple(full_matrix(scale.side, scale.side))
-    return Setting(
-        f"{harm}-{arm}", label, x, lambda seed: ObjectsCase(seed, entries, scale.entry_pixels, HARMS[harm][1], solve=scale.solve, **how)
-    )
+    (of_harm, harmed), (of_arm, how) = HARMS[harm], ARMS[arm]
+    return setting(scale, f"{harm}-{arm}", of_harm + of_arm, x, full_matrix(scale.side, scale.side), harm=harmed, **how)
 
 
 def claims(scale: Scale) -> list[Claim]:
@@ -63,7 +61,7 @@ def claims(scale: Scale) -> list[Claim]:
     refined = [_helps("outline", harm, "fitting the outline") for harm in ("turned-5", "turned-20", "larger")]
     robust = [_matters("squares", "turned-20", "the robust loss")]
     sure = [_matters("even", harm, "knowing how sure normals are") for harm in ("turned-5", "coarse")]
-    known = {setting.name for setting in settings(scale)}
+    known = {one.name for one in settings(scale)}
     return [claim for claim in (*harmful, *refined, *robust, *sure) if {claim.lower, claim.higher} <= known]
 
 

@@ -7,7 +7,7 @@ Measured   errors of materials and predictions, beside the standard errors that 
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study
 
 FACES = {"full": (1, 2, 3, 5, 9, 20, 60), "quick": (1, 9)}
 
@@ -15,14 +15,8 @@ FACES = {"full": (1, 2, 3, 5, 9, 20, 60), "quick": (1, 9)}
 def settings(scale: Scale) -> list[Setting]:
     """From one face to a sphere."""
     faces = FACES[scale.name]
-    return [
-        *(_setting(scale, x, k) for x, k in enumerate(faces)),
-        Setting(scale.square, "sphere", len(faces), lambda seed: scale.case(seed, full_matrix(scale.side, scale.side))),
-    ]
-
-
-def _setting(scale: Scale, x: int, faces: int) -> Setting:
-    return Setting(f"faces-{faces}", str(faces), x, lambda seed: scale.case(seed, full_matrix(scale.side, scale.side), facets=faces))
+    few = [scale.setting(f"faces-{k}", str(k), x, facets=k) for x, k in enumerate(faces)]
+    return [*few, scale.setting(scale.square, "sphere", len(faces))]
 
 
 def claims(scale: Scale) -> list[Claim]:

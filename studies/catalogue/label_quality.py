@@ -7,7 +7,7 @@ Measured   materials and predictions.  Renderings are of the true normals; the s
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Rise, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Rise, Scale, Setting, Study
 
 NORMALS = {"full": (1, 2, 5, 10, 20), "quick": (5, 20)}
 LABELS = {"full": (2, 10, 20), "quick": (20,)}
@@ -15,13 +15,10 @@ LABELS = {"full": (2, 10, 20), "quick": (20,)}
 
 def settings(scale: Scale) -> list[Setting]:
     """Unharmed, then each harm by itself."""
-    entries = full_matrix(scale.side, scale.side)
     harms = [(f"normals-{d}deg", f"{d}°", {"normal_deg": float(d)}) for d in NORMALS[scale.name]]
     harms += [(f"labels-{p}pc", f"{p} %", {"wrong_labels": p / 100}) for p in LABELS[scale.name]]
-    return [
-        Setting(scale.square, "none", 0, lambda seed: scale.case(seed, entries)),
-        *(Setting(name, label, x, lambda seed, how=how: scale.case(seed, entries, **how)) for x, (name, label, how) in enumerate(harms, 1)),
-    ]
+    harmed = [scale.setting(name, label, x, **how) for x, (name, label, how) in enumerate(harms, 1)]
+    return [scale.setting(scale.square, "none", 0), *harmed]
 
 
 def claims(scale: Scale) -> list[Claim]:

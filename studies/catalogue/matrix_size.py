@@ -7,16 +7,12 @@ Measured   material 0 in every light of its world, and every material of the wor
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study
 
 
 def settings(scale: Scale) -> list[Setting]:
     """1 × 1 to the largest."""
-    return [_setting(scale, n) for n in range(1, scale.largest + 1)]
-
-
-def _setting(scale: Scale, n: int) -> Setting:
-    return Setting(f"{n}x{n}", f"{n} × {n}", n, lambda seed: scale.case(seed, full_matrix(n, n)))
+    return [scale.matrix(x=n, materials=n, lights=n) for n in range(1, scale.largest + 1)]
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -12,7 +12,7 @@ Measured   entries that were observed and those that were not.  The paper's phot
 from __future__ import annotations
 
 from studies.core.entries import Entry
-from studies.core.objects.case import ObjectsCase
+from studies.core.objects.setting import setting
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 
@@ -48,12 +48,10 @@ def patterns(scale: Scale) -> dict[str, list[Entry]]:
 
 def settings(scale: Scale) -> list[Setting]:
     """A set each."""
-    return [_setting(scale, x, name, entries) for x, (name, entries) in enumerate(patterns(scale).items())]
-
-
-def _setting(scale: Scale, x: int, name: str, entries: list[Entry]) -> Setting:
-    case = lambda seed: ObjectsCase(seed, tuple(sorted(entries)), scale.entry_pixels, solve=scale.solve)  # noqa: E731
-    return Setting(f"set-{name}", name.replace("-unlinked", " without chair"), x, case)
+    return [
+        setting(scale, f"set-{name}", name.replace("-unlinked", " without chair"), x, entries)
+        for x, (name, entries) in enumerate(patterns(scale).items())
+    ]
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -9,7 +9,7 @@ Measured   how coloured the lights are beside the true ones, what they and the m
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study
 
 WEIGHTS = {"full": (0.0, 0.001, 0.01, 0.1, 1.0, 10.0), "quick": (0.0, 0.1, 10.0)}
 OF_THE_PAPER = {"full": (0.0, 0.1, 1.0, 10.0), "quick": (0.1,)}
@@ -20,11 +20,7 @@ def settings(scale: Scale) -> list[Setting]:
     found = [(f"lobes-{i}", f"{w:g}", {"prior": w, "light_prior": "none"}) for i, w in enumerate(WEIGHTS[scale.name])]
     found += [(f"paper-{i}", f"paper {w:g}", {"solver": "paper", "operator": "network", "paper_prior": w}) for i, w in enumerate(OF_THE_PAPER[scale.name])]
     found += [("natural", "natural", {"light_prior": "on"})]
-    return [_setting(scale, x, *each) for x, each in enumerate(found)]
-
-
-def _setting(scale: Scale, x: int, name: str, label: str, solve: dict[str, float | str]) -> Setting:
-    return Setting(name, label, x, lambda seed: scale.case(seed, full_matrix(scale.side, scale.side), solve=solve))
+    return [scale.setting(name, label, x, solve=solve) for x, (name, label, solve) in enumerate(found)]
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -8,7 +8,7 @@ Measured   the materials in every light of the world, all materials of the world
 
 from __future__ import annotations
 
-from studies.core.objects.case import ObjectsCase
+from studies.core.objects.setting import setting
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
 
@@ -19,10 +19,8 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def _setting(scale: Scale, x: int, n: int, start: str) -> Setting:
-    entries, warm = tuple(full_matrix(scale.side, n)), start == "earlier"
-    label = f"{n} warm" if warm else str(n)
-    case = lambda seed: ObjectsCase(seed, entries, scale.entry_pixels, start=start, solve=scale.solve)  # noqa: E731
-    return Setting(f"photos-{n}-warm" if warm else f"photos-{n}", label, x, case)
+    name, label = (f"photos-{n}-warm", f"{n} warm") if start == "earlier" else (f"photos-{n}", str(n))
+    return setting(scale, name, label, x, full_matrix(scale.side, n), start=start)
 
 
 def claims(scale: Scale) -> list[Claim]:

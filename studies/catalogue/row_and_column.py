@@ -6,18 +6,13 @@ Measured   their own entries, as in the paper; and, as for the size of the matri
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study
 
 
 def settings(scale: Scale) -> list[Setting]:
     """One entry, a row, a column, all."""
     n = scale.largest
-    return [_setting(scale, x, *shape) for x, shape in enumerate([(1, 1), (1, n), (n, 1), (n, n)])]
-
-
-def _setting(scale: Scale, x: int, materials: int, lights: int) -> Setting:
-    name = f"{materials}x{lights}"
-    return Setting(name, f"{materials} × {lights}", x, lambda seed: scale.case(seed, full_matrix(materials, lights)))
+    return [scale.matrix(x, *shape) for x, shape in enumerate([(1, 1), (1, n), (n, 1), (n, n)])]
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Scale, Setting, Study
 
 LOBES = {"light_prior": "none"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -33,11 +33,7 @@ QUICK = ("default", "closed-form", "merge-4", "paper")
 def settings(scale: Scale) -> list[Setting]:
     """All of `VARIANTS`; of a quick study, those of `QUICK`."""
     names = QUICK if scale.name == "quick" else tuple(VARIANTS)
-    return [_setting(scale, x, name, *VARIANTS[name]) for x, name in enumerate(names)]
-
-
-def _setting(scale: Scale, x: int, name: str, label: str, solve: dict[str, Any]) -> Setting:
-    return Setting(name, label, x, lambda seed: scale.case(seed, full_matrix(scale.side, scale.side), solve=solve))
+    return [scale.setting(name, VARIANTS[name][0], x, solve=VARIANTS[name][1]) for x, name in enumerate(names)]
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -42,6 +42,15 @@ class Scale(msgspec.Struct, frozen=True):
         """A case of this size; how: further fields of it."""
         return Case(seed, tuple(sorted(entries)), self.size, solve={**self.solve, **how.pop("solve", {})}, **how)
 
+    def setting(self, name: str, label: str, x: float, entries: Sequence[Entry] | None = None, **how: Any) -> Setting:
+        """One of such cases, of equal entries for all seeds; None: of `side` materials in as many lights."""
+        seen = full_matrix(self.side, self.side) if entries is None else entries
+        return Setting(name, label, x, lambda seed: self.case(seed, seen, **how))
+
+    def matrix(self, x: float, materials: int, lights: int) -> Setting:
+        """All of so many materials in so many lights."""
+        return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", x, full_matrix(materials, lights))
+
 
 FEW_LOBES = {"light_prior": "none", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
 FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
