@@ -3,7 +3,7 @@
 Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that came
 out unchanged stops what follows there, and what another run made meanwhile is used.  What a plan calls ready stays so, for
 all it takes is made; hence a plan for every stage is enough, not one for every result.  A step that fails holds up only
-what depends on it.
+what depends on it; one that fails because its stage's code was edited meanwhile holds up the stage's further steps too.
 """
 
 from __future__ import annotations
@@ -103,6 +103,7 @@ class Run:
         self.keys: dict[Step, str | None] = {}
         self.stale = False  # there are results that the plan does not know
         self.made: set[str] = set()  # keys
+        self.edited: set[str] = set()  # stages whose code is no longer that of their keys
         self.shared = shared_store(survey.store.root)
 
     def go(self) -> None:
@@ -158,7 +159,7 @@ class Run:
         for planned in self.planned:
             if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
-            if planned.step in self.running or planned.step in self.tally.failed:
+            if planned.step in self.running or planned.step in self.tally.failed or planned.step.stage in self.edited:
                 continue
             if not self.pools.free(1):
                 return
@@ -306,6 +307,8 @@ class Run:
 
     def _fail(self, step: Step, outcome: Outcome) -> None:
         self.tally.failed[step] = outcome
+        if outcome.code_changed:
+            self.edited.add(step.stage)
         where = None
         if outcome.traceback:
             path = self.survey.home.errors / f"{label(step)}.txt"

@@ -110,7 +110,8 @@ def _run(seen: Survey, whole: bool, started: float) -> int:
     finally:
         display.close()
     if tally.failed:
-        print(f"{seen.data.folder.name}: {words.count(list(tally.failed))} failed: {', '.join(map(str, tally.failed))}")
+        failed = list(tally.failed)
+        print(f"{seen.data.folder.name}: {words.count(failed)} failed: {words.listed(failed)}")
         if tally.held_up:
             print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
         return 1

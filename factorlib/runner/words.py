@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from factorlib.runner.verify import Verdict
 
 SHOWN = 8  # reasons of one step that are written out
+NAMED = 20  # steps that have failed
 
 
 def plan_lines(planned: list[Planned]) -> list[str]:
@@ -171,6 +172,16 @@ def count(steps: list[Step]) -> str:
     '1 step'
     """
     return "1 step" if len(steps) == 1 else f"{len(steps)} steps"
+
+
+def listed(steps: list[Step]) -> str:
+    """The steps by name, at most NAMED of them.
+
+    >>> listed([Step("train"), Step("urm", "a")])
+    'train, urm/a'
+    """
+    more = [f"{len(steps) - NAMED} more"] if len(steps) > NAMED else []
+    return ", ".join([*map(str, steps[:NAMED]), *more])
 
 
 def unneeded_lines(found: list[Unneeded], now: float) -> list[str]:

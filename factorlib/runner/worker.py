@@ -98,13 +98,19 @@ class Task(msgspec.Struct, frozen=True):
 
 class Outcome(msgspec.Struct, frozen=True):
     """output: hash of what was made;  damaged: where that lies now which stood in its place and was not as it had been kept;
-    error: what went wrong;  traceback: of a defect, None where a user can mend it."""
+    error: what went wrong;  traceback: of a defect, None where a user can mend it;  code_changed: whether the stage's code is
+    another than that of the key, so that further steps of it would fail alike."""
 
     output: str | None = None
     damaged: Path | None = None
     error: str | None = None
     traceback: str | None = None
+    code_changed: bool = False
     seconds: float = 0.0
+
+
+class CodeChanged(InputError):
+    """The code of a stage was edited while the run went on."""
 
 
 class Spread(Protocol):
@@ -162,7 +168,7 @@ def value_fault(code: Code) -> InputError | None:
 def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
     """What the user can mend says how; the rest is a defect, and comes with its traceback."""
     if known := error if isinstance(error, InputError) else disk_error(error, folder):
-        return Outcome(error=str(known), seconds=seconds)
+        return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged), seconds=seconds)
     return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc(), seconds=seconds)
 
 
@@ -279,7 +285,7 @@ def _check_code_still(task: Task, hashes: FileHashes) -> None:
         before, now = ({name: record[name] for name in changes if name in record} for record in (task.record, closure.record()))
         files = [str(closure.files[name]) for name in changes if name in closure.files]
         found = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
-        raise InputError(found, file=", ".join(files) or None, cure="run again")
+        raise CodeChanged(found, file=", ".join(files) or None, cure="run again")
 
 
 def _check_made(task: Task) -> None:

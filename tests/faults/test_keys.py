@@ -54,6 +54,16 @@ def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old
     assert not list((project.build / "store").glob("keys/*")) and not list((project.build / "store").glob("trees/*"))
 
 
+def test_a_stage_whose_code_was_edited_is_not_started_for_further_photos(project, capsys, monkeypatch):
+    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 1)
+    path = project.root / "stages" / "count.py"
+    write(path, editing(toy.COUNT, path, toy.COUNT + "\nMORE = 1\n"))
+    assert make(project) == 1
+    said = capsys.readouterr()
+    assert said.err.count("changed while the run went on") == 1
+    assert "1 step failed: count/a" in said.out and "not run for that: count" in said.out
+
+
 def test_a_module_that_is_imported_only_after_the_edit_is_named_too(project, capsys):
     write(project.root / "toylib" / "more.py", "")
     path = project.root / "toylib" / "letters.py"
