@@ -5,6 +5,7 @@ Writes materials.json, lobes.parquet, exposures.json, convergence.parquet, uncer
 
 import logging
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -159,8 +160,9 @@ def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple
         )
         return of_materials.standard_errors(), of_lights.relative_standard_errors()
     errors = standard_errors(problem, solution.point)
-    lit = problem.illuminations(solution.point)
-    return errors, {one.block.name: relative_standard_errors(one, problem.loss, errors.deviation) for one in lit}
+    of_light = partial(relative_standard_errors, loss=problem.loss, sigma=errors.deviation)
+    found = problem.spread(of_light, problem.illuminations(solution.point))
+    return errors, {block.name: error for block, error in zip(problem.blocks, found, strict=True)}
 
 
 def _warn(sentences: Iterable[str]) -> None:

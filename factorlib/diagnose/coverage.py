@@ -65,11 +65,14 @@ def _information(atoms: Float[np.ndarray, "n d"], jacobian: Float[np.ndarray, "n
 
 
 def _jacobians(illumination: Illumination, loss: Loss) -> list[Float[np.ndarray, "n k"]]:
-    """J of each channel, in the order of the block's rows, without robust weights, for `Illumination.atoms` has none either."""
-    light, first = illumination.light, 7 * len(illumination.materials)
-    unknowns = first + light.unknowns
-    whole = [np.zeros((len(illumination.block), unknowns)) for _ in range(3)]
+    """J of each channel, in the order of the block's rows, without robust weights, for `Illumination.atoms` has none either.
+
+    Materials that the block does not show have no columns.
+    """
+    light, unknowns = illumination.light, illumination.unknowns
+    first = len(unknowns) - light.unknowns
+    whole = [np.zeros((len(illumination.block), len(unknowns))) for _ in range(3)]
     for part in illumination.linearise(msgspec.structs.replace(loss, robust_scale=1e6)):
-        whole[part.channel][part.rows, part.places] = part.jacobian.numpy()
-    others = np.r_[0:first, first + 6 * len(light) : unknowns]
+        whole[part.channel][part.rows, np.searchsorted(unknowns, part.places)] = part.jacobian.numpy()
+    others = np.r_[0:first, first + 6 * len(light) : len(unknowns)]
     return [jacobian[:, others] for jacobian in whole]

@@ -24,6 +24,7 @@ A component in which surfaces light each other has no free factor: its errors ar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -69,7 +70,8 @@ def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
     materials, count = point.materials, len(point.materials)
     sigma = max(residual_deviation(problem, point), LEAST_DEVIATION)
     loss = msgspec.structs.replace(problem.loss, robust_scale=max(problem.loss.robust_scale, 1.0))
-    system = ArrowSystem([clustered_equations(illumination, loss) for illumination in problem.illuminations(point)])
+    parts = problem.spread(partial(clustered_equations, loss=loss), problem.illuminations(point))
+    system = ArrowSystem(list(parts), 7 * count)
     information, widths = system.schur_complement(point), np.tile(WIDTHS, count)
     inverse = inverse_of(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
     by_cell = system.reduced_scores(point)

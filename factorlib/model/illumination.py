@@ -45,6 +45,12 @@ class Illumination(msgspec.Struct, frozen=True):
         """The same observations and materials in another light."""
         return msgspec.structs.replace(self, light=light)
 
+    @property
+    def unknowns(self) -> Int[np.ndarray, " k+l"]:
+        """Numbers of the unknowns on which its radiance depends, ascending: 7 of each material that it shows, then the light's l."""
+        shown = 7 * np.unique(self.block.material)[:, None] + np.arange(7)
+        return np.concatenate([shown.reshape(-1), 7 * len(self.materials) + np.arange(self.light.unknowns)])
+
     def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Σ_p D w and Σ_p S w at `rows`: radiance of a material of that roughness with k_d = 1 and with k_s = 1, before exposure, without bounces."""
         parts = unit_values(self.block, rows, self.light.unit_lobes, roughness, self.operator)

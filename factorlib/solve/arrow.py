@@ -6,7 +6,8 @@ light leaves
     (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ g_i),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                 (1)
 
 with 7 unknowns a material.  The Schur complement on the left is the information that the data hold about the materials when the
-lights are unknown too.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on the units of an
+lights are unknown too.  A light's C and M have rows for the unknowns of the materials that it shows alone, and so has what its
+elimination adds: with many materials, of which a photo shows few, cost and memory grow with those few.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on the units of an
 unknown.  Rows and columns of unknowns that are not free become those of the identity.
 """
 
@@ -32,13 +33,17 @@ class Eliminated(NamedTuple):
     """One light eliminated: the Cholesky factor of its block L, and its C, whose columns of unknowns that are not free are 0."""
 
     factor: tuple[Float[np.ndarray, "l l"], bool]
-    cross: Float[np.ndarray, "7m l"]
+    cross: Float[np.ndarray, "k l"]
 
 
 class ArrowSystem(msgspec.Struct, frozen=True):
-    """The normal equations of all illuminations.  Sums are taken in their order, so that equal inputs give equal bits."""
+    """The normal equations of all illuminations.  Sums are taken in their order, so that equal inputs give equal bits.
+
+    unknowns: of the materials, 7 each
+    """
 
     parts: list[NormalEquations]
+    unknowns: int
 
     @property
     def loss(self) -> float:
@@ -48,12 +53,18 @@ class ArrowSystem(msgspec.Struct, frozen=True):
     @property
     def material_gradient(self) -> Float[np.ndarray, " 7m"]:
         """g_m"""
-        return np.sum([part.material_gradient for part in self.parts], axis=0)
+        gradient = np.zeros(self.unknowns)
+        for part in self.parts:
+            gradient[part.places] += part.material_gradient
+        return gradient
 
     @property
     def material_hessian(self) -> Float[np.ndarray, "7m 7m"]:
         """M"""
-        return np.sum([part.material_hessian for part in self.parts], axis=0)
+        hessian = np.zeros((self.unknowns, self.unknowns))
+        for part in self.parts:
+            hessian[np.ix_(part.places, part.places)] += part.material_hessian
+        return hessian
 
     def solved(
         self, free: Bool[np.ndarray, " 7m"], bounds: Sequence[Bounds], damping: float
@@ -66,13 +77,13 @@ class ArrowSystem(msgspec.Struct, frozen=True):
             factor, cross = _eliminated(light, part.cross_hessian, bound.free)
             gradient = (part.light_gradient + part.light_hessian @ bound.fixed) * bound.free
             solution = cho_solve(factor, np.column_stack([cross.T, gradient]), check_finite=False)
-            reduced -= cross @ solution[:, :-1]
-            right += cross @ solution[:, -1] - part.cross_hessian @ bound.fixed
+            reduced[np.ix_(part.places, part.places)] -= cross @ solution[:, :-1]
+            right[part.places] += cross @ solution[:, -1] - part.cross_hessian @ bound.fixed
             solutions.append(solution)
         by_materials = np.linalg.solve(masked(reduced, free), np.where(free, right, 0.0))
         by_lights = [
-            bound.fixed - (solution[:, -1] + solution[:, :-1] @ by_materials) * bound.free
-            for bound, solution in zip(bounds, solutions, strict=True)
+            bound.fixed - (solution[:, -1] + solution[:, :-1] @ by_materials[part.places]) * bound.free
+            for part, bound, solution in zip(self.parts, bounds, solutions, strict=True)
         ]
         return by_materials, by_lights
 
@@ -80,7 +91,7 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         """By how much a step lowers the quadratic model of the loss."""
         decrease = -by_materials @ (2 * self.material_gradient + self.material_hessian @ by_materials)
         for part, step in zip(self.parts, by_lights, strict=True):
-            decrease -= step @ (2 * part.light_gradient + part.light_hessian @ step + 2 * part.cross_hessian.T @ by_materials)
+            decrease -= step @ (2 * part.light_gradient + part.light_hessian @ step + 2 * part.cross_hessian.T @ by_materials[part.places])
         return float(decrease)
 
     def schur_complement(self, point: Point) -> Float[np.ndarray, "7m 7m"]:
@@ -90,22 +101,20 @@ class ArrowSystem(msgspec.Struct, frozen=True):
             factor, cross = _eliminated(
                 damped(part.light_hessian, DEFINITE), part.cross_hessian, ~light_at_bound(light, point.materials, part.light_gradient)
             )
-            reduced = reduced - cross @ cho_solve(factor, cross.T, check_finite=False)
+            reduced[np.ix_(part.places, part.places)] -= cross @ cho_solve(factor, cross.T, check_finite=False)
         return (reduced + reduced.T) / 2
 
-    def reduced_scores(self, point: Point) -> list[Float[np.ndarray, "k 7m"]]:
+    def reduced_scores(self, point: Point) -> list[Float[np.ndarray, "g 7m"]]:
         """The materials' scores of each illumination's clusters, after elimination of the light."""
-        return [_reduced_scores(part, point, k) for k, part in enumerate(self.parts)]
+        found = [np.zeros((len(part.scores), self.unknowns)) for part in self.parts]
+        for scores, part, light in zip(found, self.parts, point.lights, strict=True):
+            k, free = len(part.places), ~light_at_bound(light, point.materials, part.light_gradient)
+            factor, cross = _eliminated(damped(part.light_hessian, DEFINITE), part.cross_hessian, free)
+            scores[:, part.places] = part.scores[:, :k] - (part.scores[:, k:] * free) @ cho_solve(factor, cross.T, check_finite=False)
+        return found
 
 
-def _reduced_scores(part: NormalEquations, point: Point, k: int) -> Float[np.ndarray, "k 7m"]:
-    m = len(part.material_gradient)
-    free = ~light_at_bound(point.lights[k], point.materials, part.light_gradient)
-    factor, cross = _eliminated(damped(part.light_hessian, DEFINITE), part.cross_hessian, free)
-    return part.scores[:, :m] - (part.scores[:, m:] * free) @ cho_solve(factor, cross.T, check_finite=False)
-
-
-def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "7m l"], free: Bool[np.ndarray, " l"]) -> Eliminated:
+def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "k l"], free: Bool[np.ndarray, " l"]) -> Eliminated:
     return Eliminated(cho_factor(masked(light, free), check_finite=False), cross * free)
 
 

@@ -28,10 +28,11 @@ class Iterate(msgspec.Struct, frozen=True):
 def evaluate(problem: JointProblem, point: Point) -> Iterate:
     """The point with its system."""
     parts = problem.spread(partial(normal_equations, loss=problem.loss), problem.illuminations(point))
-    return Iterate(point, ArrowSystem(list(parts)))
+    return Iterate(point, ArrowSystem(list(parts), 7 * len(point.materials)))
 
 
 def fit_weights(problem: JointProblem, point: Point) -> Iterate:
     """As `evaluate`, with the lobes' weights fitted first: those that lower the loss most while nothing else changes."""
     found = list(problem.spread(partial(fitted_illumination, loss=problem.loss), problem.illuminations(point)))
-    return Iterate(Point(point.materials, [one.light for one in found]), ArrowSystem([one.equations for one in found]))
+    system = ArrowSystem([one.equations for one in found], 7 * len(point.materials))
+    return Iterate(Point(point.materials, [one.light for one in found]), system)

@@ -17,18 +17,20 @@ from factorlib.model.responses import Responses, bounced_of
 
 
 class NormalEquations(msgspec.Struct, frozen=True):
-    """Gauss–Newton system of one illumination: gradient and Hessian blocks of materials (7m) and light (l).
+    """Gauss–Newton system of one illumination: gradient and Hessian blocks of the materials that it shows (k unknowns) and its light (l).
 
-    scores: the gradient's part from each of k clusters of observations, where clusters were asked for
+    places: numbers of the k unknowns among those of all materials, ascending
+    scores: the gradient's part from each of g clusters of observations, where clusters were asked for
     """
 
     loss: float
-    material_gradient: Float[np.ndarray, " 7m"]
+    places: Int[np.ndarray, " k"]
+    material_gradient: Float[np.ndarray, " k"]
     light_gradient: Float[np.ndarray, " l"]
-    material_hessian: Float[np.ndarray, "7m 7m"]
-    cross_hessian: Float[np.ndarray, "7m l"]
+    material_hessian: Float[np.ndarray, "k k"]
+    cross_hessian: Float[np.ndarray, "k l"]
     light_hessian: Float[np.ndarray, "l l"]
-    scores: Float[np.ndarray, "k 7m+l"] | None = None
+    scores: Float[np.ndarray, "g k+l"] | None = None
 
 
 def normal_equations(
@@ -39,16 +41,16 @@ def normal_equations(
     clusters: number of each observation's cluster, from 0, for `NormalEquations.scores`
     known: responses of what is fitted to the light, where they were computed before
     """
-    light, k = illumination.light, 7 * len(illumination.materials)
-    size = k + light.unknowns
+    light, fitted, total = illumination.light, illumination.fitted(), 0.0
+    unknowns = fitted.unknowns
+    size, k = len(unknowns), len(unknowns) - light.unknowns
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, size))
     if clusters is not None:
         clusters = clusters[~illumination.block.held_out]
-    fitted, total = illumination.fitted(), 0.0
     for part in fitted.linearise(loss, known):
         total += part.loss
-        places, jacobian, residual = part.places, part.jacobian, part.residual
+        places, jacobian, residual = np.searchsorted(unknowns, part.places), part.jacobian, part.residual
         hessian[np.ix_(places, places)] += product(jacobian.T, jacobian).numpy()
         gradient[places] += product(jacobian.T, residual).numpy()
         if scores is not None:
@@ -56,7 +58,8 @@ def normal_equations(
     prior = loss.of_light(fitted.block, light)
     gradient[k:] += prior.gradient
     hessian[k:, k:] += prior.hessian
-    return NormalEquations(total + prior.value, gradient[:k], gradient[k:], hessian[:k, :k], hessian[:k, k:], hessian[k:, k:], scores)
+    blocks = (hessian[:k, :k], hessian[:k, k:], hessian[k:, k:])
+    return NormalEquations(total + prior.value, unknowns[:k], gradient[:k], gradient[k:], *blocks, scores)
 
 
 class EnergyEquations(msgspec.Struct, frozen=True):

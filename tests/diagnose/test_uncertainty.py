@@ -49,7 +49,7 @@ def test_scores_of_clusters_sum_to_the_gradient(solved):
     whole = clustered_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0))
     np.testing.assert_allclose(whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8)
     assert len(whole.scores) > 20
-    (reduced,) = ArrowSystem([whole]).reduced_scores(Point(MATERIALS, point.lights[:1]))
+    (reduced,) = ArrowSystem([whole], 21).reduced_scores(Point(MATERIALS, point.lights[:1]))
     assert reduced.shape == (len(whole.scores), 21)
 
 

@@ -18,27 +18,32 @@ from factorlib.solve.step import damped_step
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2
 EVERY = np.ones(7 * len(MATERIALS), bool)
+SHOWN = ([0, 2], [1, 2])  # the materials of each light
 
 
 @pytest.fixture(scope="module")
 def iterate():
     """Two lights of unlike sizes, away from any optimum and from all bounds."""
-    rng = np.random.default_rng(2)
-    blocks = [block(f"room{k}", random_light(rng, 4, photos), MATERIALS, [0, 1, 2], OPERATOR, size=12) for k, photos in enumerate((1, 2))]
+    rng = np.random.default_rng(3)
     lights = [random_light(rng, lobes, photos) for lobes, photos in ((3, 1), (5, 2))]
-    return evaluate(JointProblem(blocks, OPERATOR), Point(MATERIALS, lights))
+    return evaluate(JointProblem(blocks(), OPERATOR), Point(MATERIALS, lights))
+
+
+def blocks():
+    rng = np.random.default_rng(2)
+    return [block(f"room{k}", random_light(rng, 4, photos), MATERIALS, SHOWN[k], OPERATOR, size=12) for k, photos in enumerate((1, 2))]
 
 
 def dense(system):
     """H and g of all unknowns, the materials first."""
     sizes = [len(part.light_gradient) for part in system.parts]
-    first, size = len(system.material_gradient), len(system.material_gradient) + sum(sizes)
-    hessian, gradient, at = np.zeros((size, size)), np.zeros(size), first
-    hessian[:first, :first], gradient[:first] = system.material_hessian, system.material_gradient
-    for part, count in zip(system.parts, sizes, strict=True):
-        own = slice(at, at + count)
-        hessian[own, own], gradient[own] = part.light_hessian, part.light_gradient
-        hessian[:first, own], hessian[own, :first] = part.cross_hessian, part.cross_hessian.T
+    size, at = len(EVERY) + sum(sizes), len(EVERY)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    for part, shown, count in zip(system.parts, SHOWN, sizes, strict=True):
+        unknowns = [*(7 * m + k for m in shown for k in range(7)), *range(at, at + count)]
+        blocks = [[part.material_hessian, part.cross_hessian], [part.cross_hessian.T, part.light_hessian]]
+        hessian[np.ix_(unknowns, unknowns)] += np.block(blocks)
+        gradient[unknowns] += np.concatenate([part.material_gradient, part.light_gradient])
         at += count
     return hessian, gradient
 
@@ -60,6 +65,24 @@ def unbounded(iterate):
     bounds = [Bounds(part, light, MATERIALS) for part, light in zip(iterate.system.parts, iterate.point.lights, strict=True)]
     assert all(bound.free.all() for bound in bounds)
     return bounds
+
+
+def test_sums_over_lights_are_those_of_the_dense_system(iterate):
+    hessian, gradient = dense(iterate.system)
+    np.testing.assert_array_equal(iterate.system.material_hessian, hessian[:21, :21])
+    np.testing.assert_array_equal(iterate.system.material_gradient, gradient[:21])
+
+
+def test_the_equations_are_those_of_the_jacobian_by_all_unknowns(iterate):
+    problem = JointProblem(blocks(), OPERATOR)
+    for part, one in zip(iterate.system.parts, problem.illuminations(iterate.point), strict=True):
+        hessian = np.zeros((21 + one.light.unknowns,) * 2)
+        for some in one.fitted().linearise(problem.loss):
+            hessian[np.ix_(some.places, some.places)] += (some.jacobian.T @ some.jacobian).numpy()
+        shown = np.flatnonzero(np.diag(hessian)[:21])
+        np.testing.assert_array_equal(part.places, shown)
+        np.testing.assert_allclose(part.cross_hessian, hessian[shown, 21:], rtol=1e-9, atol=1e-9 * hessian.max())
+        np.testing.assert_allclose(part.material_hessian, hessian[np.ix_(shown, shown)], rtol=1e-9, atol=1e-9 * hessian.max())
 
 
 def test_the_step_is_that_of_a_dense_solve(iterate):
@@ -99,10 +122,8 @@ def test_the_predicted_decrease_is_that_of_the_quadratic_model(iterate):
 
 def test_a_small_step_lowers_the_loss_as_predicted(iterate):
     """Where the quadratic model holds: at strong damping."""
-    rng = np.random.default_rng(2)
-    blocks = [block(f"room{k}", random_light(rng, 4, photos), MATERIALS, [0, 1, 2], OPERATOR, size=12) for k, photos in enumerate((1, 2))]
     step = damped_step(iterate, 1e4)
-    gained = iterate.loss - JointProblem(blocks, OPERATOR).fit_loss(iterate.point.moved(step.materials, step.lights))
+    gained = iterate.loss - JointProblem(blocks(), OPERATOR).fit_loss(iterate.point.moved(step.materials, step.lights))
     assert gained == pytest.approx(step.predicted, rel=0.02)
 
 
