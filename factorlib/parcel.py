@@ -4,8 +4,6 @@ Layout   How a sum is ordered may depend on an array's strides, and pickling mak
          with the strides that it was sent with.
 Shelf    Observations are sent once: an array of LEAST bytes or more is written to a file that all processes see, and what is
          sent is where it lies, by the hash of its content.  Each map over the same observations then sends a few kB.
-Sparse   An array that is mostly zeros is sent as those elements that are none (by their bits: −0 is kept): the normal equations of
-         an illumination are, where it shows few of many materials.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import numpy as np
 
 from factorlib.wholefile import write_bytes
 
-LEAST = 16_384  # bytes of an array that is worth a place on the shelf, or a look for zeros
+LEAST = 16_384  # bytes of an array that is worth a place on the shelf
 FORGOTTEN = 20  # maps in which nothing of a file was used, after which it is deleted
 CACHED = 1 << 28  # bytes from shelves that a process keeps
 
@@ -35,13 +33,6 @@ class Place(NamedTuple):
     file: Path
     offset: int
     size: int
-
-
-class Sparse(NamedTuple):
-    """The elements of a flat array that are not all zero bits, and where they stand."""
-
-    index: bytes
-    value: bytes
 
 
 class Shelf:
@@ -130,17 +121,10 @@ class _Pickler(cloudpickle.Pickler):
         once = value[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in value.strides)]  # a repeated axis
         return _strided, (value.dtype, value.shape, value.strides, once.shape, self._body(once))
 
-    def _body(self, value: np.ndarray) -> Place | Sparse | bytes:
-        if value.nbytes < LEAST:
+    def _body(self, value: np.ndarray) -> Place | bytes:
+        if value.nbytes < LEAST or self.put is None:
             return value.tobytes()
-        if self.put is not None:
-            return self.put(value.tobytes())
-        if value.itemsize in (1, 2, 4, 8):
-            bits = np.ascontiguousarray(value).reshape(-1).view(f"u{value.itemsize}")
-            index = np.flatnonzero(bits).astype(np.uint32 if bits.size < 2**32 else np.uint64)
-            if 2 * index.size * (index.itemsize + value.itemsize) < value.nbytes:
-                return Sparse(index.tobytes(), bits[index].tobytes())
-        return value.tobytes()
+        return self.put(value.tobytes())
 
 
 def _order(value: np.ndarray) -> str | None:
@@ -170,13 +154,7 @@ def _address(value: np.ndarray) -> int:
 # ── receiving ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _array(dtype: np.dtype, shape: tuple[int, ...], order: str, body: Place | Sparse | bytes) -> np.ndarray:
-    if isinstance(body, Sparse):
-        value = np.zeros(shape, dtype, order)
-        size = value.size
-        flat = value.reshape(-1, order=order).view(f"u{dtype.itemsize}")
-        flat[np.frombuffer(body.index, np.uint32 if size < 2**32 else np.uint64)] = np.frombuffer(body.value, flat.dtype)
-        return value
+def _array(dtype: np.dtype, shape: tuple[int, ...], order: str, body: Place | bytes) -> np.ndarray:
     data = _read(body) if isinstance(body, Place) else body
     return np.frombuffer(data, dtype).reshape(shape, order=order).copy(order)
 
@@ -186,7 +164,7 @@ def _part(owner: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], offset: in
 
 
 def _strided(
-    dtype: np.dtype, shape: tuple[int, ...], strides: tuple[int, ...], once: tuple[int, ...], body: Place | Sparse | bytes
+    dtype: np.dtype, shape: tuple[int, ...], strides: tuple[int, ...], once: tuple[int, ...], body: Place | bytes
 ) -> np.ndarray:
     """The elements in memory of their own, as far apart as `strides` say; once: their shape where a repeated axis is sent once."""
     reach = [(size - 1) * stride for size, stride in zip(shape, strides, strict=True)]

@@ -191,7 +191,14 @@ def with_specular_chosen(problem: JointProblem, fit: Fit, start: Start, run: Run
         evidence = undecided(start.lambertian) if start.decided.any() else []
         return run.journal.keep("choice", Specular(before, start.lambertian, evidence))
     sample = sampled_for(problem, before, run.options)
-    return run.journal.keep("choice", without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian))
+    number, lobes = fit.history[-1].round, sum(map(len, before.lights))
+
+    def report(trial: int, held_out: float) -> None:
+        """Of a trial without one material's specular part."""
+        run.report(Event(number, "specular part", trial, held_out, held_out, lobes))
+
+    found = without_needless_specular(sample, before, fit.loss, start.decided, start.lambertian, report)
+    return run.journal.keep("choice", found)
 
 
 def follows_prior(problem: JointProblem, fit: Fit, choices: Choices) -> bool:

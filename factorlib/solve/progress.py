@@ -26,6 +26,7 @@ def of_rounds(progress: Progress, bundle: Bundle, models: int) -> Report:
         fitted, round_ = fitted + (event.round < round_), event.round
         of_round = (event.iteration + 1) / bundle.iterations if event.phase == "descent" else 1.0
         done = fitted * bundle.rounds + event.round + min(of_round, 1.0) if event.phase != "polish" else total - 1
-        progress(done, total, f"{event.phase} {event.round}: loss {event.loss:.3g}, {event.lobes} lobes")
+        number = event.round if event.phase in ("descent", "round") else event.iteration
+        progress(done, total, f"{event.phase} {number}: loss {event.loss:.3g}, {event.lobes} lobes")
 
     return report

@@ -8,12 +8,13 @@ observations better than the true one, and a dark glossy material would lose all
 A trial whose iterations raise the held-out loss decides nothing.  A lobe may then have grown in a part of the light that only held-out
 observations mirror, and their loss says nothing about the specular part.
 
-A trial fits only the `LIGHTS` lights that show most of the material, so that its cost does not grow with the set.
+A trial fits only the `LIGHTS` lights that show most of the material, so that its cost does not grow with the set; so does the fit that
+it is compared with once another material has lost its specular part since the last fit of all lights.  These are fitted again at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -81,30 +82,40 @@ class Trials:
 
 
 def without_needless_specular(
-    problem: JointProblem, start: Point, robust: Loss, decided: Bool[np.ndarray, " m"], lambertian: Bool[np.ndarray, " m"]
+    problem: JointProblem,
+    start: Point,
+    robust: Loss,
+    decided: Bool[np.ndarray, " m"],
+    lambertian: Bool[np.ndarray, " m"],
+    report: Callable[[int, float], None] = lambda trial, held_out: None,
 ) -> Specular:
     """The point with needless specular parts gone, which materials have none, and the evidence for every material.
 
     start: nearly at an optimum, so that iterations change the held-out loss less than what is decided;  robust: the loss to lower;
-    decided: materials that are not tried;  lambertian: those of them that have no specular part
+    decided: materials that are not tried;  lambertian: those of them that have no specular part;  report: called with the number of
+    each trial, from 0, and the held-out loss that it is compared with
     """
     trials, lambertian = Trials(problem, start, robust), lambertian.copy()
     every, numbers = np.arange(len(problem.blocks)), np.arange(len(lambertian))
     base = start.materials  # all go on from here by as many iterations
     chosen, evidence = trials.near_optimum(every, base, lambertian), undecided(lambertian)
-    for m in np.argsort(base.specular.mean(1), kind="stable"):
+    current = True  # whether `chosen` is the fit of `base`
+    for number, m in enumerate(np.argsort(base.specular.mean(1), kind="stable")):
         lights = trials.lights_of(m)
         if decided[m] or not trials.shows_held_out(lights, m) or base.specular[m].mean() > base.diffuse[m].mean():
             continue
-        judge, richer, without = problem.restricted(lights), chosen.restricted(lights), base.lambertian(m)
-        most = NEEDED_EARLY * judge.held_out_loss(richer)
+        richer = chosen.restricted(lights) if current else trials.near_optimum(lights, base, lambertian)
+        judge, without = problem.restricted(lights), base.lambertian(m)
+        report(number, held_out := judge.held_out_loss(richer))
+        most = NEEDED_EARLY * held_out
         trial = trials.near_optimum(lights, without, lambertian | (numbers == m), most)
         evidence[m] = compare(judge, Candidates(trial, richer), SPECULAR, int(m))
         if evidence[m].kept:
             continue
         base, lambertian[m] = without, True
-        chosen = trial if len(lights) == len(every) else trials.near_optimum(every, base, lambertian)
-    return Specular(chosen, lambertian, evidence)
+        current = len(lights) == len(every)
+        chosen = trial if current else chosen
+    return Specular(chosen if current else trials.near_optimum(every, base, lambertian), lambertian, evidence)
 
 
 def undecided(lambertian: Bool[np.ndarray, " m"]) -> list[Evidence]:
