@@ -44,7 +44,7 @@ SKY, SUN = 1.0, 1e4  # radiances
 
 
 class Case(msgspec.Struct, frozen=True):
-    """What is `seen`, what would be without noise and harm (`clean`), and the materials it was made with."""
+    """What is `seen`, what would be without noise and perturbation (`clean`), and the materials it was made with."""
 
     seen: Observations
     clean: Observations
@@ -141,12 +141,12 @@ def case(truth: Materials, lights: Sequence[Light], shown=None, normals=None) ->
 ORDINARY = case(TWO, ROOMS[:2])
 
 
-def harmed(harm: Callable[[Observations, int], Observations]) -> Callable[[int], Case]:
-    """The ordinary case after `harm(seen, seed)`."""
+def perturbed(perturbation: Callable[[Observations, int], Observations]) -> Callable[[int], Case]:
+    """The ordinary case after `perturbation(seen, seed)`."""
 
     def of(seed: int) -> Case:
         ordinary = ORDINARY(seed)
-        return msgspec.structs.replace(ordinary, seen=harm(ordinary.seen, seed))
+        return msgspec.structs.replace(ordinary, seen=perturbation(ordinary.seen, seed))
 
     return of
 
@@ -170,7 +170,7 @@ def with_wrong_normals(seen: Observations, seed: int) -> Observations:
 
 
 def with_noise_on_normals(degrees: float) -> Callable[[int], Case]:
-    return harmed(lambda seen, seed: tilted(seen, degrees * np.abs(np.random.default_rng(seed).normal(size=len(seen))), seed + 1))
+    return perturbed(lambda seen, seed: tilted(seen, degrees * np.abs(np.random.default_rng(seed).normal(size=len(seen))), seed + 1))
 
 
 def with_invalid(seen: Observations, seed: int) -> Observations:
@@ -201,16 +201,16 @@ CASES: dict[str, Callable[[int], Case]] = {
     "radiances × 10⁻⁴": of_brightness(1e-4),
     "radiances × 10⁴": of_brightness(1e4),
     "sun 10⁴ × the sky": case(TWO, [SUNNY, ROOMS[1]]),
-    "half the values clipped": harmed(clipped),
-    "all values clipped": harmed(lambda seen, seed: clipped(seen, seed, 1.0)),
-    "20 % of normals wrong by 40°": harmed(with_wrong_normals),
+    "half the values clipped": perturbed(clipped),
+    "all values clipped": perturbed(lambda seen, seed: clipped(seen, seed, 1.0)),
+    "20 % of normals wrong by 40°": perturbed(with_wrong_normals),
     "normals with noise of 1°": with_noise_on_normals(1),
     "normals with noise of 2°": with_noise_on_normals(2),
     "normals with noise of 5°": with_noise_on_normals(5),
     "normals with noise of 10°": with_noise_on_normals(10),
     "two equal materials": case(chosen([1, 1]), ROOMS[:2]),
     "a material without pixels": case(THREE, ROOMS[:2], [[1, 2], [1, 2]]),
-    "NaN, infinite, no direction": harmed(with_invalid),
+    "NaN, infinite, no direction": perturbed(with_invalid),
 }
 
 

@@ -1,7 +1,7 @@
 """The unit of work of all studies: a case is one set of observations, solved once and compared with the truth.
 
 A case belongs to a world, which its seed names: five materials on spheres, and as many lights at most.  It sees some entries of
-the matrix of materials × lights, perhaps harmed, and is asked for all entries of its rows and columns.  Cases of equal seeds
+the matrix of materials × lights, perhaps perturbed, and is asked for all entries of its rows and columns.  Cases of equal seeds
 show equal materials in equal lights, so that settings are compared seed by seed.
 """
 

@@ -25,7 +25,7 @@ class Scale(msgspec.Struct, frozen=True):
 
     @property
     def square(self) -> str:
-        """The name of the setting of all entries of `side` materials in as many lights, unharmed."""
+        """The name of the setting of all entries of `side` materials in as many lights, unperturbed."""
         return f"{self.side}x{self.side}"
 
     @property

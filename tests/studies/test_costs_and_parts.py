@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.operator import cases as operator_cases
 from benchmarks.solve import hard_cases
-from benchmarks.splits import HARMS, splits_of
+from benchmarks.splits import CHANGES, splits_of
 from factorlib.evaluate.ball import constant_light
 from factorlib.runner.project import LIBRARY
 from factorlib.solve.options import Bundle
@@ -59,7 +59,7 @@ def operator_free_kinds():
 def test_options_of_parts_are_options():
     known = {*Bundle.__struct_fields__, "robust_scale", "seen"}
     for _, how in part.PARTS.values():
-        assert how.keys() <= known and how.get("seen", "sure") in HARMS
+        assert how.keys() <= known and how.get("seen", "sure") in CHANGES
 
 
 # cost -----------------------------------------------------------------------------------------------------------------
@@ -129,15 +129,15 @@ def photo(seed=0, n=400):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("harm", [None, *HARMS])
-def test_what_is_asked_for_is_the_same_whatever_a_solve_may_see(harm):
-    (usual,), (found,) = splits_of([photo()], {}), splits_of([photo()], {}, harm)
+@pytest.mark.parametrize("change", [None, *CHANGES])
+def test_what_is_asked_for_is_the_same_whatever_a_solve_may_see(change):
+    (usual,), (found,) = splits_of([photo()], {}), splits_of([photo()], {}, change)
     np.testing.assert_array_equal(found.asked.radiance, usual.asked.radiance)
     assert len(found.seen) and not {*map(tuple, found.seen.normal)} & {*map(tuple, found.asked.normal)}
-    changed = {"sure": "precision", "unclipped": "clipped", "dropped": "clipped"}.get(harm)
+    changed = {"sure": "precision", "unclipped": "clipped", "dropped": "clipped"}.get(change)
     same = len(found.seen) == len(usual.seen) and all(np.array_equal(getattr(found.seen, k), getattr(usual.seen, k)) for k in ("precision", "clipped"))
     assert same == (changed is None)
-    assert harm not in ("unclipped", "dropped") or not found.seen.clipped.any()
+    assert change not in ("unclipped", "dropped") or not found.seen.clipped.any()
 
 
 # figures and sentences ------------------------------------------------------------------------------------------------

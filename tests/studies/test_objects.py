@@ -1,4 +1,4 @@
-"""What a case of objects sees, harmed and mended; its scores; a solve that starts from an earlier one."""
+"""What a case of objects sees, perturbed and mended; its scores; a solve that starts from an earlier one."""
 
 import json
 
@@ -14,7 +14,7 @@ from factorlib.solve import natural, rounds
 from factorlib.stage import Inputs, silent
 from studies.catalogue.paper_sets import docksta, unlinked
 from studies.core.case import World, light_name
-from studies.core.objects.case import Harm, ObjectsCase
+from studies.core.objects.case import ObjectsCase, Perturbation
 from studies.core.objects.observed import observations_of, together
 from studies.core.objects.treatment import BEYOND_ALL, robust_loss
 from studies.core.objects.world import BODIES, SIDE, body, materials_of, with_one_light_more
@@ -27,8 +27,8 @@ LIGHTS = {li: constant_light(np.array([1.0, 0.8, 0.5]) * (1 + li)) for li in ran
 TRUTHS = materials_of(0)
 
 
-def seen(harm=Harm(), entries=((0, 0),), pixels=ALL, **how):
-    case = ObjectsCase(0, tuple(entries), pixels, harm, **how)
+def seen(perturbation=Perturbation(), entries=((0, 0),), pixels=ALL, **how):
+    case = ObjectsCase(0, tuple(entries), pixels, perturbation, **how)
     return observations_of(case, TRUTHS, LIGHTS)
 
 
@@ -46,27 +46,28 @@ def test_objects_that_are_where_they_are_thought_to_be_have_true_normals():
 
 def test_the_further_an_object_is_turned_the_more_its_normals_are_off():
     """By about as much: pixels show other places of a curved surface then, too."""
-    small, large = (errors(Harm(turned_deg=degrees)) for degrees in (2.0, 20.0))
+    small, large = (errors(Perturbation(turned_deg=degrees)) for degrees in (2.0, 20.0))
     assert (small > 0.5).all() and (small < 4.0).all()
     assert (large > 3 * small).all() and (large < 40.0).all()
 
 
-@pytest.mark.parametrize("harm", [Harm(shifted=0.05), Harm(larger=0.1), Harm(triangles=100)])
-def test_other_harms_do_harm(harm):
-    assert (errors(harm) > 0.5).all()
+@pytest.mark.parametrize("perturbation", [Perturbation(shifted=0.05), Perturbation(larger=0.1), Perturbation(triangles=100)])
+def test_other_perturbations_turn_normals_too(perturbation):
+    assert (errors(perturbation) > 0.5).all()
 
 
 def test_harm_changes_the_normals_and_not_what_a_pixel_shows():
-    clean, harmed = (together(seen(harm)["light0"]) for harm in (Harm(), Harm(turned_deg=5.0)))
+    clean, perturbed = (together(seen(perturbation)["light0"]) for perturbation in (Perturbation(), Perturbation(turned_deg=5.0)))
     radiance = dict(zip(clean.x.tolist(), clean.radiance.tolist(), strict=True))
-    shared = [k for k, pixel in enumerate(harmed.x.tolist()) if pixel in radiance]
+    shared = [k for k, pixel in enumerate(perturbed.x.tolist()) if pixel in radiance]
     assert len(shared) > 1000
-    assert all(harmed.radiance[k].tolist() == radiance[int(harmed.x[k])] for k in shared)
+    assert all(perturbed.radiance[k].tolist() == radiance[int(perturbed.x[k])] for k in shared)
 
 
-@pytest.mark.parametrize("harm", [Harm(turned_deg=5.0), Harm(turned_deg=20.0), Harm(larger=0.1), Harm(shifted=0.05)])
-def test_fitting_the_outline_mends_the_pose(harm):
-    assert np.median(errors(harm, refined=True)) < 0.4 * np.median(errors(harm))
+@pytest.mark.parametrize("what", [{"turned_deg": 5.0}, {"turned_deg": 20.0}, {"larger": 0.1}, {"shifted": 0.05}])
+def test_fitting_the_outline_mends_the_pose(what):
+    perturbation = Perturbation(**what)
+    assert np.median(errors(perturbation, refined=True)) < 0.4 * np.median(errors(perturbation))
 
 
 def test_the_solve_hears_how_sure_normals_are_or_not():

@@ -1,4 +1,4 @@
-"""What a case sees: entries, harm, faces."""
+"""What a case sees: entries, perturbations, faces."""
 
 import numpy as np
 import pytest
@@ -34,9 +34,9 @@ def test_an_entry_is_the_same_whatever_else_a_case_shows():
 
 
 def test_harm_changes_what_is_told_and_not_what_is_seen():
-    clean, harmed = (seen(full_matrix(2, 1), **how)["light0"] for how in ({}, {"normal_deg": 5.0, "wrong_labels": 0.2}))
-    assert np.array_equal(clean.radiance, harmed.radiance)
-    assert not np.array_equal(clean.normal, harmed.normal) and 0 < np.mean(clean.material != harmed.material) < 0.4
+    clean, perturbed = (seen(full_matrix(2, 1), **how)["light0"] for how in ({}, {"normal_deg": 5.0, "wrong_labels": 0.2}))
+    assert np.array_equal(clean.radiance, perturbed.radiance)
+    assert not np.array_equal(clean.normal, perturbed.normal) and 0 < np.mean(clean.material != perturbed.material) < 0.4
 
 
 def test_normals_turn_as_far_as_they_are_told():

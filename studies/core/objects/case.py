@@ -15,7 +15,7 @@ from studies.core.entries import Entries
 SEVEN = (*NAMES, "tile", "bronze")
 
 
-class Harm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What of an object is not as the solve is led to believe.
 
     turned_deg:  about a random axis through its middle
@@ -33,19 +33,19 @@ class Harm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ObjectsCase(Entries, frozen=True, forbid_unknown_fields=True):
     """What one solve sees: an object for each entry.
 
-    pixels:      most observations of an entry
-    harm:        of every object alike, toward random sides
-    robust:      whether the solve has its robust loss
-    confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
-    refined:     whether every pose is first fitted to the outline of its mask by `factorlib.align.refine`, from where the harm left it
-    start:       nothing, or the solution of all photos but the last (the stage's parameter `start`)
-    solve:       parameters of the stage `solve` that differ from their defaults
+    pixels:        most observations of an entry
+    perturbation:  of every object alike, toward random sides
+    robust:        whether the solve has its robust loss
+    confidence:    whether the solve gets the confidence of each normal, as the stage `align` writes it
+    refined:       whether every pose is first fitted to the outline of its mask by `factorlib.align.refine`, from the perturbed one
+    start:         nothing, or the solution of all photos but the last (the stage's parameter `start`)
+    solve:         parameters of the stage `solve` that differ from their defaults
     """
 
     names: ClassVar[tuple[str, ...]] = SEVEN
 
     pixels: int
-    harm: Harm = Harm()
+    perturbation: Perturbation = Perturbation()
     robust: bool = True
     confidence: bool = True
     refined: bool = False

@@ -1,8 +1,8 @@
 """What a case of objects sees: radiance of the true normals, beside the normals of where the objects are thought to be.
 
-Pixels     those that both the true object and the one of the harmed pose and mesh show, as the stage `urm` takes them
-Noise      each radiance times 1 + .01 · normal, drawn for each pixel by itself: harm leaves what a pixel shows as it is
-Normals    of the mesh that is given, at the pose that is given: harmed, or fitted to the outline from there
+Pixels     those that both the true object and the one of the perturbed pose and mesh show, as the stage `urm` takes them
+Noise      each radiance times 1 + .01 · normal, drawn for each pixel by itself: a perturbation leaves what a pixel shows as it is
+Normals    of the mesh that is given, at the pose that is given: perturbed, or fitted to the outline from there
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.core.case import light_name
-from studies.core.objects.case import Harm, ObjectsCase
+from studies.core.objects.case import ObjectsCase, Perturbation
 from studies.core.objects.world import CAMERA, body, body_of, pose_of
 from studies.core.observed import NOISE
 from studies.core.world import GRAZING, spheres
@@ -65,7 +65,7 @@ def _entry(case: ObjectsCase, m: int, li: int, materials: Mapping[str, Reflectan
     rng = np.random.default_rng([14, case.seed, m, li])
     whole = body(body_of(m, li))
     truth = pose_of(whole, rng)
-    shown, given = rasterise(whole, CAMERA, truth), given_of(body_of(m, li), truth, case.harm, rng)
+    shown, given = rasterise(whole, CAMERA, truth), given_of(body_of(m, li), truth, case.perturbation, rng)
     outline = Silhouette(shown.label.astype(np.int16))
     if case.refined:
         given = Given(given.mesh, fitted(given, outline))
@@ -84,15 +84,15 @@ def _facing(maps: Maps) -> np.ndarray:
     return maps.normal @ FRONT > GRAZING
 
 
-def given_of(name: str, truth: Pose, harm: Harm, rng: np.random.Generator) -> Given:
-    """What stands for the body `name` at pose `truth` after `harm`."""
-    whole, mesh = body(name), body(name, harm.triangles)
-    if harm.larger:
-        mesh = Caster(scaled(mesh.mesh, (1 + harm.larger,) * 3))
+def given_of(name: str, truth: Pose, perturbation: Perturbation, rng: np.random.Generator) -> Given:
+    """What stands for the body `name` at pose `truth` after `perturbation`."""
+    whole, mesh = body(name), body(name, perturbation.triangles)
+    if perturbation.larger:
+        mesh = Caster(scaled(mesh.mesh, (1 + perturbation.larger,) * 3))
     axis, side = (v / np.linalg.norm(v) for v in (rng.normal(size=3), np.append(rng.normal(size=2), 0.0)))
-    rotation = rotation_of_vector(np.radians(harm.turned_deg) * axis) @ truth.rotation
-    middle = truth.rotation @ whole.centre + truth.translation + harm.shifted * 2 * whole.radius * side
-    return Given(mesh, Pose(rotation, middle - rotation @ (whole.centre * (1 + harm.larger))))
+    rotation = rotation_of_vector(np.radians(perturbation.turned_deg) * axis) @ truth.rotation
+    middle = truth.rotation @ whole.centre + truth.translation + perturbation.shifted * 2 * whole.radius * side
+    return Given(mesh, Pose(rotation, middle - rotation @ (whole.centre * (1 + perturbation.larger))))
 
 
 def fitted(given: Given, outline: Silhouette) -> Pose:

@@ -24,7 +24,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render, harm, and fit poses where the case says so."""
+    """Render, perturb, and fit poses where the case says so."""
     case = msgspec.convert(inputs.facts["dataset.case"], ObjectsCase)
     lights = {li: light(read_rgb_exr(inputs["worlds"] / light_file(case.seed, li))) for li in case.lights}
     photos = observations_of(case, materials_of(case.seed), lights)

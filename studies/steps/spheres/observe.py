@@ -20,7 +20,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render and harm."""
+    """Render and perturb."""
     case = msgspec.convert(inputs.facts["dataset.case"], Case)
     lights = {li: light(read_rgb_exr(inputs["worlds"] / light_file(case.seed, li))) for li in case.lights}
     (out / inputs.photo).mkdir()
