@@ -1,11 +1,12 @@
 """Studies as tables: `python -m studies.tables [study …] [--quick] [--docs]`; --docs refreshes docs/studies.md.
 
 Runs whatever of the studies must run first, so that every number is of the sources that are here.  `benchmarks.stale` names the tables
-of the page that are of others.
+of the page that are of others.  What the page has of a full study stays until there is a full one to replace it: a quick one says less.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -31,14 +32,42 @@ STEPS = ROOT / "studies" / "steps"
 SHOWN = 4  # measures of a study
 
 
-def against_the_paper(found: dict[str, Conclusion]) -> str:
-    """The table of conclusions of all studies, those that were not run among them."""
-    rows = [[f"[{s.title}](#{s.title.lower().replace(' ', '-')})", s.paper, _answer(found.get(name))] for name, s in STUDIES.items()]
+def against_the_paper(found: dict[str, Conclusion], page: str = "") -> str:
+    """The table of conclusions of all studies, those that were not run among them.
+
+    page: the text of the page, whose answer stays where it is a full study's and `found` has none
+    """
+    rows = []
+    for name, study in STUDIES.items():
+        title = f"[{study.title}](#{study.title.lower().replace(' ', '-')})"
+        kept = _answer_on(page, title) if is_full(page, name) and not _full(found.get(name)) else None
+        rows.append([title, study.paper, kept or (answer_to_the_paper(found[name]) if name in found else "not run")])
     return table(["study", "the paper", "here"], rows)
 
 
-def _answer(found: Conclusion | None) -> str:
-    return answer_to_the_paper(found) if found else "not run"
+def part_of(page: str, name: str) -> str:
+    """What the page has between the marks of `name`; nothing where there are none.
+
+    >>> part_of("<!-- begin a -->\\nten\\n<!-- end a -->", "a")
+    'ten\\n'
+    """
+    found = re.search(rf"<!-- begin {re.escape(name)} -->\n(.*?)<!-- end {re.escape(name)} -->", page, re.DOTALL)
+    return found[1] if found else ""
+
+
+def is_full(page: str, name: str) -> bool:
+    """Whether the page has a full study's table of that name."""
+    inner = part_of(page, name)
+    return "|" in inner and "(quick" not in inner
+
+
+def _answer_on(page: str, title: str) -> str | None:
+    rows = [line.split(" | ") for line in part_of(page, "conclusions").splitlines()]
+    return next((row[-1].removesuffix(" |") for row in rows if row[0] == f"| {title}"), None)
+
+
+def _full(found: Conclusion | None) -> bool:
+    return found is not None and not found.label
 
 
 def numbers(found: Conclusion) -> str:
@@ -78,11 +107,12 @@ def main(
         raise SystemExit(1)
     found = conclusions(project)
     parts = {name: numbers(found[name]) for name in names or STUDIES}
-    everything = against_the_paper(conclusions(project_of(QUICK)) | conclusions(project_of(FULL)))
+    page = DOCS.read_text(encoding="utf-8")
+    everything = against_the_paper(conclusions(project_of(QUICK)) | conclusions(project_of(FULL)), page)
     print("\n\n".join([everything, *parts.values()]))
     if docs:
         refresh(DOCS, {"conclusions": everything}, "studies.tables")
-        for name, part in parts.items():
+        for name, part in parts.items() if not quick else [(n, part) for n, part in parts.items() if not is_full(page, n)]:
             refresh(DOCS, {name: part}, "studies.tables", modules=measuring(STUDIES[name]))
 
 
