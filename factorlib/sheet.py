@@ -74,7 +74,7 @@ def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) 
 
 def _mesh(dataset: Dataset, obj: ObjectEntry) -> Mesh:
     entry = dataset.spec.meshes[obj.mesh]
-    return read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.parts, entry.material, obj.materials)
+    return read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.made_of, obj.materials)
 
 
 def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:

@@ -103,7 +103,7 @@ class Validation:
 
     def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
         file = self._file(mesh.file)
-        part_labels(self._parts_of(mesh.file, limits), self.dataset.spec.materials, mesh.parts, mesh.material, obj.materials, file)
+        part_labels(self._parts_of(mesh.file, limits), self.dataset.spec.materials, mesh.made_of, obj.materials, file)
 
     def _parts_of(self, name: str, limits: Limits) -> list[tuple[str, ...]]:
         """The parts of a mesh file, which is read once; if it cannot be, that is said again for every object."""

@@ -95,7 +95,7 @@ def objects_of(
 
 
 def _mesh(file: Path, mesh: schema.MeshEntry, obj: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
-    return read_mesh(file, materials, mesh.parts, mesh.material, obj.materials, params.crease_deg, params.limits)
+    return read_mesh(file, materials, mesh.made_of, obj.materials, params.crease_deg, params.limits)
 
 
 def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace], photo: str) -> None:

@@ -82,7 +82,7 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: In
         found, mesh = entry.objects[obj.name], slice_.meshes[obj.mesh]
         if found.source not in SEARCHED or (found.silhouette_iou or 0.0) < params.least_iou:
             continue
-        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.parts, mesh.material, obj.materials, limits=NO_LIMITS)
+        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.made_of, obj.materials, limits=NO_LIMITS)
         silhouette = silhouette_of_object(channels, number, read.labels, obj.mask is not None)
         state = state_of(found.pose, camera, scaled(read, found.scale))
         target = target_of(silhouette, read.labels, params.resolution, MARGIN)

@@ -85,7 +85,7 @@ def scene_of(inputs: Inputs, photo: dict, entry: PhotoPoses, shadows: int) -> Sc
     for number, own in enumerate(slice_.objects, start=1):
         mesh, found = slice_.meshes[own.mesh], entry.objects[own.name]
         file = inputs.file(mesh.file)
-        read = read_mesh(file, inputs.facts["dataset.materials"], mesh.parts, mesh.material, own.materials, limits=NO_LIMITS)
+        read = read_mesh(file, inputs.facts["dataset.materials"], mesh.made_of, own.materials, limits=NO_LIMITS)
         caster = Caster(scaled(read, found.scale))
         silhouette, other = silhouette_of_object(photo, number, caster.mesh.labels, own.mask is not None), found.runner_up
         moves = found.source in SEARCHED

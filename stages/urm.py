@@ -76,8 +76,6 @@ def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
     for thing in slice_.objects:
         entry = slice_.meshes[thing.mesh]
-        mesh = read_mesh(
-            inputs.file(entry.file), inputs.facts["dataset.materials"], entry.parts, entry.material, thing.materials, limits=NO_LIMITS
-        )
+        mesh = read_mesh(inputs.file(entry.file), inputs.facts["dataset.materials"], entry.made_of, thing.materials, limits=NO_LIMITS)
         meshes.append(scaled(mesh, poses[thing.name].scale))
     return Occluders(meshes, [poses[thing.name].pose for thing in slice_.objects])

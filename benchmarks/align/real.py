@@ -96,7 +96,7 @@ def _aligned(dataset: Dataset, photo: str, folder: Path) -> tuple[PhotoPoses, tu
 
 def _errors(dataset: Dataset, obj: ObjectEntry, size: tuple[int, int], entry: PhotoPoses, reference: Reference) -> dict:
     mesh = dataset.spec.meshes[obj.mesh]
-    caster = Caster(read_mesh(dataset.folder / mesh.file, dataset.spec.materials, mesh.parts, mesh.material, obj.materials))
+    caster = Caster(read_mesh(dataset.folder / mesh.file, dataset.spec.materials, mesh.made_of, obj.materials))
     (camera, pose), (true_camera, true_pose) = (_seen(said, obj.name, size) for said in (entry, reference))
     found = entry.objects[obj.name]
     return {

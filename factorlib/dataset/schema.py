@@ -37,6 +37,11 @@ class MeshEntry(_Format):
     parts: dict[str, str] | None = None
     material: str | None = None
 
+    @property
+    def made_of(self) -> dict[str, str] | str | None:
+        """The material of each part, or that of all; None where the entry names none, which the reader refuses."""
+        return self.parts or self.material
+
 
 class Camera(_Format):
     """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is found."""

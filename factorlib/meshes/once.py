@@ -26,5 +26,5 @@ class MeshesOnce:
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.file(entry.file)
-            self._meshes[key] = read_mesh(file, self.materials, entry.parts, entry.material, overrides, self.crease_deg, NO_LIMITS)
+            self._meshes[key] = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
         return self._meshes[key]

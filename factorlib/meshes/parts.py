@@ -22,25 +22,27 @@ def check_count(parts: int, file: str | Path) -> None:
 def part_labels(
     names: Sequence[tuple[str, ...]],
     materials: Sequence[str],
-    parts: Mapping[str, str] | None,
-    material: str | None,
+    made_of: Mapping[str, str] | str | None,
     overrides: Mapping[str, str],
     file: str | Path,
 ) -> np.ndarray:
     """Material label (int16, from 1) of each part of a file, given the names it goes by.
 
-    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], {"shell": "red", "wood": "oak"}, None, {}, "a.obj").tolist()
+    made_of: part -> material, or the material of all parts;  overrides: part -> material, which go before it
+
+    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], {"shell": "red", "wood": "oak"}, {}, "a.obj").tolist()
     [1, 2]
     """
     there = sorted({name for each in names for name in each})
-    for mapping in (parts or {}, overrides):
+    parts, material = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
+    for mapping in (parts, overrides):
         for part, chosen in mapping.items():
             if part not in there:
                 raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=did_you_mean(part, [one_line(name) for name in there]))
             _check_material(chosen, materials, part, file)
     if material is not None:
         _check_material(material, materials, None, file)
-    return np.array([_label(each, materials, parts or {}, material, overrides, file) for each in names], dtype=np.int16)
+    return np.array([_label(each, materials, parts, material, overrides, file) for each in names], dtype=np.int16)
 
 
 def _label(

@@ -36,8 +36,7 @@ log = logging.getLogger("factorlib.meshes")
 def read_mesh(
     path: str | Path,
     materials: Sequence[str],
-    parts: Mapping[str, str] | None = None,
-    material: str | None = None,
+    made_of: Mapping[str, str] | str | None = None,
     overrides: Mapping[str, str] | None = None,
     crease_deg: float = CREASE_DEG,
     limits: Limits | None = None,
@@ -45,7 +44,7 @@ def read_mesh(
     """The mesh of one object, labelled by material.
 
     materials   the dataset's, in order: label k is the k-th, from 1
-    parts       part -> material; or `material` for the whole mesh; `overrides` (part -> material) go before both
+    made_of     part -> material, or the material of the whole mesh; `overrides` (part -> material) go before it
     crease_deg  edges sharper than this stay sharp in the normals
     limits      how large it may be
 
@@ -53,7 +52,7 @@ def read_mesh(
     finite, a part of the mesh that has no material, a named part that the mesh lacks, and a material that the dataset lacks.
     """
     soup = read_soup(path, limits or Limits())
-    label = part_labels(soup.parts, materials, parts, material, overrides or {}, path)
+    label = part_labels(soup.parts, materials, made_of, overrides or {}, path)
     return usable(soup, label[soup.part], crease_deg, path)
 
 

@@ -126,7 +126,7 @@ class SolvedSet:
             return sphere(1.0), (material or self.names[0],), axis
         if is_mesh_file(name):
             wanted = material or self.names[0]
-            return read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], None, wanted, {}, self._meshes.crease_deg), (wanted,), axis
+            return read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], wanted, {}, self._meshes.crease_deg), (wanted,), axis
         photo, obj = next((photo, obj) for photo, o in self.objects.items() for obj in o.objects if obj.mesh == name)
         placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
         upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal

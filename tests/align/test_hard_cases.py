@@ -96,7 +96,7 @@ def test_a_vertex_that_is_no_number_is_refused_by_name(tmp_path):
     path = tmp_path / "nan.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv nan 1 0\nv 1 1 1\nf 1 2 3\nf 2 3 4\n")
     with pytest.raises(InputError, match=r"1 vertices are not finite, first is number 3"):
-        read_mesh(path, ["white"], material="white")
+        read_mesh(path, ["white"], "white")
 
 
 def test_a_million_triangles():

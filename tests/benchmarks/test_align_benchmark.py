@@ -63,7 +63,7 @@ def test_the_set_is_a_dataset_that_is_read_with_its_truth(tmp_path):
     assert [photo.name for photo in dataset.spec.photos] == [case.name for case in made]
     assert set(dataset.truth.poses) == {case.name for case in made if case.kind in cases.RIGHT}
     entry = dataset.spec.meshes["chair"]
-    mesh = read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.parts, entry.material)
+    mesh = read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.made_of)
     assert mesh.labels == (1, 2) and np.isclose(mesh.radius, shapes.mesh("chair").radius, rtol=1e-3)
 
 

@@ -81,7 +81,7 @@ def closed_form(name: str, model) -> tuple[np.ndarray, np.ndarray]:
 def balls(tmp_path_factory):
     folder = tmp_path_factory.mktemp("balls")
     made_export.write_obj(folder / "ball.obj", (1, 1, 1), rows=96)
-    write_ply(folder / "ball.ply", read_mesh(folder / "ball.obj", ["red"], None, "red"))
+    write_ply(folder / "ball.ply", read_mesh(folder / "ball.obj", ["red"], "red"))
     write_script(folder)
     for name in SIDES:
         write_ball(folder, name)

@@ -78,7 +78,7 @@ def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = Fa
     """A ball in front of a square camera, through a scene file and a mesh file."""
     if not (folder / "ball.red.ply").exists():
         made_export.write_obj(folder / "ball.obj", (1, 1, 1))
-        mesh = read_mesh(folder / "ball.obj", ["red"], None, "red")
+        mesh = read_mesh(folder / "ball.obj", ["red"], "red")
         write_ply(folder / "ball.red.ply", mesh)
     write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
     place = np.eye(4)

@@ -96,7 +96,7 @@ def balls(tmp_path_factory):
     """A Lambertian ball under one bright texel, whose exposure has a colour, rendered from each side."""
     folder = tmp_path_factory.mktemp("balls")
     made_export.write_obj(folder / "ball.obj", (1, 1, 1), rows=96)
-    write_usd_mesh(folder / "ball.usda", read_mesh(folder / "ball.obj", ["red"], None, "red"))
+    write_usd_mesh(folder / "ball.usda", read_mesh(folder / "ball.obj", ["red"], "red"))
     place = np.eye(4)
     place[2, 3] = DISTANCE
     for name in LIT:

@@ -163,12 +163,12 @@ CAME = Counter()  # of the meshes so far: how many were read, how many refused
 def attempt(folder: Path, name: str, content: bytes) -> None:
     """Read it as the dataset's reader and the stages do."""
     (folder / name).write_bytes(content)
-    parts = {"material": "red"} if len(content) % 2 else {"parts": {"red": "red", "shell": "red"}}
+    made_of = "red" if len(content) % 2 else {"red": "red", "shell": "red"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a warning that names our source is no word to a user
         for work in (
             lambda: companions_of_mesh(name, "meshes.a.file", Refusal(folder / "dataset.yaml", folder)),
-            lambda: read_mesh(folder / name, ["red"], **parts),
+            lambda: read_mesh(folder / name, ["red"], made_of),
         ):
             refused = False
             try:

@@ -37,7 +37,7 @@ MOST_MEMORY = 30_000_000  # bytes: what a file of some kB may take
 
 
 def read(path):
-    return read_mesh(path, MATERIALS, material="red")
+    return read_mesh(path, MATERIALS, "red")
 
 
 def refused(path, words="."):
@@ -219,9 +219,9 @@ def test_a_mesh_of_too_many_triangles_is_refused(tmp_path):
 
     for name, content in GOOD.items():
         path = write(tmp_path, name, content)
-        assert len(read_mesh(path, MATERIALS, material="red", limits=Limits(triangles=4)).faces) == 4
+        assert len(read_mesh(path, MATERIALS, "red", limits=Limits(triangles=4)).faces) == 4
         with pytest.raises(InputError, match="4 triangles") as caught:
-            read_mesh(path, MATERIALS, material="red", limits=Limits(triangles=3))
+            read_mesh(path, MATERIALS, "red", limits=Limits(triangles=3))
         assert "simplify" in caught.value.cure, name
 
 

@@ -101,20 +101,20 @@ def test_unknown_material_is_named(tmp_path):
 )
 def test_unusable_meshes_are_refused(tmp_path, text, match):
     with pytest.raises(InputError, match=match):
-        read_mesh(obj(tmp_path, text), MATERIALS, material="red")
+        read_mesh(obj(tmp_path, text), MATERIALS, "red")
 
 
 def test_missing_file_and_unknown_format(tmp_path):
     for name, match in (("no.obj", "No such file"), ("mesh.xyz", "unknown mesh format")):
         with pytest.raises(InputError, match=match):
-            read_mesh(tmp_path / name, MATERIALS, material="red")
+            read_mesh(tmp_path / name, MATERIALS, "red")
 
 
 def test_truncated_binary_is_refused(tmp_path):
     path = tmp_path / "ball.ply"
     path.write_bytes(trimesh.creation.icosphere(subdivisions=2).export(file_type="ply")[:900])
     with pytest.raises(InputError):
-        read_mesh(path, MATERIALS, material="red")
+        read_mesh(path, MATERIALS, "red")
 
 
 def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):
@@ -140,7 +140,7 @@ def test_glb_nodes_are_placed_and_parts_named(tmp_path):
 @pytest.mark.parametrize("suffix", ["ply", "stl", "off"])
 def test_plain_formats_hold_one_part(tmp_path, suffix):
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / f"ball.{suffix}")
-    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, material="oak")
+    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "oak")
     assert len(mesh.faces) == 320 and mesh.labels == (2,) and not mesh.open
     assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.999  # STL has no shared vertices: welded
 
@@ -150,7 +150,7 @@ def test_written_ply_is_read_again_and_is_the_same_bytes(tmp_path):
     for name in ("a.ply", "b.ply"):
         write_ply(tmp_path / name, mesh)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    again = read_mesh(tmp_path / "a.ply", MATERIALS, material="red")
+    again = read_mesh(tmp_path / "a.ply", MATERIALS, "red")
     assert len(again.faces) == 12
     corners = [sorted(map(tuple, np.round(m.vertices[m.faces].reshape(-1, 9), 6))) for m in (mesh, again)]
     assert corners[0] == corners[1]
@@ -173,7 +173,7 @@ def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
     ]
     (tmp_path / "a.glb").write_bytes(glb(header))
     expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
-    found = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, material="red").vertices.round(5), axis=0)
+    found = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, "red").vertices.round(5), axis=0)
     assert np.allclose(found, np.unique(expected.round(5), axis=0), atol=2e-5)
 
 
@@ -184,7 +184,7 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
     (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **({"vertex_normal": True} if suffix == "ply" else {})))
-    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, material="red")
+    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "red")
     nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
     assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
 
@@ -194,6 +194,6 @@ def test_what_trimesh_writes_and_reads_is_read_the_same(tmp_path, suffix):
     made = trimesh.util.concatenate([trimesh.creation.torus(2, 0.5), trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))])
     made.export(tmp_path / f"a.{suffix}")
     theirs = trimesh.load_mesh(tmp_path / f"a.{suffix}")
-    ours = read_mesh(tmp_path / f"a.{suffix}", MATERIALS, material="red")
+    ours = read_mesh(tmp_path / f"a.{suffix}", MATERIALS, "red")
     triangles = [np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0) for t in (theirs.triangles, ours.vertices[ours.faces])]
     assert triangles[0].shape == triangles[1].shape and np.allclose(*triangles, atol=2e-3)

@@ -37,7 +37,7 @@ def test_meshes_at_the_given_poses_lie_under_the_masks(written):
         height, width = label.shape
         camera = Camera(width, height, photo.camera.focal_px, tuple(photo.camera.principal_point))
         meshes = [
-            read_mesh(written / dataset.spec.meshes[obj.mesh].file, dataset.spec.materials, None, dataset.spec.meshes[obj.mesh].material, obj.materials)
+            read_mesh(written / dataset.spec.meshes[obj.mesh].file, dataset.spec.materials, dataset.spec.meshes[obj.mesh].material, obj.materials)
             for obj in photo.objects
         ]
         poses = [Pose(np.array(obj.pose.rotation), np.array(obj.pose.translation)) for obj in photo.objects]
