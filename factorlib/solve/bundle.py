@@ -31,11 +31,11 @@ from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.natural import LOBES, OBSERVATIONS, Natural, lights_from_all, naturally, sure_ones
 from factorlib.solve.options import Choices
-from factorlib.solve.rounds import Fit, Start, answer_of, best_round, further_rounds, sampled_for
+from factorlib.solve.rounds import Fit, Start, answer_of, chosen_round, further_rounds, sampled_for
 from factorlib.solve.specular import Specular, undecided, without_needless_specular
 from factorlib.solve.thresholds import HOPEFUL, INTERREFLECTION, SHADOWS, WELL_EXPLAINED
 
-MANY = 4  # times `sample` observations bring the best round to its optimum, before all of them settle it
+MANY = 4  # times `sample` observations bring the chosen round to its optimum, before all of them settle it
 
 
 class Solution(msgspec.Struct, frozen=True):
@@ -95,7 +95,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     """
     run, fits = run or Run(), dict[str, Fit]()
     for name, model in models(problem, run.options).items():
-        fits[name] = best_round(model, start, run, f"rounds {name}", list(fits.values()))
+        fits[name] = chosen_round(model, start, run, f"rounds {name}", list(fits.values()))
     shadows = _shadows(fits)
     bounces = with_bounces_chosen(problem, fits["with"], run) if shadows.kept else Bounces(fits["without"], Evidence(False))
     problem, fit = _of_model(problem, shadows.kept, bounces.evidence.kept), bounces.fit
@@ -117,7 +117,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
 def models(problem: JointProblem, choices: Choices) -> dict[str, JointProblem]:
     """The models that rounds start with: `with` self-shadowing, `without`, or both; `without` alone where nothing is hidden.
 
-    `with` has bounces where they are `on`; else they are decided from its best round (`with_bounces_chosen`)
+    `with` has bounces where they are `on`; else they are decided from its chosen round (`with_bounces_chosen`)
     """
     shadows = choices.self_shadowing != "off" and any(block.visibility is not None for block in problem.blocks)
     found = {"without": problem.without_shadows()} if not shadows or choices.self_shadowing == "auto" else {}
@@ -131,7 +131,7 @@ def _of_model(problem: JointProblem, shadows: bool, bounces: bool) -> JointProbl
 
 
 def _shadows(fits: dict[str, Fit]) -> Evidence:
-    """Which model of `fits` explains held-out observations better, by its best round."""
+    """Which model of `fits` explains held-out observations better, by its chosen round."""
     losses = {name: fit.held_out for name, fit in fits.items()}
     if len(losses) == 2:
         return decide(losses["without"], losses["with"], SHADOWS)
@@ -236,7 +236,7 @@ def seen_under_prior(problem: JointProblem, choices: Choices) -> JointProblem:
 
 
 def polished(problem: JointProblem, fit: Fit, lambertian: Bool[np.ndarray, " m"], run: Run) -> Polished:
-    """The best round brought to its optimum on many observations, then on all, and the whole history."""
+    """The chosen round brought to its optimum on many observations, then on all, and the whole history."""
     everything = problem.with_none_held_out().with_loss(fit.loss)
     many = sampled_for(everything, fit.point, run.options, times=MANY)
     number, fixed = fit.history[-1].round, specular_unknowns(lambertian)

@@ -42,7 +42,7 @@ class Choices(Struct, frozen=True):
     tolerance: Tolerance = 1e-3
     """A descent stops after two steps that lower the loss by less than this share of it."""
     least_gain: Share = 0.01
-    """Share of the held-out loss that a round must gain to be taken as the best one."""
+    """Share of the held-out loss that a round must gain to be the best one; two rounds without gain are the last."""
     self_shadowing: SelfShadowing = "auto"
     """Whether what meshes hide of the light is dark; auto: where that explains held-out observations better."""
     interreflection: Interreflection = "auto"

@@ -4,6 +4,9 @@
             descend on all unknowns (descent), look for a better roughness (roughness), prune, fix the gauge
             (all on a sample of the observations, which finds the lobes as well as all of them do)
     best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
+    chosen: the last round whose held-out loss is above the best one's by no more than the standard error of their difference,
+            observation by observation.  Where held-out observations cannot tell two rounds apart, the fitted ones do, which the
+            later round explains better; the least of two losses that are equal up to noise would be rounding's choice
     stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
             evidence), at `lobes` lobes per light, or after `rounds`; after `ENOUGH` of them, where lights may follow a prior and a
             further round is not expected to explain held-out pixels so well that they need none
@@ -69,12 +72,14 @@ class Rounds(msgspec.Struct, frozen=True):
     """The state between two rounds.
 
     current       the point after the last round;  best: the best point so far, with its held-out loss `held_out`
+    chosen        the last point that held-out observations do not tell to be worse than the best
     fitted        the fitted loss of the last round
     without_gain  how many rounds in a row have gained nothing;  over: there is no further round
     """
 
     current: Point
     best: Point
+    chosen: Point
     held_out: float
     fitted: float
     history: list[Event]
@@ -88,7 +93,7 @@ class Rounds(msgspec.Struct, frozen=True):
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """The best round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
+    """The chosen round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
 
     point: Point
     held_out: float
@@ -96,12 +101,12 @@ class Fit(msgspec.Struct, frozen=True):
     history: list[Event]
 
     def held_out_at(self, number: int) -> float:
-        """The held-out loss of round `number`; if there were fewer rounds, that of the best one."""
+        """The held-out loss of round `number`; if there were fewer rounds, that of the chosen one."""
         rounds = [event.held_out for event in self.history if event.phase == "round"]
         return rounds[number] if number < len(rounds) else self.held_out
 
 
-def best_round(problem: JointProblem, start: Start, run: Run, part: str = "rounds", rivals: Sequence[Fit] = ()) -> Fit:
+def chosen_round(problem: JointProblem, start: Start, run: Run, part: str = "rounds", rivals: Sequence[Fit] = ()) -> Fit:
     """Rounds on a sample of the observations, until they gain nothing or a rival was far better at the same round.
 
     part: the name by which the journal keeps them
@@ -115,11 +120,11 @@ def best_round(problem: JointProblem, start: Start, run: Run, part: str = "round
 
 
 def further_rounds(problem: JointProblem, fit: Fit, start: Point, run: Run, part: str = "further rounds") -> Fit:
-    """Further rounds from `start` in place of the fit's best point."""
+    """Further rounds from `start` in place of the fit's point."""
     rounds = run.journal.kept(part, Rounds)
     if not rounds:
         held_out = sampled_for(problem, start, run.options).held_out_loss(start)
-        rounds = Rounds(start, start, held_out, np.inf, fit.history)
+        rounds = Rounds(start, start, start, held_out, np.inf, fit.history)
         rounds = msgspec.structs.replace(rounds, over=_full(start, run.options) or rounds.done >= run.options.rounds)
     return _fit_of(problem, rounds, run, part)
 
@@ -128,8 +133,8 @@ def _fit_of(problem: JointProblem, rounds: Rounds, run: Run, part: str, rivals: 
     """All further rounds, until they are over."""
     while not rounds.over:
         rounds = run.journal.keep(part, _next_round(problem, rounds, run, rivals))
-    loss = robust(sampled_for(problem, rounds.best, run.options), rounds.best)
-    return Fit(rounds.best, rounds.held_out, loss, rounds.history)
+    sample = sampled_for(problem, rounds.chosen, run.options)
+    return Fit(rounds.chosen, sample.held_out_loss(rounds.chosen), robust(sample, rounds.chosen), rounds.history)
 
 
 def _full(point: Point, bundle: Bundle) -> bool:
@@ -146,9 +151,9 @@ def _before_rounds(problem: JointProblem, start: Start, bundle: Bundle) -> Round
     sample = problem.sampled(bundle.sample, bundle.seed)
     current = fit_weights(sample, start.point(sample, bundle)).point
     if not start.converged:
-        return Rounds(current, current, np.inf, np.inf, [])
+        return Rounds(current, current, current, np.inf, np.inf, [])
     reached = evaluate(sample.with_loss(robust(sample, current)), current).loss
-    return Rounds(current, current, sample.held_out_loss(current), reached, [])
+    return Rounds(current, current, current, sample.held_out_loss(current), reached, [])
 
 
 def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequence[Fit]) -> Rounds:
@@ -160,14 +165,28 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run, rivals: Sequenc
     current = descend(fitting, current, Descent(bundle.iterations, bundle.tolerance), partial(record, number, "descent"))
     current = pruned_in_gauge(fitting, _with_best_roughness(fitting, current).point)
     held_out = record(number, "round", -1, current)
-    better = rounds.held_out - held_out >= max(bundle.least_gain * held_out, LEAST_DECREASE)
+    gain, error = gained(sample, rounds, current.point)
+    better = gain >= max(bundle.least_gain * held_out, LEAST_DECREASE)
     halved = history[-1].loss < HALVED * rounds.fitted
     outdone = number >= 1 and any(held_out > FAR_BEHIND * rival.held_out_at(number) for rival in rivals)
     without_gain = 0 if better or halved else rounds.without_gain + 1
     needs_prior = bundle.light_prior != "none" and number + 1 >= ENOUGH and another_is_too_few(rounds.held_out, held_out)
     over = outdone or needs_prior or without_gain >= PATIENCE or _full(current.point, bundle) or number + 1 == bundle.rounds
     best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
-    return Rounds(current.point, best, least, history[-1].loss, history, without_gain, bool(over))
+    chosen = current.point if better or gain >= -error else rounds.chosen
+    return Rounds(current.point, best, chosen, least, history[-1].loss, history, without_gain, bool(over))
+
+
+def gained(sample: JointProblem, rounds: Rounds, point: Point) -> tuple[float, float]:
+    """By how much the held-out loss of `point` is below the best round's, and the standard error of this difference.
+
+    Both points are judged by the same observations; those that are hard for both tell nothing of the difference.  Infinitely, before
+    there is a best round.
+    """
+    if np.isinf(rounds.held_out):
+        return np.inf, 0.0
+    best, now = (np.concatenate(sample.held_out_losses(at)) for at in (rounds.best, point))
+    return float((best - now).mean()), float((best - now).std() / np.sqrt(len(now)))
 
 
 def another_is_too_few(best: float, held_out: float) -> bool:

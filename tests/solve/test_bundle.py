@@ -14,7 +14,7 @@ from factorlib.solve.bundle import solve
 from factorlib.solve.history import Run
 from factorlib.solve.iterate import evaluate, fit_weights
 from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import answer_of, from_nothing
+from factorlib.solve.rounds import Rounds, answer_of, chosen_round, from_nothing, gained
 from factorlib.stage import serial_map
 
 OPERATOR = reflection_operator("network")
@@ -104,3 +104,28 @@ def test_neither_threads_nor_processes_change_a_bit():
     with ThreadPoolExecutor(3) as threads, ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
         for pool in (threads, processes):
             np.testing.assert_array_equal(answer(lambda f, items, pool=pool: list(pool.map(f, items))), serial)
+
+
+def test_a_gain_is_the_fall_of_the_held_out_loss_and_its_error_that_of_other_draws(solved):
+    blocks, materials, lights, _ = solved
+    problem, best = JointProblem(blocks, OPERATOR), Point(materials, lights)
+    worse = Point(materials, [msgspec.structs.replace(light, weight=1.1 * light.weight) for light in lights])
+    rounds = Rounds(best, best, best, problem.held_out_loss(best), 1.0, [])
+    gain, error = gained(problem, rounds, worse)
+    assert gain == pytest.approx(problem.held_out_loss(best) - problem.held_out_loss(worse))
+    difference = np.subtract(*(np.concatenate(problem.held_out_losses(at)) for at in (best, worse)))
+    rng = np.random.default_rng(0)
+    drawn = [rng.choice(difference, len(difference)).mean() for _ in range(2000)]
+    assert error == pytest.approx(np.std(drawn), rel=0.1)
+    assert gained(problem, rounds, best) == (0, 0)
+
+
+def test_what_held_out_observations_cannot_tell_apart_the_fitted_ones_decide(monkeypatch):
+    problem = JointProblem(rooms(), OPERATOR)
+    bundle = msgspec.structs.replace(QUICK, lobes=18, insert=6, rounds=3)
+
+    def lost_at(gain):  # the fitted loss, where each round after the first seems to have this gain, ± 1
+        monkeypatch.setattr("factorlib.solve.rounds.gained", lambda sample, rounds, point: (gain, 1.0) if rounds.done else (np.inf, 0.0))
+        return evaluate(problem, chosen_round(problem, from_nothing(3), Run(bundle)).point).loss
+
+    assert lost_at(-0.9) < 0.5 * lost_at(-1.1)
