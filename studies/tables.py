@@ -35,13 +35,13 @@ SHOWN = 4  # measures of a study
 def against_the_paper(found: dict[str, Conclusion], page: str = "") -> str:
     """The table of conclusions of all studies, those that were not run among them.
 
-    page: the text of the page, whose answer stays where it is a full study's and `found` has none
+    page: the text of the page, whose answer stays where `found` has none, or a quick study's and the page a full one's
     """
     rows = []
     for name, study in STUDIES.items():
         title = f"[{study.title}](#{study.title.lower().replace(' ', '-')})"
-        kept = _answer_on(page, title) if is_full(page, name) and not _full(found.get(name)) else None
-        rows.append([title, study.paper, kept or (answer_to_the_paper(found[name]) if name in found else "not run")])
+        new = name in found and (_full(found[name]) or not is_full(page, name))
+        rows.append([title, study.paper, answer_to_the_paper(found[name]) if new else _answer_on(page, title) or "not run"])
     return table(["study", "the paper", "here"], rows)
 
 
@@ -66,8 +66,8 @@ def _answer_on(page: str, title: str) -> str | None:
     return next((row[-1].removesuffix(" |") for row in rows if row[0] == f"| {title}"), None)
 
 
-def _full(found: Conclusion | None) -> bool:
-    return found is not None and not found.label
+def _full(found: Conclusion) -> bool:
+    return not found.label
 
 
 def numbers(found: Conclusion) -> str:

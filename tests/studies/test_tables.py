@@ -25,5 +25,11 @@ def test_a_row_stays_until_there_is_a_study_as_large(on_page, here, stays):
     assert (row.rpartition(" | ")[2].startswith("agrees")) == stays, row
 
 
+@pytest.mark.parametrize("on_page", ["", QUICK])
+def test_a_row_of_a_study_that_was_not_run_here_stays(on_page):
+    assert "| agrees |" in against_the_paper({}, page(on_page))
+    assert "| agrees |" not in against_the_paper({}, "")
+
+
 def test_a_study_that_the_page_does_not_have_is_not_full():
     assert not is_full("", "prior") and not is_full("<!-- begin prior -->\n(not run)\n<!-- end prior -->", "prior")
