@@ -7,7 +7,7 @@ Measured   errors of materials and predictions, beside the standard errors that 
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study
+from studies.core.study import Claim, Guess, Scale, Setting, Study
 
 FACES = {"full": (1, 2, 3, 5, 9, 20, 60), "quick": (1, 9)}
 
@@ -20,10 +20,12 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """A sphere against few faces, in error and in what is stated of it."""
+    """Few faces against a guess that knows mean colours, a sphere against few faces, in error and in what is stated of it."""
     sphere = scale.square
     nine = "faces-9"
     return [
+        Claim("new_light", nine, Guess(nine), "materials of nine faces are predicted in every light better than by a guess of mean colours"),
+        Claim("entries", nine, Guess(nine), "so are the entries that nine faces show"),
         Claim("new_light", nine, "faces-1", "nine faces tell more of materials than one"),
         Claim("new_light", sphere, nine, "a sphere tells more than nine faces", paper=False),
         Claim("roughness", sphere, "faces-1", "roughness is known better of a sphere than of one face", paper=False),

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from studies.core.entries import Entry
 from studies.core.objects.setting import setting
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.core.study import Claim, Guess, Scale, Setting, Study, full_matrix
 
 
 def docksta(photos: int) -> list[Entry]:
@@ -55,8 +55,12 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """What links the photos is worth something, and a full matrix more than a sparse one."""
+    """Each set is predicted better than by a guess that knows mean colours; what links the photos is worth something, and a full
+    matrix more than a sparse one."""
+    sets = (("docksta", "unobserved", "entries of Docksta's pattern that were not observed"), ("lapd", "entries", "entries of LAPD's pattern"),
+            ("photos", "entries", "entries of all photos"))  # fmt: skip
     return [
+        *(Claim(measure, f"set-{name}", Guess(f"set-{name}"), f"{words} are predicted better than by a guess of mean colours") for name, measure, words in sets),
         Claim("unobserved", "set-docksta", "set-docksta-unlinked", "the linking chair helps to predict what was not observed"),
         Claim("observed", "set-docksta", "set-docksta-unlinked", "the linking chair helps with what was observed", paper=False),
         Claim("entries", "set-photos", "set-docksta", "the full matrix is predicted better than the linked one", paper=False),

@@ -71,7 +71,7 @@ class Setting(msgspec.Struct, frozen=True):
     case: Callable[[int], msgspec.Struct]
 
 
-class Rise(msgspec.Struct, frozen=True):
+class Rise(msgspec.Struct, frozen=True, tag=True):
     """How much a measure rises from one setting to another, for each of the `per` units that they are apart."""
 
     start: str
@@ -79,15 +79,24 @@ class Rise(msgspec.Struct, frozen=True):
     per: float
 
 
+class Guess(msgspec.Struct, frozen=True, tag=True):
+    """What a guess that knows mean colours alone scores in a setting: the null of its measure."""
+
+    setting: str
+
+
+Side = str | Rise | Guess  # of a comparison; str: a setting
+
+
 class Claim(msgspec.Struct, frozen=True):
-    """A comparison that the study makes: the measure, or its rise, is lower in the setting `lower` than in `higher`.
+    """A comparison that the study makes: the measure, or its rise, is lower on the side `lower` than on `higher`.
 
     words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
     """
 
     measure: str
-    lower: str | Rise
-    higher: str | Rise
+    lower: Side
+    higher: Side
     words: str
     paper: bool = True
 
@@ -97,9 +106,15 @@ class Claim(msgspec.Struct, frozen=True):
         return [name for side in (self.lower, self.higher) for name in settings_of(side)]
 
 
-def settings_of(side: str | Rise) -> list[str]:
+def settings_of(side: Side) -> list[str]:
     """The names of the settings of one side of a claim."""
-    return [side] if isinstance(side, str) else [side.start, side.end]
+    match side:
+        case Rise(start, end):
+            return [start, end]
+        case Guess(setting):
+            return [setting]
+        case _:
+            return [side]
 
 
 class Study(msgspec.Struct, frozen=True):

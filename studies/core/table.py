@@ -29,11 +29,16 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 class Cell(msgspec.Struct, frozen=True):
-    """A measure in a setting: its spread, each seed's value, and the mean over seeds of what the null scores."""
+    """A measure in a setting: its spread, each seed's value, and what the null scores, where it has one."""
 
     spread: Spread
     values: dict[int, float]
-    null: float | None = None
+    nulls: dict[int, float] = {}
+
+    @property
+    def null(self) -> float | None:
+        """The mean over seeds of what the null scores."""
+        return sum(self.nulls.values()) / len(self.nulls) if self.nulls else None
 
 
 class Row(msgspec.Struct, frozen=True):

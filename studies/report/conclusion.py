@@ -8,7 +8,7 @@ from typing import NamedTuple
 from studies.core.case import Score
 from studies.core.measures import MEASURES
 from studies.core.statistics import LEAST_SEEDS, difference, spread
-from studies.core.study import Claim, Rise, Scale, Setting, Study, case_name, settings_of
+from studies.core.study import Claim, Guess, Rise, Scale, Setting, Side, Study, case_name, settings_of
 from studies.core.table import Cell, Conclusion, Difference, Row, Tested
 
 NO_CONCLUSION = "quick: one seed, smallest sets: no conclusion"
@@ -48,22 +48,25 @@ def _row(setting: Setting, seeds: tuple[int, ...], scores: Mapping[str, Score]) 
 
 def _cell(measure: str, of: Mapping[int, Score]) -> Cell:
     values = {seed: score.values[measure] for seed, score in of.items() if measure in score.values}
-    nulls = [score.nulls[measure] for score in of.values() if measure in score.nulls]
-    return Cell(spread(list(values.values())), values, sum(nulls) / len(nulls) if nulls else None)
+    nulls = {seed: score.nulls[measure] for seed, score in of.items() if measure in score.nulls}
+    return Cell(spread(list(values.values())), values, nulls)
 
 
 def _both(claim: Claim, rows: Mapping[str, Row]) -> bool:
-    """Whether all settings have the measure: small sets lack some."""
-    return all(name in rows and claim.measure in rows[name].cells for name in claim.settings) and claim.lower != claim.higher
+    """Whether all settings have the measure, and its null where that is compared: small sets lack some."""
+    there = all(name in rows and claim.measure in rows[name].cells for name in claim.settings) and claim.lower != claim.higher
+    return there and all(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher))
 
 
-def _by_seed(side: str | Rise, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:
-    first, *last = (rows[name].cells[measure].values for name in settings_of(side))
-    return {seed: (last[0][seed] - value) / side.per for seed, value in first.items() if seed in last[0]} if last else first
+def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:
+    first, *last = (rows[name].cells[measure] for name in settings_of(side))
+    if isinstance(side, Guess):
+        return first.nulls
+    return {seed: (last[0].values[seed] - value) / side.per for seed, value in first.values.items() if seed in last[0].values} if last else first.values
 
 
-def _label(side: str | Rise, rows: Mapping[str, Row]) -> str:
-    return " to ".join(f"“{rows[name].label}”" for name in settings_of(side))
+def _label(side: Side, rows: Mapping[str, Row]) -> str:
+    return "a guess" if isinstance(side, Guess) else " to ".join(f"“{rows[name].label}”" for name in settings_of(side))
 
 
 def tested_claim(claim: Claim, rows: Mapping[str, Row], testing: Testing) -> Tested:
@@ -73,7 +76,7 @@ def tested_claim(claim: Claim, rows: Mapping[str, Row], testing: Testing) -> Tes
 
 
 def _sentence(claim: Claim, rows: Mapping[str, Row], found: Difference, over: str) -> str:
-    rise = "" if isinstance(claim.lower, str) else "the rise of "
+    rise = "the rise of " if isinstance(claim.lower, Rise) else ""
     subject, difference_ = rise + MEASURES[claim.measure].words, found.spread
     between = f"{subject} in {_label(claim.lower, rows)} against {_label(claim.higher, rows)}"
     if found.verdict == "too few seeds":

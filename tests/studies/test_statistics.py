@@ -7,7 +7,7 @@ from scipy.stats import ttest_1samp
 
 from studies.core.case import Score
 from studies.core.statistics import difference, spread
-from studies.core.study import FULL, QUICK, Claim, Rise, Setting, Study, case_name
+from studies.core.study import FULL, QUICK, Claim, Guess, Rise, Setting, Study, case_name
 from studies.report.conclusion import concluded
 from studies.report.tables import answer_to_the_paper, csv_text, paragraph
 
@@ -97,6 +97,22 @@ def test_rises_are_compared_per_unit(b, c, answer):
     found = concluded(of, FULL, given)
     assert found.claims[0].answer == answer and "the rise of DSSIM" in found.claims[0].sentence
     assert found.claims[0].difference.spread.mean == pytest.approx((c - b) / 2 - (b - 0.1), abs=1e-4)
+
+
+@pytest.mark.parametrize("a, answer", [(0.1, "agrees"), (0.9, "disagrees")])
+def test_a_guess_is_compared_seed_by_seed(a, answer):
+    """The guess scores .5, and each seed's own difference counts."""
+    given = {name: Score(s.values, {"entries": 0.5 + 0.2 * s.values["entries"]}) for name, s in scores(FULL, a=a, b=0.3).items()}
+    found = concluded(study(Claim("entries", "a", Guess("a"), "a is predicted better than by a guess")), FULL, given)
+    (tested,) = found.claims
+    assert tested.answer == answer and "in “a” against a guess" in tested.sentence
+    assert tested.difference.spread.mean == pytest.approx(0.8 * (a + 0.002) - 0.5)
+    assert msgspec.convert(msgspec.to_builtins(found, str_keys=True), type(found), str_keys=True) == found  # as table.json has it
+
+
+def test_a_claim_about_a_measure_without_a_null_is_left_out():
+    given = {name: Score(s.values) for name, s in scores(FULL, a=0.1, b=0.3).items()}
+    assert not concluded(study(Claim("entries", "a", Guess("a"), "…")), FULL, given).claims
 
 
 def test_an_answer_in_part_says_of_how_many():
