@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, ClassVar
 
@@ -43,7 +43,7 @@ class Pools:
             try:
                 future = executor.submit(function, *arguments)
             except BrokenProcessPool:  # its process was killed while it had nothing to do
-                executor.shutdown(wait=False)
+                executor.shutdown()
                 return self.submit(cores, threads, function, *arguments)
             self._busy[future] = cores, threads, executor
             return future
@@ -56,13 +56,12 @@ class Pools:
     def close(self, kill: bool = False) -> None:
         """End all worker processes; `kill`: at once, whatever they do."""
         executors = [e for spare in self._spare.values() for e in spare] + [executor for _, _, executor in self._busy.values()]
-        for executor in executors:
-            executor.shutdown(wait=False, cancel_futures=True)
         if kill:
             for process in multiprocessing.active_children():
                 process.kill()
-        for executor in executors:
-            executor.shutdown(wait=True)
+        # One call each, which waits: after `shutdown(wait=False)` a second call waits for nothing, and Python's end meets threads that close.
+        with ThreadPoolExecutor(max(1, len(executors))) as enders:
+            list(enders.map(lambda executor: executor.shutdown(cancel_futures=True), executors))
 
 
 def machine_cores() -> int:

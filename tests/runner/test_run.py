@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
+from factorlib.runner.executors import Pools
 from factorlib.runner.gc import collect
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import Store
@@ -382,6 +384,19 @@ def test_a_run_that_is_interrupted_stops_its_workers(project):
     said = process.communicate(timeout=20)[0]
     assert process.returncode == 130 and "stopped" in said and "Traceback" not in said
     assert not list((project.build / "store" / "tmp").iterdir())
+
+
+@pytest.mark.parametrize("kill", [False, True])
+def test_pools_that_are_closed_have_no_threads_left(kill):
+    before = set(threading.enumerate())
+    pools = Pools()
+    futures = [pools.submit(1, 1, time.sleep, 60 if kill else 0) for _ in range(2)]
+    if not kill:
+        for future in futures:
+            future.result()
+            pools.done(future)
+    pools.close(kill)
+    assert set(threading.enumerate()) == before  # one that closes while Python ends is a traceback after "stopped"
 
 
 def test_status_shows_what_runs(project, capsys):
