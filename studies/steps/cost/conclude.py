@@ -27,7 +27,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def notes(found: Conclusion) -> list[str]:
     """Exponents, where there are two sizes or more; and what a GPU would do."""
-    kinds = {"12 lobes a light": "", "as the solve is by default": "default-"}
+    kinds = {"6 lobes a light": "", "as the solve is by default": "default-"}
     said = [_said(found, words, prefix, m) for words, prefix in kinds.items() for m in ("seconds", "grown") if len(_sizes(found, prefix)) > 1]
     return [*said, "The paper's 30 minutes are of other pictures, another machine and a GPU: no ratio is drawn."]
 
