@@ -9,8 +9,9 @@ from studies.core.left_out.case import CHAIRS, LeftOutCase
 from studies.core.left_out.photos import flat_colour, without
 from studies.core.left_out.score import Chair, score_of
 from studies.core.study import FULL, QUICK
+from studies.core.table import Cell, Conclusion, Row, Spread
 from studies.run.project import photos_of
-from studies.steps.left_out.conclude import side_by_side
+from studies.steps.left_out.conclude import by_photo, side_by_side
 
 NAMES = ("red", "white", "wood")
 ALBEDO = {"red": (0.5, 0.1, 0.1), "white": (0.8, 0.8, 0.7), "wood": (0.4, 0.3, 0.2)}
@@ -81,3 +82,9 @@ def test_intervals_are_over_photos():
     study = STUDIES["leave-one-out"]
     assert study.seeds_of(FULL) == tuple(range(len(CHAIRS))) and len(study.cases(FULL)) == 3 * len(CHAIRS)
     assert {case.photo for case in study.cases(FULL).values()} == set(CHAIRS)
+
+
+def test_a_note_gives_each_photos_values():
+    rows = [Row(name, name, 0, {"chair": Cell(Spread(0.0, 2), dict(enumerate(of)))}) for name, of in {"left out": (0.1, 0.2), "flat": (0.15, 0.123)}.items()]
+    found = Conclusion("x", "x", "?", "p", "v", "full", "", (0, 1), ("chair",), rows, [])
+    assert by_photo(found, {0: "hall", 1: "patio"}) == "DSSIM of a chair, photo by photo (left out, flat): hall 0.1, 0.15; patio 0.2, 0.12."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -10,8 +11,9 @@ import numpy as np
 from factorlib.images.picture import png_bytes, read_png
 from factorlib.stage import Inputs, Progress
 from studies.catalogue.contents import STUDIES
+from studies.core.measures import MEASURES
 from studies.core.study import Scale, case_name
-from studies.core.table import Picture
+from studies.core.table import Conclusion, Picture
 from studies.steps.conclusion import conclude
 
 
@@ -29,7 +31,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         shown = ", ".join(f"{setting.case(seed).photo} ({', '.join(setting.case(seed).shells)})" for seed in study.seeds_of(scale))
         caption = f"{setting.label}: the chairs' shells in the photos (above) and predicted (below), exposed alike: {shown}."
         pictures[Picture(f"{setting.name}.png", caption)] = png_bytes(side_by_side([read_png(inputs["score"] / f"chairs-{case}.png") for case in cases]))
-    conclude(inputs, out, pictures=pictures)
+    photos = {seed: study.settings(scale)[0].case(seed).photo for seed in study.seeds_of(scale)}
+    conclude(inputs, out, pictures=pictures, notes=lambda found: [by_photo(found, photos)])
+
+
+def by_photo(found: Conclusion, photos: Mapping[int, str]) -> str:
+    """Each photo's values of the first measure, as a sentence: six photos are few, and one that is unlike the others decides a mean."""
+    measure = found.measures[0]
+    values = {row.label: row.cells[measure].values for row in found.rows}
+    each = "; ".join(f"{photo} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k, photo in photos.items())
+    return f"{MEASURES[measure].label}, photo by photo ({', '.join(values)}): {each}."
 
 
 def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
