@@ -1,7 +1,7 @@
 """Real photo sets, which the project does not carry: `python -m studies.real ../shared/real/liberty [--docs]`.
 
-There is no truth of photographs: all that can be said is how well the answer gives back the photos it was solved from.  So the DSSIM of the
-re-synthesis stands beside that of flat colours, each material of each photo in its own mean colour, which nothing solved knows of.
+There is no truth of photographs: all that can be said is how well the answer gives back the photos it was solved from.  So DSSIM and
+PSNR of the re-synthesis stand beside that of flat colours, each material of each photo in its own mean colour, which nothing solved knows of.
 
 The pipeline runs first, as `make evaluate` does, as far as anything must run.  A folder that is not there is said to be absent, and
 leaves docs/studies.md as it is.
@@ -16,7 +16,7 @@ import typer
 
 from benchmarks.markdown import refresh, table
 from benchmarks.rounded import exact
-from factorlib.results.metrics import Metrics, read_metrics
+from factorlib.results.metrics import Metrics, ScoredPicture, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 
@@ -26,11 +26,15 @@ STAGES = [f"stages.{name}" for name in ("masks", "align", "urm", "solve", "expor
 
 
 def rows_of(name: str, found: Metrics) -> list[list[str]]:
-    """A row for each photo, and the mean."""
+    """A row for each photo, and the mean: DSSIM and PSNR of the re-synthesis, each beside that of flat colours."""
     shots = [(photo, errors.gauges["none"]) for photo, errors in found.resynthesis.photos.items() if errors.gauges]
-    rows = [[f"{name}: {photo}", exact(s.estimate.dssim), exact(s.null.dssim)] for photo, s in shots]
     mean = found.resynthesis.mean
-    return rows + ([[f"{name}: mean", exact(mean["none"].estimate.dssim), exact(mean["none"].null.dssim)]] if mean else [])
+    return [_row(f"{name}: {of}", scores) for of, scores in shots + ([("mean", mean["none"])] if mean else [])]
+
+
+def _row(label: str, scores: ScoredPicture) -> list[str]:
+    both = (scores.estimate, scores.null)
+    return [label, *(exact(of.dssim, 3) for of in both), *(f"{of.psnr_tonemapped_db:.1f}" for of in both)]
 
 
 def measured(folder: Path) -> Metrics:
@@ -52,7 +56,7 @@ def main(
     rows = [row for folder in folders if folder not in absent for row in rows_of(folder.resolve().name, measured(folder))]
     if not rows:
         return
-    found = table(["set: photo", "DSSIM of the re-synthesis", "of flat colours"], rows)
+    found = table(["set: photo", "DSSIM of the re-synthesis", "of flat colours", "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"], rows)
     print(found)
     if docs:
         refresh(DOCS, {PLACE: found}, "studies.real", modules=STAGES)

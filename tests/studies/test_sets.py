@@ -1,5 +1,8 @@
 """The paper's patterns as data sets on disk, and real sets that are not there."""
 
+from types import SimpleNamespace
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -10,6 +13,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_rgb_exr
 from factorlib.images.picture import read_png
 from factorlib.meshes.read import read_mesh
+from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
 from studies import real, sets
 
 
@@ -62,3 +66,11 @@ def test_a_real_set_that_is_not_there_is_said_to_be_absent(tmp_path, capsys):
     before = real.DOCS.read_bytes()
     real.main([tmp_path / "liberty"], docs=True)
     assert "absent" in capsys.readouterr().out and real.DOCS.read_bytes() == before
+
+
+def test_a_real_sets_rows_give_photos_and_the_mean_beside_flat_colours():
+    scored = ScoredPicture(PictureError(1.0, 15.47, 0.34357), PictureError(1.0, 13.39, 0.347734))
+    seen = PhotoErrors(1.0, 4, 0, 0, 0, 0, None, {}, {"none": scored}, {})
+    nothing_counts = msgspec.structs.replace(seen, gauges=None)
+    found = SimpleNamespace(resynthesis=Resynthesis({"a": seen, "b": nothing_counts}, {"none": scored}, 1.0, 1.0))
+    assert real.rows_of("x", found) == [["x: a", ".344", ".348", "15.5", "13.4"], ["x: mean", ".344", ".348", "15.5", "13.4"]]
