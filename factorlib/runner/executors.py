@@ -59,7 +59,8 @@ class Pools:
         if kill:
             for process in multiprocessing.active_children():
                 process.kill()
-        # One call each, which waits: after `shutdown(wait=False)` a second call waits for nothing, and Python's end meets threads that close.
+        # Each executor is shut down by one call that waits.  After `shutdown(wait=False)` a second call would not wait, and its thread could
+        # still be closing pipes when Python ends, which prints a traceback.
         with ThreadPoolExecutor(max(1, len(executors))) as enders:
             list(enders.map(lambda executor: executor.shutdown(cancel_futures=True), executors))
 

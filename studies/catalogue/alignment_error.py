@@ -1,7 +1,7 @@
 """Alignment error: how much do wrong poses and meshes cost, and what helps?
 
 Varied     every object of a set is turned by 0 … 20° about a random axis, shifted in the image by a share of its diameter, its mesh too
-           large, or of few triangles; sets of 3 × 3 (quick: 2 × 2) of bodies without symmetry.  Treatments, where they are compared:
+           large, or of few triangles; sets of 3 × 3 (quick: 2 × 2) of bodies without symmetry.  Treatments, each where a claim compares it:
            as it is      the solve as the project has it: robust loss, and normals that weigh as much as `align` is sure of them
            squares       least squares in place of the robust loss
            even          every normal as sure as any other
