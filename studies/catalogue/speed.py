@@ -15,7 +15,7 @@ from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 LOBES = {"light_prior": "none"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("as it is", {}),
-    "natural": ("natural light", {"light_prior": "on"}),
+    "natural-light": ("natural light", {"light_prior": "on"}),
     "lobes": ("lobes", LOBES),
     "closed-form": ("lobes, closed form", LOBES | {"operator": "closed_form"}),
     "lobes-16": ("16 lobes", LOBES | {"lobes": 16}),
