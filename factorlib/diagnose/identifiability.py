@@ -15,6 +15,7 @@ from factorlib.geometry.sphere import mirror_directions
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
 from factorlib.model.components import connected_components
+from factorlib.model.gauge import LEAST_ENERGY, is_free
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -27,6 +28,7 @@ CLIPPED = 0.5  # share of channel values
 ROUGHNESS_ERROR = 0.1  # largest standard error with which dull and glossy can be distinguished
 SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
 DARK = 0.1  # a bound on reflectance that still says 'dark'
+TINTED = 0.6  # of a mean |log R/G| or |log B/G|: three standard deviations of the level of one light's colour (docs/light-prior.md)
 OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
 
 
@@ -134,3 +136,23 @@ def unlikely_curves(blocks: Sequence[Block], lights: Sequence[Light]) -> list[st
         for block, light in zip(blocks, lights, strict=True)
         if beyond_cameras(light)
     ]
+
+
+def tinted_alike(names: Sequence[str], blocks: Sequence[Block], lights: Sequence[Light]) -> list[str]:
+    """Lights that interreflection gives one strong colour on average, as sentences; names: of all materials.
+
+    Where no surface lights another, the rule of `factorlib.model.gauge` makes lights grey, and nothing is said.
+    """
+    said = []
+    for _, illuminations in connected_components(blocks, len(names)):
+        if not illuminations or is_free(blocks, illuminations):
+            continue
+        sums = np.array([light.energy.sum(0) for block, light in zip(blocks, lights, strict=True) if block.name in illuminations])
+        level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
+        if np.abs(level - level[1]).max() > TINTED:
+            colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
+            said.append(
+                f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection fixes it: reflectances have "
+                'the opposite colour, if the lights were nearly white. SET="solve.interreflection=off" makes the lights grey'
+            )
+    return said

@@ -7,7 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorlib.diagnose.answer import Answer
-from factorlib.diagnose.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations, unlikely_curves
+from factorlib.diagnose.identifiability import (
+    poorly_explained,
+    tinted_alike,
+    undetermined_by_answer,
+    undetermined_by_observations,
+    unlikely_curves,
+)
 from factorlib.diagnose.uncertainty import StandardErrors
 from factorlib.model.blocks import Block
 from factorlib.model.components import connected_components
@@ -76,5 +82,6 @@ def after_solving(answer: Answer, errors: StandardErrors) -> list[str]:
         *undetermined_by_answer(answer.names, problem.blocks, point.materials, errors.materials),
         *poorly_explained(problem, point),
         *unlikely_curves(problem.blocks, point.lights),
+        *tinted_alike(answer.names, problem.blocks, point.lights),
         *exposures_unlike_exif(answer),
     ]

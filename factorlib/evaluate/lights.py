@@ -1,6 +1,6 @@
 """Errors of recovered light against true light.
 
-Three spheres  a mirror, a glossy (GGX, roughness 0.4) and a Lambertian (`matte`) white sphere, rendered in the estimated and
+Three spheres  a white `mirror`, a `glossy` (GGX, roughness 0.4) and a `lambertian` sphere, rendered in the estimated and
                in the true light, as LeGendre et al. 2019 ("DeepLight") and others do.
 Env map        the maps themselves, averaged to texels of equal solid angle about 3° across; all directions, and split
                into those that an observed pixel mirrors toward the camera (within about 6°) and the rest.
@@ -34,7 +34,7 @@ from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
 SPHERE_SIZE = 32
-SPHERES = ("mirror", "glossy", "matte")
+SPHERES = ("mirror", "glossy", "lambertian")
 MAPS = ("all", "mirrored", "unmirrored")
 COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
 
@@ -111,7 +111,7 @@ def _views() -> dict[str, Callable[[Light], Samples]]:
     return {
         "mirror": lambda light: mirror_ball(light, normals, SPHERE_SIZE),
         "glossy": lambda light: glossy_ball(light, normals, GLOSSY_ROUGHNESS),
-        "matte": lambda light: diffuse_ball(light, normals),
+        "lambertian": lambda light: diffuse_ball(light, normals),
         **{f"map_{part}": _map for part in MAPS},
     }
 

@@ -48,7 +48,7 @@ SYNTHETIC = (
     Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 38.0, "dB", "relit balls, one scalar per set"),
     Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.276, "", "mirror sphere, of the truth's RMS"),
     Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.076, "", "glossy sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.matte.estimate.rmse", "≤", 0.005, "", "Lambertian sphere, of the truth's RMS"),
+    Bound("light.mean.channel_per_photo.lambertian.estimate.rmse", "≤", 0.005, "", "Lambertian sphere, of the truth's RMS"),
 )
 
 

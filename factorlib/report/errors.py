@@ -34,7 +34,7 @@ KINDS = {
 VIEWS = {
     "mirror": "mirror sphere",
     "glossy": "glossy sphere",
-    "matte": "Lambertian sphere",
+    "lambertian": "Lambertian sphere",
     "map_all": "map, all directions",
     "map_mirrored": "map, where a pixel mirrors it",
     "map_unmirrored": "map, elsewhere",

@@ -150,7 +150,7 @@ class ScoredLight(msgspec.Struct, frozen=True):
 
 
 class LightErrors(msgspec.Struct, frozen=True):
-    """gauge -> view -> errors; the views are mirror, glossy, matte and map_all, map_mirrored, map_unmirrored.
+    """gauge -> view -> errors; the views are mirror, glossy, lambertian and map_all, map_mirrored, map_unmirrored.
 
     mean: over lights.  mirrored_fraction: of the sphere, by light; null where no observation is known.
     """

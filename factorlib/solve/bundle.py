@@ -26,7 +26,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve.bounds import specular_unknowns
 from factorlib.solve.curves import Curves, near_optimum, with_curves_where_needed
 from factorlib.solve.descent import Descent, descend
-from factorlib.solve.evidence import Evidence, decide
+from factorlib.solve.evidence import Evidence, decide, decide_over_lights
 from factorlib.solve.history import Event, Recorder, Run
 from factorlib.solve.iterate import evaluate
 from factorlib.solve.natural import LOBES, OBSERVATIONS, Natural, lights_from_all, naturally, sure_ones
@@ -157,13 +157,13 @@ def lobes_may_do(fit: Fit, run: Run) -> bool:
 
 def _bounces_decided(problem: JointProblem, fit: Fit, run: Run) -> Bounces:
     """Both models are brought near their optimum by equally many iterations; the fit keeps its point where bounces are not kept."""
-    held_out, points = [], []
-    for model in (problem.without_bounces(), problem):
-        sample = sampled_for(model, fit.point, run.options)
-        points.append(near_optimum(sample.with_loss(fit.loss), fit.point).point)
-        held_out.append(sample.held_out_loss(points[-1]))
-    evidence = decide(*held_out, INTERREFLECTION)
-    return Bounces(msgspec.structs.replace(fit, point=points[1], held_out=held_out[1]) if evidence.kept else fit, evidence)
+    samples = [sampled_for(model, fit.point, run.options) for model in (problem.without_bounces(), problem)]
+    points = [near_optimum(sample.with_loss(fit.loss), fit.point).point for sample in samples]
+    losses = [sample.held_out_losses(point) for sample, point in zip(samples, points, strict=True)]
+    evidence = decide_over_lights(*losses, INTERREFLECTION)
+    if not evidence.kept:
+        return Bounces(fit, evidence)
+    return Bounces(msgspec.structs.replace(fit, point=points[1], held_out=samples[1].held_out_loss(points[1])), evidence)
 
 
 def with_tone_chosen(problem: JointProblem, fit: Fit, run: Run) -> Curves:

@@ -16,13 +16,15 @@ from jaxtyping import Bool, Float
 
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.thresholds import Threshold
+from factorlib.solve.thresholds import LEAST_DECREASE, Threshold
+
+Losses = Float[np.ndarray, " n"]  # of one light's held-out observations
 
 
 class Evidence(msgspec.Struct, frozen=True):
     """Whether the richer model is kept, and the mean loss of the held-out observations that decided, with it and without it.
 
-    A loss is None where that model was not tried.
+    A loss is None where that model was not tried.  Of interreflection they are geometric means over lights (`decide_over_lights`).
     """
 
     kept: bool
@@ -56,6 +58,17 @@ def compare_by_light(problem: JointProblem, without: Sequence[Point], richer: Po
     """
     losses = zip(*(problem.held_out_losses(point) for point in (richer, *without)), strict=True)
     return [decide(min(mean(other) for other in others), mean(richer), threshold) for richer, *others in losses]
+
+
+def decide_over_lights(without: Sequence[Losses], richer: Sequence[Losses], threshold: Threshold) -> Evidence:
+    """As `decide`, by the geometric mean over lights of each light's mean loss; lights without held-out observations have no say.
+
+    It is the likelihood where the variance of each light's residuals is unknown: a light whose normals are wrong has many times the loss
+    of another, and what a richer model changes there would outweigh all others in a sum.
+    """
+    number = [len(losses) for losses in richer]
+    logarithms = ([np.log(max(mean(losses), LEAST_DECREASE)) for losses in model] for model in (without, richer))
+    return decide(*(float(np.exp(np.average(of, weights=number))) if sum(number) else 0.0 for of in logarithms), threshold)
 
 
 def decide(without: float, richer: float, threshold: Threshold) -> Evidence:

@@ -57,7 +57,7 @@ STUDY = Study(
     varied="method",
     measures=(
         "novel_view", "novel_light", "novel_material", "processor", "novel_view_balanced", "novel_light_balanced", "novel_material_balanced",
-        "diffuse", "specular", "roughness", "mirror", "glossy", "matte",
+        "diffuse", "specular", "roughness", "mirror", "glossy", "lambertian",
     ),
     settings=settings,
     claims=claims,

@@ -25,7 +25,7 @@ def claims(scale: Scale) -> list[Claim]:
     nine = "faces-9"
     return [
         Claim("new_light", nine, Guess(nine), "materials of nine faces are predicted in every light better than by a guess of mean colours"),
-        Claim("entries", nine, Guess(nine), "so are the entries that nine faces show"),
+        Claim("entries", nine, Guess(nine), "all entries are predicted from nine faces better than by a guess of mean colours"),
         Claim("new_light", nine, "faces-1", "nine faces tell more of materials than one"),
         Claim("new_light", sphere, nine, "a sphere tells more than nine faces", paper=False),
         Claim("roughness", sphere, "faces-1", "roughness is known better of a sphere than of one face", paper=False),

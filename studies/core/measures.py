@@ -26,7 +26,7 @@ MEASURES = {
     "roughness": Measure("error of roughness", "1", "the error of roughness"),
     "mirror": Measure("error of a mirror sphere", "RMSE over the truth's RMS", "the error of a mirror sphere"),
     "glossy": Measure("error of a glossy sphere", "RMSE over the truth's RMS", "the error of a glossy sphere"),
-    "matte": Measure("error of a Lambertian sphere", "RMSE over the truth's RMS", "the error of a Lambertian sphere"),
+    "lambertian": Measure("error of a Lambertian sphere", "RMSE over the truth's RMS", "the error of a Lambertian sphere"),
     "chair": Measure("DSSIM of a chair", "1", "DSSIM of a chair"),
     "chair_scaled": Measure("DSSIM of a chair, a factor per channel taken out", "1", "DSSIM of a chair, a factor per channel taken out,"),
     "normals": Measure("median error of the normals given", "degrees", "the error of the normals given"),
@@ -78,5 +78,5 @@ MEASURES = {
     "relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db": Measure("relit balls (higher is better)", "dB", "relit balls"),
     "light.mean.channel_per_photo.mirror.estimate.rmse": Measure("mirror sphere", "RMSE over the truth's RMS", "a mirror sphere"),
     "light.mean.channel_per_photo.glossy.estimate.rmse": Measure("glossy sphere", "RMSE over the truth's RMS", "a glossy sphere"),
-    "light.mean.channel_per_photo.matte.estimate.rmse": Measure("Lambertian sphere", "RMSE over the truth's RMS", "a Lambertian sphere"),
+    "light.mean.channel_per_photo.lambertian.estimate.rmse": Measure("Lambertian sphere", "RMSE over the truth's RMS", "a Lambertian sphere"),
 }

@@ -35,7 +35,7 @@ def test_gauges_forgive_what_they_name():
 
 def test_a_turned_light_is_wrong_on_every_sphere_and_most_in_the_mirror():
     views = compared(lambda n, v: np.roll(v, 16, axis=1)).mean["channel_per_photo"]
-    assert views["mirror"].estimate.rmse > views["matte"].estimate.rmse > 0.1
+    assert views["mirror"].estimate.rmse > views["lambertian"].estimate.rmse > 0.1
 
 
 def test_an_error_in_the_unseen_half_shows_there_only():

@@ -190,6 +190,27 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
     assert error["auto"] < 0.5 * error["off"]
 
 
+def tilted(seen, seed, degrees):
+    """The same observations, their normals wrong by a smooth field of tilts of at most so many degrees an axis."""
+    rng = np.random.default_rng(seed)
+    waves = np.sin(seen.normal @ (2 * rng.normal(size=(3, 3))).T + rng.uniform(0, 6, 3))
+    normal = seen.normal + np.radians(degrees) * waves
+    return msgspec.structs.replace(seen, normal=(normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(seen.normal.dtype))
+
+
+@pytest.mark.parametrize("bounced", [False, True])
+def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
+    """A mesh with hollows that the object has not, as far as light goes.  Bounces then explain a little of what the normals make wrong,
+    and the darker all surfaces are, the less harm they do: reflectances would fall to a tenth."""
+    lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
+    direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
+    shown = [one if bounced else msgspec.structs.replace(one, radiance=other.radiance) for one, other in zip(lit, direct, strict=True)]
+    blocks = [blocks_of_observations(tilted(one, 10 + i, 12.0), Noise(0.02, 0.02))[0] for i, one in enumerate(shown)]
+    solution = solve(JointProblem(blocks, reflection_operator("network")), from_nothing(3), Run(QUICK))
+    assert solution.interreflection.kept == bounced
+    assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
+
+
 def test_off_is_the_solve_of_the_same_observations_without_codes(rooms):
     without, operator = [room.without_bounces() for room in rooms], reflection_operator("network")
     quick = msgspec.structs.replace(QUICK, lobes=3, insert=3, rounds=1, iterations=2, polish=1, sample=100)

@@ -20,7 +20,7 @@ from factorlib.results.metrics import (
 )
 
 GREY = Reflectance((0.5,) * 3, (0.05,) * 3, 0.5)
-VIEWS = ("mirror", "glossy", "matte", "map_all", "map_mirrored", "map_unmirrored")
+VIEWS = ("mirror", "glossy", "lambertian", "map_all", "map_mirrored", "map_unmirrored")
 
 
 def metrics_of(error: float) -> Metrics:

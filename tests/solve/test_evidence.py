@@ -2,12 +2,13 @@
 
 import msgspec
 import numpy as np
+import pytest
 
 from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.evidence import Candidates, compare, compare_by_light
+from factorlib.solve.evidence import Candidates, compare, compare_by_light, decide_over_lights
 from factorlib.solve.thresholds import Threshold
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
@@ -64,3 +65,19 @@ def test_each_light_is_judged_by_its_own_observations_and_none_held_out_is_no_ev
     assert not any(one.kept for one in compare_by_light(problem, [without, truth], truth, Threshold(0.25)))
     blocks = [problem.blocks[0], problem.blocks[1].with_none_held_out()]
     assert not compare_by_light(msgspec.structs.replace(problem, blocks=blocks), [without], truth, Threshold(0.25))[1].kept
+
+
+def test_over_lights_each_counts_relative_to_itself():
+    """The third light is explained badly, and a little worse by the richer model: its sum would outweigh what the others gain."""
+    one, other = np.array([0.5, 1.5]), np.array([1.0, 2.0, 3.0, 2.0])
+    without, richer = [one, one, 100 * other], [one / 2, one / 2, 101 * other]
+    assert sum(losses.sum() for losses in richer) > sum(losses.sum() for losses in without)
+    found = decide_over_lights(without, richer, Threshold(0.1))
+    assert found.kept and not decide_over_lights(richer, without, Threshold(0.1)).kept
+    logarithms = np.log([[1, 1, 200], [0.5, 0.5, 202]]) @ [0.25, 0.25, 0.5]  # by their counts
+    np.testing.assert_allclose([found.held_out_loss_without, found.held_out_loss_with], np.exp(logarithms))
+    nothing = np.zeros(0)
+    assert decide_over_lights([nothing, one], [nothing, one / 2], Threshold(0.1)).held_out_loss_without == pytest.approx(1.0)
+    assert not decide_over_lights([nothing], [nothing], Threshold(0.0)).kept
+    exact = np.full(5, 1e-9)
+    assert not decide_over_lights([2 * exact], [exact], Threshold(0.1)).kept, "below what the operator errs by, nothing is a gain"

@@ -78,12 +78,12 @@ def test_lamps_at_night_are_found_where_they_are():
         assert lamp[around][radiance[around].argmax()] < 19  # cells are 18° apart
 
 
-def test_all_surfaces_matte():
-    matte = Materials(MATERIALS.diffuse, np.zeros((3, 3)), MATERIALS.roughness)
+def test_all_surfaces_lambertian():
+    lambertian = Materials(MATERIALS.diffuse, np.zeros((3, 3)), MATERIALS.roughness)
     lattice = Lattice.of(FEW)
     lights = [light_of(lattice.axis, lattice.sharpness, np.exp(np.sin(2 * lattice.axis[:, k : k + 1]))) for k in range(2)]
-    found = found_in(lights, lambertian=(True,) * 3, materials=matte).point.materials
-    assert np.abs(found.diffuse * factor_between(found, matte) / matte.diffuse - 1).max() < 0.05 and not found.specular.any()
+    found = found_in(lights, lambertian=(True,) * 3, materials=lambertian).point.materials
+    assert np.abs(found.diffuse * factor_between(found, lambertian) / lambertian.diffuse - 1).max() < 0.05 and not found.specular.any()
 
 
 @pytest.mark.parametrize("shown", [(0,), (2,)])
