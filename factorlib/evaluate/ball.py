@@ -68,21 +68,37 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
     return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
 
-def radiance_toward(light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-    """Radiance averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
-    finest = 4 * np.pi / SIDE**2
-    level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, len(light.levels) - 1)
-    below = np.minimum(level.astype(int), len(light.levels) - 2)
-    blend = (level - below)[..., None]
+class Lookup(msgspec.Struct, frozen=True):
+    """Where directions fall in any light's pyramid: two texels, of neighbouring levels, each numbered over all levels, and the second's share."""
+
+    finer: Int[np.ndarray, "*n"]
+    coarser: Int[np.ndarray, "*n"]
+    share: Float[np.ndarray, "*n"]
+
+    def of(self, light: Light) -> Float[np.ndarray, "*n 3"]:
+        """The light's radiance there."""
+        texels = np.concatenate([level.reshape(-1, 3) for level in light.levels])
+        return texels[self.finer] * (1 - self.share)[..., None] + texels[self.coarser] * self.share[..., None]
+
+
+def lookup_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Lookup:
+    """Of unit directions, each the mean of about so many steradians around it: between the two nearest levels."""
+    finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
+    level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
+    below = np.minimum(level.astype(int), last - 1)
     row, column = _texel(direction, SIDE)
-    offsets = np.cumsum([0] + [len(lv) ** 2 for lv in light.levels])[:-1]
-    flat = np.concatenate([lv.reshape(-1, 3) for lv in light.levels])
+    offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last)])
 
-    def at(lv: Int[np.ndarray, "*n"]) -> np.ndarray:
-        """The texels of level lv that the directions fall in."""
-        return flat[offsets[lv] + (row >> lv) * (SIDE >> lv) + (column >> lv)]
+    def at(k: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """The numbers of the texels of level k that the directions fall in."""
+        return (offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32)
 
-    return at(below) * (1 - blend) + at(below + 1) * blend
+    return Lookup(at(below), at(below + 1), level - below)
+
+
+def radiance_toward(light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    """Radiance averaged over about `solid_angle` steradians around unit `direction`."""
+    return lookup_toward(direction, solid_angle).of(light)
 
 
 def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
@@ -102,30 +118,55 @@ def diffuse_ball(light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.nd
 
 def glossy_ball(light: Light, normals: Float[np.ndarray, "n 3"], roughness: float) -> Float[np.ndarray, "n 3"]:
     """Reflected radiance of GGX with k_s = 1, seen from `VIEW`."""
+    return glossy_lobe(normals, roughness).in_light(light)
+
+
+class WideLobe(msgspec.Struct, frozen=True):
+    """What each normal reflects of each texel of the level of `WIDE_SIDE`, per steradian."""
+
+    response: Float[np.ndarray, "n t"]
+
+    def in_light(self, light: Light) -> Float[np.ndarray, "n 3"]:
+        """Reflected radiance."""
+        return _summed(light, self.response)
+
+
+class NarrowLobe(msgspec.Struct, frozen=True):
+    """Where each normal's samples look, and what they count."""
+
+    sample: Lookup
+    weight: Float[np.ndarray, "n k"]
+
+    def in_light(self, light: Light) -> Float[np.ndarray, "n 3"]:
+        """Reflected radiance."""
+        return np.einsum("nk,nkc->nc", self.weight, self.sample.of(light)) / SAMPLES
+
+
+def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> WideLobe | NarrowLobe:
+    """All of `glossy_ball` that is the same in every light, which is most of its work."""
     alpha = max(float(alpha_of_roughness(roughness)), 1e-3)
-    return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(light, normals, alpha)
+    return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
 
 
-def _wide_lobe(light: Light, normals: Float[np.ndarray, "n 3"], alpha: float) -> Float[np.ndarray, "n 3"]:
+def _wide_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> WideLobe:
     directions = octahedral_directions(WIDE_SIDE)
     half = directions + VIEW
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-9)
     cos_o = np.maximum(normals @ VIEW, 1e-3).astype(np.float32)[:, None]
     cos_i, cos_h = (normals.astype(np.float32) @ d.T.astype(np.float32) for d in (directions, half))
     shadowing = _g1(np.maximum(cos_i, 1e-6), alpha) * _g1(cos_o, alpha)
-    return _summed(light, np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
+    return WideLobe(np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
 
 
-def _narrow_lobe(light: Light, normals: Float[np.ndarray, "n 3"], alpha: float) -> Float[np.ndarray, "n 3"]:
+def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> NarrowLobe:
     cos_o = np.clip(normals @ VIEW, 1e-3, 1.0).astype(np.float32)[:, None]
     half = _visible_normals(cos_o, alpha)
     view = np.concatenate([np.sqrt(1 - cos_o**2), np.zeros_like(cos_o), cos_o], axis=-1)[:, None, :]
     incoming = 2 * np.sum(view * half, axis=-1, keepdims=True) * half - view
     density = _g1(cos_o, alpha) * _ggx(half[..., 2], alpha) / (4 * cos_o)  # of the incoming direction, per steradian
     frame = _frames(normals).astype(np.float32)  # rows: tangent toward the viewer, bitangent, normal
-    value = radiance_toward(light, incoming @ frame, 1 / (SAMPLES * density))
     weight = np.where(incoming[..., 2] > 0, _g1(np.maximum(incoming[..., 2], 1e-6), alpha), 0.0)
-    return np.einsum("nk,nkc->nc", weight, value) / SAMPLES
+    return NarrowLobe(lookup_toward(incoming @ frame, 1 / (SAMPLES * density)), weight)
 
 
 def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:

@@ -12,11 +12,12 @@ A ball is a "photo" for the gauge `channel_per_photo`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, ball_normals, diffuse_ball, glossy_ball
+from factorlib.evaluate.ball import Light, NarrowLobe, WideLobe, ball_normals, diffuse_ball, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 from factorlib.evaluate.picture import mean_error, picture_error, white_of
 from factorlib.results.materials import Reflectance
@@ -27,6 +28,12 @@ KINDS = ("in_true_light", "in_estimated_light", "null_grey", "null_mean_colour")
 GREY = 0.5
 
 Samples = Float[np.ndarray, "_ 3"]
+
+
+@lru_cache(maxsize=16)
+def lobe_of(roughness: float) -> WideLobe | NarrowLobe:
+    """Of a ball; kept, for materials are shown in many lights.  16 take 200 MB at most."""
+    return glossy_lobe(ball_normals(BALL_SIZE)[0], roughness)
 
 
 class Appearances:
@@ -43,7 +50,7 @@ class Appearances:
         if not any(material.specular):
             return value
         if material.roughness not in self.glossy:
-            self.glossy[material.roughness] = glossy_ball(self.light, self.normals, material.roughness)
+            self.glossy[material.roughness] = lobe_of(material.roughness).in_light(self.light)
         return value + np.asarray(material.specular) * self.glossy[material.roughness]
 
 
