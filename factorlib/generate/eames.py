@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import Part, chair, labelled, rough_chair
+from factorlib.generate.drawn import drawn_materials
 from factorlib.generate.lights import EYE, SceneDict
 from factorlib.generate.shapes import smooth
-from factorlib.generate.synthetic import drawn_materials
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh

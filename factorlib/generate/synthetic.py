@@ -16,14 +16,14 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.generate import folder, lights
-from factorlib.generate.lights import SceneDict
+from factorlib.generate import folder
+from factorlib.generate.drawn import MATERIALS, drawn_light, drawn_materials
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
-from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
@@ -60,11 +60,6 @@ class Shot(msgspec.Struct, frozen=True):
     clipped: float | None = None
 
 
-MATERIALS = {
-    "red": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
-    "green": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
-    "blue": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
-}
 SHOTS = (
     Shot("garden", ".exr", (Placed("sphere", "red", -1.22), Placed("vase", "green", 0.0), Placed("blob", "blue", 1.22, 0.6))),
     Shot("parlour", ".png", (Placed("bottle", "green", -1.22), Placed("sphere", "blue", 0.0), Placed("vase", "red", 1.22))),
@@ -104,52 +99,12 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = light_of(number, world_from_camera, lat_longs, rng, parameters)
+        light = drawn_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = placements(shot, world_from_camera, rng, spread=0.0 if seed == 0 else 1.0)
         photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
     write_records(out, materials, photos, poses)
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
-
-
-def drawn_materials(rng: np.random.Generator, spread: float, about: dict[str, Material] = MATERIALS) -> dict[str, Material]:
-    """The materials of `about`, each number times exp(spread · normal), within k_d + k_s ≤ 0.95."""
-    drawn = {}
-    for name, material in about.items():
-        factor = np.exp(spread * rng.standard_normal(5))
-        diffuse = np.array(material.diffuse) * factor[:3]
-        specular = np.array(material.specular) * factor[3]
-        shrink = min(1.0, 0.95 / (diffuse.max() + specular.max()))
-        roughness = float(np.clip(material.roughness * factor[4], 0.15, 0.8))
-        drawn[name] = Material(_rounded(diffuse * shrink), _rounded(specular * shrink), round(roughness, 4))
-    return drawn
-
-
-def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
-    return tuple(round(float(v), 4) for v in values)
-
-
-def light_of(
-    number: int, world_from_camera: Float[np.ndarray, "3 3"], lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
-) -> Float[np.ndarray, "h w 3"]:
-    """The light of photo `number`, in the camera's y-up frame: daylight for the first, rooms for the others."""
-    if lat_longs:
-        return lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
-    seed = int(rng.integers(1 << 24))
-    turn = world_from_camera @ YUP_FROM_CAMERA
-    scene = surroundings(number, world_from_camera, rng, 2 * parameters.light_rows)
-    return light_seen(scene, rigid(turn, (0, 0, 0)), parameters.light_rows, parameters.light_spp, seed)
-
-
-def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> SceneDict:
-    """Light number 0 is a street by day, the others rooms with as many lamps as their number.
-
-    The sun stands behind the camera, to its left or right.
-    """
-    if number:
-        return lights.room(rng, windows=2, lamps=number)
-    forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-    return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70), rows=sky_rows)
 
 
 def placements(shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float) -> dict[str, Pose]:

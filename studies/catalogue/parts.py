@@ -14,7 +14,7 @@ from __future__ import annotations
 from studies.core.part import PARTS, Part
 from studies.core.study import Claim, Scale, Setting, Study
 
-QUICK = ("as-it-is", "bounce", "light-prior")
+QUICK = ("as-it-is", "bounce", "robust")
 WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "the light prior", "normals": "how sure normals are", "robust": "the robust loss"}
 FURTHER = {"tone": "tone curves", "clipped-as-data": "knowing what is clipped", "clipped-left-out": "clipped values as bounds"}
 
@@ -22,8 +22,7 @@ FURTHER = {"tone": "tone curves", "clipped-as-data": "knowing what is clipped", 
 def settings(scale: Scale) -> list[Setting]:
     """As it is, then without each part."""
     names = QUICK if scale.name == "quick" else tuple(PARTS)
-    solve = {"lobes": 24, "rounds": 2, "iterations": 4, "polish": 4} if scale.name == "quick" else {}
-    return [Setting(name, PARTS[name][0], x, lambda seed, name=name: Part(seed, name, solve)) for x, name in enumerate(names)]
+    return [Setting(name, PARTS[name][0], x, lambda seed, name=name: Part(seed, name, scale.solve)) for x, name in enumerate(names)]
 
 
 def claims(scale: Scale) -> list[Claim]:

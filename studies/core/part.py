@@ -44,4 +44,4 @@ def chairs_of(scale: Scale) -> Chairs:
     """The sets of a scale; small ones, since a study is of many solves."""
     if scale.name == "quick":
         return Chairs(scale.seeds, shots=2, width=120, height=90, spp=16, light_rows=32)
-    return Chairs(scale.seeds, shots=6, width=240, height=180, spp=64, light_rows=64)
+    return Chairs(scale.seeds, shots=4, width=240, height=180, spp=64, light_rows=64)

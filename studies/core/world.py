@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball, ball_normals, light_of_lat_long
-from factorlib.generate.synthetic import Parameters, drawn_materials, light_of
+from factorlib.generate.drawn import drawn_light, drawn_materials
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import Material, look
 from studies.core.case import NAMES
@@ -49,7 +49,7 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     rng = np.random.default_rng([12, seed, light])
     world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
     lamps = 1 + light % 2 if light else 0  # none: by day
-    found = light_of(lamps, world_from_camera, [], rng, Parameters(light_rows=rows, light_spp=spp))
+    found = drawn_light(lamps, world_from_camera, [], rng, rows, spp)
     return (found / found.mean()).astype(np.float32)
 
 
