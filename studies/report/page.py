@@ -19,12 +19,26 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def page(studies: Sequence[tuple[Any, Path]]) -> str:
-    """HTML of studies, each the value of its table.json and the folder of its figure.svg, which is this project's own and set as it is."""
-    found = [_shown(msgspec.convert(table, Conclusion, str_keys=True), folder) for table, folder in studies]
+    """HTML of studies, each the value of its table.json and the folder of its figure.svg, which is this project's own and set as it is.
+
+    A table that another version of the project wrote in another form is left out, and the page names it.
+    """
+    read = [(_conclusion(table), folder) for table, folder in studies]
+    found = [_shown(conclusion, folder) for conclusion, folder in read if conclusion]
+    others = [folder.name for conclusion, folder in read if not conclusion]
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((TEMPLATES / "index.html").read_text(encoding="utf-8"))
     quick = any(conclusion.label for conclusion, _, _ in found)
-    return template.render(studies=found, quick=quick, measures=MEASURES, number=number, answer=answer_to_the_paper)
+    return template.render(studies=found, others=others, quick=quick, measures=MEASURES, number=number, answer=answer_to_the_paper)
+
+
+def _conclusion(table: Any) -> Conclusion | None:
+    """The table as this version writes it; None where it is of another form, or of a measure that is no longer taken."""
+    try:
+        found = msgspec.convert(table, Conclusion, str_keys=True)
+    except msgspec.ValidationError:
+        return None
+    return found if set(found.measures) <= MEASURES.keys() else None
 
 
 def _shown(found: Conclusion, folder: Path) -> tuple[Conclusion, str, list[tuple[Picture, str]]]:

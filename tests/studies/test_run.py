@@ -96,6 +96,17 @@ def test_the_page_escapes_what_it_shows(tmp_path):
     assert "<script>" not in page([(json.loads(msgspec.json.encode(found)), tmp_path)])
 
 
+@pytest.mark.parametrize("change", [{"measures": ["entries", "gone"]}, {"rows": 1}])
+def test_the_page_names_tables_of_another_version_and_shows_the_others(tmp_path, change):
+    found = json.loads(msgspec.json.encode(Conclusion("x", "title", "?", "&", "v", "full", "", (0,), ("entries",), [], [])))
+    for name in ("new", "old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "figure.svg").write_text("<svg></svg>")
+    text = page([(found, tmp_path / "new"), (found | change, tmp_path / "old")])
+    assert text.count("<section") == 1 and "not shown: old." in text
+    assert "not shown" not in page([(found, tmp_path / "new")])
+
+
 def finished(project):
     """Steps that were done, by name, as often as they were."""
     path = project.build / NAME / "log.jsonl"
