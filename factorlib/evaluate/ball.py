@@ -69,7 +69,10 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
 
 
 class Lookup(msgspec.Struct, frozen=True):
-    """Where directions fall in any light's pyramid: two texels, of neighbouring levels, each numbered over all levels, and the second's share."""
+    """Which texels of a light's pyramid each direction reads: one of a finer and one of the next coarser level, and the coarser one's share.
+
+    Texels are numbered over all levels, the finest first; the numbers are the same for every light.
+    """
 
     finer: Int[np.ndarray, "*n"]
     coarser: Int[np.ndarray, "*n"]

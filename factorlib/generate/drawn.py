@@ -1,6 +1,6 @@
-"""What is random in a set: the numbers of its materials, and the lights.
+"""What is drawn at random for a set: its materials and its lights.
 
-Nothing here needs a mesh, so that studies of spheres start without the libraries that do.
+Nothing here needs a mesh, so studies of spheres need not load the libraries for meshes.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ def compare_by_light(problem: JointProblem, without: Sequence[Point], richer: Po
 def decide_over_lights(without: Sequence[Losses], richer: Sequence[Losses], threshold: Threshold) -> Evidence:
     """As `decide`, by the geometric mean over lights of each light's mean loss; lights without held-out observations have no say.
 
-    It is the likelihood where the variance of each light's residuals is unknown: a light whose normals are wrong has many times the loss
-    of another, and what a richer model changes there would outweigh all others in a sum.
+    This is the likelihood of residuals whose variance differs from light to light and is unknown.  A light whose normals are wrong has many
+    times the loss of another, and in a sum of losses its change would outweigh those of all others.
     """
     number = [len(losses) for losses in richer]
     logarithms = ([np.log(max(mean(losses), LEAST_DECREASE)) for losses in model] for model in (without, richer))

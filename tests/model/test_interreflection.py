@@ -200,8 +200,8 @@ def tilted(seen, seed, degrees):
 
 @pytest.mark.parametrize("bounced", [False, True])
 def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
-    """A mesh with hollows that the object has not, as far as light goes.  Bounces then explain a little of what the normals make wrong,
-    and the darker all surfaces are, the less harm they do: reflectances would fall to a tenth."""
+    """Where the photos show no bounces, those computed from the mesh still explain a little of what wrong normals cause.  They fit best
+    when they are weak, so a solve that kept them would make all reflectances ten times too small."""
     lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
     direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
     shown = [one if bounced else msgspec.structs.replace(one, radiance=other.radiance) for one, other in zip(lit, direct, strict=True)]

@@ -15,6 +15,7 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.solution import FILES
+from factorlib.solve.thresholds import INTERREFLECTION
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
@@ -113,7 +114,9 @@ def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_s
     models = {c: table["model"] for c, table in tables.items()}
     assert models["on"]["interreflection"] and not models["off"]["interreflection"]
     evidence = models["auto"]["interreflection_chosen_by"]
-    assert models["auto"]["interreflection"] == (evidence["held_out_loss_without"] > 1.1 * evidence["held_out_loss_with"])
+    assert models["auto"]["interreflection"] == (
+        evidence["held_out_loss_without"] > (1 + INTERREFLECTION.gain) * evidence["held_out_loss_with"]
+    )
     assert "no free factor" in tables["on"]["gauge"]["rule"] and "no free factor" not in tables["off"]["gauge"]["rule"]
     assert models["off"]["interreflection_chosen_by"] == {}
     earlier = tmp_path / "auto" / "out"
