@@ -77,6 +77,7 @@ help:
 	@echo 'make bench-solve                     the joint solve: speed against error, to build/bench/solve'
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
+	@echo 'make bench-eames_like                data/eames, and sets made alike that no setting was chosen on: captured lights too by $(PY) -m benchmarks.eames_like --lights FOLDER'
 	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
 	@echo 'make bench-runners                   a run with nothing to do, a plan and a status, beside DVC and Snakemake (docs/runner.md)'
 	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'

@@ -25,6 +25,7 @@ TABLE = re.compile(r"<!-- begin (?P<name>.+?) -->\n(?P<inner>.*?)<!-- end (?P=na
 TYPED = re.compile(r"<!-- typed from (.+?) -->")
 QUANTITY = re.compile(r"(?<![\w.])\.?\d[\d.,]*\s?(?:dB|%|°|s|×(?! ?\d))(?!\w)")
 CODE = re.compile(r"^```.*?^```|`[^`\n]+`", re.DOTALL | re.MULTILINE)
+OTHERWISE = {"benchmarks.reference": 'make bench-reference REASON="…"'}  # how a table is written whose command has no --docs
 STAMP = re.compile(r"<!-- written by (\S+) for sources ([0-9a-f]{8})(?: of (.+?))? -->")
 
 
@@ -52,7 +53,7 @@ def _reason(stamp: re.Match | None, hash_of: cache) -> str | None:
         now = hash_of(modules or command)
     except InputError as error:
         return f"written by {command}, of which {error.found}"
-    return None if now == then else f"of sources {then}, now {now}; written by python -m {command} --docs"
+    return None if now == then else f"of sources {then}, now {now}; written by {OTHERWISE.get(command, f'python -m {command} --docs')}"
 
 
 def unmarked(page: Path, root: Path = ROOT) -> Iterator[str]:
