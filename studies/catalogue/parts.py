@@ -15,8 +15,9 @@ from studies.core.part import PARTS, Part
 from studies.core.study import Claim, Scale, Setting, Study
 
 QUICK = ("as-it-is", "bounce", "robust")
-WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "the light prior", "normals": "how sure normals are", "robust": "the robust loss"}
-FURTHER = {"tone": "tone curves", "clipped-as-data": "knowing what is clipped", "clipped-left-out": "clipped values as bounds"}
+WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "the prior on lights", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
+FURTHER = {"tone": "tone curves", "clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
+DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}  # measure -> what parts may do
 
 
 def settings(scale: Scale) -> list[Setting]:
@@ -26,10 +27,9 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """Unseen cells and materials with each part against without it."""
+    """Unseen cells, materials and lights with each part against without it."""
     parts = {name: words for name, words in (WORTH | FURTHER).items() if scale.name == "full" or name in QUICK}
-    unseen = [Claim("unseen", "as-it-is", name, f"{words} help to explain unseen observations", paper=False) for name, words in parts.items()]
-    return unseen + [Claim("diffuse", "as-it-is", name, f"{words} make k_d truer", paper=False) for name, words in parts.items()]
+    return [Claim(measure, "as-it-is", name, f"{words} {does}", paper=False) for measure, does in DO.items() for name, words in parts.items()]
 
 
 STUDY = Study(
@@ -38,7 +38,7 @@ STUDY = Study(
     question="What is each part of the model worth?",
     paper="Nothing: the paper's model has none of these parts.",
     varied="what is switched off",
-    measures=("unseen", "diffuse", "specular", "roughness", "glossy", "mirror"),
+    measures=("unseen", "diffuse", "specular", "glossy", "roughness", "mirror"),
     settings=settings,
     claims=claims,
     kind="parts",
