@@ -15,7 +15,7 @@ from studies.core.part import PARTS, Part
 from studies.core.study import Claim, Scale, Setting, Study
 
 QUICK = ("as-it-is", "bounce", "robust")
-WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "the prior on lights", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
+WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "priors on lights", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
 FURTHER = {"tone": "tone curves", "clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
 DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}  # measure -> what parts may do
 
