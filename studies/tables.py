@@ -73,10 +73,20 @@ def _full(found: Conclusion) -> bool:
 def numbers(found: Conclusion) -> str:
     """The first measures of a study, and its claims; a quick one says in its head that it is."""
     measures = found.measures[:SHOWN]
-    head = [f"{found.varied} ({found.label})" if found.label else found.varied, *(MEASURES[m].label for m in measures)]
+    head = [f"{found.varied} ({found.label})" if found.label else found.varied, *(with_unit(m) for m in measures)]
     rows = [[row.label, *(number(row.cells.get(m)) for m in measures)] for row in found.rows]
     sentences = "\n".join(f"- {sentence}" for sentence in said(found))
     return f"{table(head, rows)}\n\n{sentences}" if not found.label else table(head, rows)
+
+
+def with_unit(measure: str) -> str:
+    """What stands at the head of a measure's column.
+
+    >>> with_unit("peak"), with_unit("roughness")
+    ('largest memory of the process (GB)', 'error of roughness')
+    """
+    about = MEASURES[measure]
+    return about.label if about.unit == "1" else f"{about.label} ({about.unit})"
 
 
 def conclusions(project: Studies) -> dict[str, Conclusion]:
