@@ -16,9 +16,9 @@ import typer
 from benchmarks.markdown import refresh, table
 from factorlib.jsonfile import read_json
 from studies.catalogue.contents import STUDIES
-from studies.core.measures import MEASURES
 from studies.core.study import FULL, QUICK, Study
 from studies.core.table import Conclusion
+from studies.report.heads import with_unit
 from studies.report.page import number
 from studies.report.tables import answer_to_the_paper
 from studies.report.tables import sentences as said
@@ -77,16 +77,6 @@ def numbers(found: Conclusion) -> str:
     rows = [[row.label, *(number(row.cells.get(m)) for m in measures)] for row in found.rows]
     sentences = "\n".join(f"- {sentence}" for sentence in said(found))
     return f"{table(head, rows)}\n\n{sentences}" if not found.label else table(head, rows)
-
-
-def with_unit(measure: str) -> str:
-    """What stands at the head of a measure's column.
-
-    >>> with_unit("peak"), with_unit("roughness")
-    ('largest memory of the process (GB)', 'error of roughness')
-    """
-    about = MEASURES[measure]
-    return about.label if about.unit == "1" else f"{about.label} ({about.unit})"
 
 
 def conclusions(project: Studies) -> dict[str, Conclusion]:

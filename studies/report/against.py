@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from benchmarks.figure import COLOURS, LogAxis, dot, line, page, text
 from factorlib.report.plot import log_ticks
-from studies.core.measures import MEASURES
 from studies.core.table import Conclusion, Row, Spread
+from studies.report.heads import with_unit
 
 WIDTH, HEIGHT, COLUMNS = 380, 290, 2  # of a panel; panels side by side
 LEFT, RIGHT, TOP, BOTTOM = 62, 18, 44, 46
@@ -32,12 +32,12 @@ def _panel(found: Conclusion, across: str, measure: str, x0: float, y0: float) -
     rows = [(k, row) for k, row in enumerate(found.rows) if {across, measure} <= row.cells.keys()]
     right = _axis([row.cells[across].spread for _, row in rows], x0 + LEFT, x0 + WIDTH - RIGHT)
     up = _axis([row.cells[measure].spread for _, row in rows], y0 + HEIGHT - BOTTOM, y0 + TOP)
-    parts = [text(x0 + LEFT, y0 + TOP - 14, _named(measure), css="small")]
+    parts = [text(x0 + LEFT, y0 + TOP - 14, with_unit(measure), css="small")]
     for value in _ticks(up):
         parts += [line(right.start, up(value), right.end, up(value), "grid"), text(right.start - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
     for value in _ticks(right):
         parts += [line(right(value), up.start, right(value), up.end, "grid"), text(right(value), up.start + 16, f"{value:g}", "middle", "small soft")]
-    parts += [line(right.start, up.start, right.end, up.start, "axis"), text((right.start + right.end) / 2, up.start + 34, _named(across), "middle", "small soft")]
+    parts += [line(right.start, up.start, right.end, up.start, "axis"), text((right.start + right.end) / 2, up.start + 34, with_unit(across), "middle", "small soft")]
     return parts + [mark for k, row in rows for mark in _marks(k, row, right, up, across, measure)]
 
 
@@ -59,11 +59,6 @@ def _axis(spreads: Sequence[Spread], start: float, end: float) -> LogAxis:
 
 def _ticks(axis: LogAxis) -> list[float]:
     return [10**k for k in log_ticks(axis.log(axis.low), axis.log(axis.high))]
-
-
-def _named(measure: str) -> str:
-    about = MEASURES[measure]
-    return about.label + ("" if about.unit == "1" else f" ({about.unit})")
 
 
 def _colour(k: int) -> str:

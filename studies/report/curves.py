@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from benchmarks.figure import COLOURS, LogAxis, dot, line, page, path, text
 from factorlib.report.plot import log_ticks
-from studies.core.measures import MEASURES
 from studies.core.table import Cell, Conclusion
+from studies.report.heads import with_unit
 
 WIDTH, HEIGHT, COLUMNS = 380, 250, 2  # of a panel; panels side by side
 LEFT, RIGHT, TOP, BOTTOM = 66, 14, 40, 50
@@ -37,8 +37,7 @@ def _panel(found: Conclusion, of: Curves, measure: str, x0: float, y0: float) ->
     left, right, base = x0 + LEFT, x0 + WIDTH - RIGHT, y0 + HEIGHT - BOTTOM
     up = LogAxis(min(means) / 1.6, max(means) * 1.6, base, y0 + TOP)
     across = {place: left + (k + 0.5) / len(places) * (right - left) for k, place in enumerate(places)}
-    about = MEASURES[measure]
-    parts = [text(left, y0 + TOP - 12, about.label + ("" if about.unit == "1" else f" ({about.unit})"), css="small")]
+    parts = [text(left, y0 + TOP - 12, with_unit(measure), css="small")]
     for value in (10**t for t in log_ticks(up.log(up.low), up.log(up.high))):
         parts += [line(left, up(value), right, up(value), "grid"), text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
     parts += [text(x, base + 16, place, "middle", "small") for place, x in across.items()]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 from benchmarks.figure import COLOURS, SOFT, dot, line, page, path, text
 from factorlib.report.plot import ticks
-from studies.core.measures import MEASURES
 from studies.core.table import Cell, Conclusion
+from studies.report.heads import with_unit
 
 WIDTH, HEIGHT, COLUMNS = 380, 230, 2  # of a panel; panels side by side, one alone where labels need the room
 LETTER, TURN = 6.0, 35.0  # pixels of a label's letter; degrees that labels are turned by where they do not fit beside each other
@@ -57,9 +57,7 @@ def _panel(found: Conclusion, measure: str, x0: float, y0: float) -> list[str]:
         """Of a value; the axis begins at 0."""
         return base - max(value, 0.0) / (1.05 * top) * (base - high)
 
-    about = MEASURES[measure]
-    unit = "" if about.unit == "1" else f" ({about.unit})"
-    parts = [text(left, high - 14, f"{about.label}{unit}", css="small")]
+    parts = [text(left, high - 14, with_unit(measure), css="small")]
     for value in ticks(0, 1.05 * top, 4):
         parts += [line(left, up(value), right, up(value), "grid"), text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
     parts += [line(left, base, right, base, "axis"), text((left + right) / 2, base + below, found.varied, "middle", "small soft")]

@@ -164,6 +164,11 @@ def test_figures_stand_alone_and_show_every_setting(draw):
     assert any("Title <&>" in (e.text or "") for e in root.iter())
 
 
+@pytest.mark.parametrize("names, axes", [(("few seeds", "more seeds"), 1), (("a: few", "a: more"), 1), (("a: few", "b: more"), 2)])
+def test_settings_share_an_axis_unless_they_are_of_several_kinds(names, axes):
+    assert bars(conclusion(names=names, measures=("peak",))).count("largest memory of the process (GB)") == axes
+
+
 def test_the_best_is_named_with_those_that_are_not_shown_to_be_worse():
     found = conclusion(names=("one", "two"))
     assert best(found, "entries") == "Least mean of DSSIM, all entries: “one”; all others are shown to be worse."
