@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from pathlib import Path
 
@@ -43,9 +44,9 @@ def show(survey: Survey, planned: list[Planned]) -> None:
         current = {p.step.photo: p.output for p in planned if p.step.stage == stage and p.status == "current"}
         if current:
             point(survey.home.folder / stage, folder_of(survey, stage, current))
-    for link in survey.home.folder.glob("*"):
+    for link in survey.home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in survey.spec.pipeline.stages:
-            link.unlink()
+            link.unlink(missing_ok=True)
     _drop_errors(survey, planned)
     sweep_drafts(survey.home.folder)
 
@@ -57,8 +58,8 @@ def _drop_errors(survey: Survey, planned: list[Planned]) -> None:
     folder = survey.home.folder / "errors"
     for path in folder.glob("*.txt"):
         if path.stem in good or path.stem not in there:
-            path.unlink()
-    if folder.is_dir() and not any(folder.iterdir()):
+            path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
         folder.rmdir()
 
 

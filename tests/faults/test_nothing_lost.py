@@ -129,6 +129,13 @@ def test_runs_at_the_same_time_do_the_work_once(fresh, finished, again, seeds):
     no_loss("two or three runs at once", losses)
 
 
+def test_a_run_leaves_the_link_that_another_run_is_about_to_rename(finished, again):
+    project = again(finished)
+    draft = project.build / "set" / f".upper.{os.getpid()}"
+    draft.symlink_to("../store", target_is_directory=True)
+    assert make(project) == 0 and draft.is_symlink()
+
+
 @pytest.mark.parametrize("seeds", few(12), ids=str)
 def test_a_photo_that_vanishes_in_mid_run_is_named_and_costs_its_own_steps(fresh, finished, again, seeds):
     losses = []
