@@ -73,11 +73,14 @@ def _opened(path: str | Path, key: str | None) -> Any:
 
 def _decoded(picture: Any, path: str | Path, key: str | None) -> Shaped[np.ndarray, "h w 3"]:
     """RGB codes, alpha dropped; grey is repeated where it is looked at, not in memory."""
+    width, height = picture.size  # as the header says; decoding may find another, and the picture then takes that one
     try:
         pixels = np.asarray(picture)
     except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
-        found = f"truncated or damaged ({error})"
-        raise InputError(found, file=path, key=key, cure="copy it again from where it came") from None
+        raise _damaged(str(error), path, key) from None
+    if pixels.shape[:2] != (height, width):
+        found = f"its header says {width}×{height} pixels, the picture in it has {pixels.shape[1]}×{pixels.shape[0]}"
+        raise _damaged(found, path, key)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.broadcast_to(pixels[..., :1], (*pixels.shape[:2], 3))
@@ -103,6 +106,10 @@ def _profile(icc: bytes | None) -> str:
         return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip() if icc else ""
     except (OSError, ImageCms.PyCMSError):
         return ""
+
+
+def _damaged(found: str, path: str | Path, key: str | None) -> InputError:
+    return InputError(f"truncated or damaged ({found})", file=path, key=key, cure="copy it again from where it came")
 
 
 def _refused(found: str, path: str | Path, key: str | None) -> InputError:

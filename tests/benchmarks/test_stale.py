@@ -2,6 +2,7 @@
 
 import pytest
 
+from benchmarks import markdown
 from benchmarks.markdown import refresh, table
 from benchmarks.stale import ROOT, stale, unmarked
 
@@ -37,6 +38,16 @@ def test_other_sources_make_it_stale_and_comments_do_not(page, file):
     assert line.startswith("speed.md: speed: of sources ") and "python -m measures.speed --docs" in line
     refresh(page, SPEED, "measures.speed", page.parent)
     assert not list(stale([page], page.parent))
+
+
+def test_a_module_that_no_number_depends_on_makes_stale_only_what_names_it(page, monkeypatch):
+    monkeypatch.setattr(markdown, "WITHOUT_NUMBERS", {"library"})
+    refresh(page, SPEED, "measures.speed", page.parent)
+    (page.parent / "library.py").write_text("STEPS = 4\n")
+    assert not list(stale([page], page.parent))
+    refresh(page, SPEED, "measures.speed", page.parent, modules=["measures.speed", "library"])
+    (page.parent / "library.py").write_text("STEPS = 5\n")
+    assert len(list(stale([page], page.parent))) == 1
 
 
 def test_a_table_without_stamp_or_without_its_command_is_named(page):

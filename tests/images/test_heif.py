@@ -98,6 +98,15 @@ def test_a_damaged_file_is_refused(tmp_path, part):
     assert "photos[0].image" in str(caught.value) and caught.value.cure
 
 
+def test_a_picture_of_another_size_than_its_header_says_is_refused(tmp_path):
+    whole = save(tmp_path / "a.heic", SMOOTH).read_bytes()
+    at = whole.index(b"clap") + 12  # the height of the crop: past the name and the width, a fraction
+    (tmp_path / "a.heic").write_bytes(whole[:at] + (255).to_bytes(4, "big") + whole[at + 4 :])
+    with pytest.raises(InputError, match=r"truncated or damaged \(its header says .*×255 pixels, the picture in it has ") as caught:
+        read_photo(tmp_path / "a.heic", key="photos[0].image")
+    assert "photos[0].image" in str(caught.value) and caught.value.cure
+
+
 def test_a_file_in_a_curve_of_hdr_video_is_refused(tmp_path):
     path = save(tmp_path / "a.heic", SMOOTH, deep=True, save_nclx_profile=True, transfer_characteristics=18, color_primaries=9)
     with pytest.raises(InputError, match="HLG"):
