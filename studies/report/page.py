@@ -13,6 +13,7 @@ import msgspec
 from benchmarks.rounded import exact
 from studies.core.measures import MEASURES
 from studies.core.table import Cell, Conclusion, Picture
+from studies.report.heads import with_unit
 from studies.report.tables import answer_to_the_paper
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -29,7 +30,7 @@ def page(studies: Sequence[tuple[Any, Path]]) -> str:
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((TEMPLATES / "index.html").read_text(encoding="utf-8"))
     quick = any(conclusion.label for conclusion, _, _ in found)
-    return template.render(studies=found, others=others, quick=quick, measures=MEASURES, number=number, answer=answer_to_the_paper)
+    return template.render(studies=found, others=others, quick=quick, with_unit=with_unit, number=number, answer=answer_to_the_paper)
 
 
 def _conclusion(table: Any) -> Conclusion | None:

@@ -90,6 +90,13 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), "the page stands alone"
 
 
+def test_the_page_heads_a_column_with_its_unit(tmp_path):
+    found = Conclusion("x", "title", "?", "p", "v", "full", "", (0,), ("seconds", "entries"), [], [])
+    (tmp_path / "figure.svg").write_text("<svg></svg>")
+    text = page([(json.loads(msgspec.json.encode(found)), tmp_path)])
+    assert "of a solve (s)</th>" in text and "<th>DSSIM, all entries</th>" in text
+
+
 def test_the_page_escapes_what_it_shows(tmp_path):
     found = Conclusion("x", "<script>", "?", "&", "v", "full", "", (0,), ("entries",), [], [])
     (tmp_path / "figure.svg").write_text("<svg></svg>")
