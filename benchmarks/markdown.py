@@ -16,7 +16,8 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 
 ROOT = Path(__file__).resolve().parents[1]
-WITHOUT_NUMBERS = {"benchmarks.markdown", "factorlib.images.heif"}  # the form of tables, and the reader of a kind of photo that none measures
+WITHOUT_NUMBERS = {"benchmarks.markdown", "studies.report:templates/index.html", "factorlib.images.heif"}
+"""Modules and data that can change no number: the form of tables and pages, and the reader of a kind of photo that none measures."""
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -55,8 +56,8 @@ def refresh(path: Path, parts: dict[str, str], command: str, root: Path = ROOT, 
 def sources_hash(*commands: str, root: Path = ROOT) -> str:
     """Eight digits of a hash of all modules of the project, and their data, that `python -m command` imports, of all commands.
 
-    Comments and docstrings do not count, as for the keys of steps, nor do modules WITHOUT_NUMBERS, but for those
-    that are named.  Raises InputError where there is no such module.
+    Comments and docstrings do not count, as for the keys of steps, nor does what stands in
+    WITHOUT_NUMBERS, but for what is named.  Raises InputError where there is no such module.
     """
     sources, found = Sources([root], FileHashes(None)), {}
     for command in commands:
