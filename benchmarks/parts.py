@@ -1,6 +1,6 @@
-"""What each part of the model is worth on a data set: `make bench-parts DATASETS="eames ../photos/mine"`.
+"""What each part of the model, with lights of few lobes, is worth on a data set: `make bench-parts DATASETS="eames ../photos/mine"`.
 
-Needs the data set's `urm` and `train` (`make urm train DATASET=…`), takes what `solve` would take, and measures on mirror cells
+Needs the data set's `urm` and `train` (`make urm train DATASET=…`), takes what `solve` with few lobes would take, and measures on mirror cells
 (a tenth of the sphere's width) that no solve has seen, about 15 % of the observations:
 
 unseen     PSNR of them, 10 log₁₀(peak² / mean squared error), peak the 99.9th percentile of the light's radiances; mean and worst light
@@ -35,26 +35,23 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import Solution
-from factorlib.solve.descent import Descent, descend
-from factorlib.solve.insertion import blurred, pruned
-from factorlib.solve.rounds import with_new_lobes
-from factorlib.solve.start import starting_light
-from factorlib.solve.warm import with_exposures
+from factorlib.solve.few_lobes.descent import Descent, descend
+from factorlib.solve.few_lobes.insertion import blurred, pruned
+from factorlib.solve.few_lobes.rounds import with_new_lobes
+from factorlib.solve.few_lobes.start import starting_light
+from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations, read_observations
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "solve.md"
 VARIANTS: dict[str, dict] = {
     "as it is": {},
-    "no tone curves": {"tone": "off"},
-    "no self-shadowing": {"self_shadowing": "off"},
+    "no self-shadowing": {"shadows": False},
     "every material specular": {"specular": "on"},
     "no material specular": {"lambertian": True},
     "no tint prior": {"prior": 0.0},
     "tint prior .1, the paper's": {"prior": 0.1},
-    "no interreflection": {"interreflection": "off"},
-    "no light prior": {"light_prior": "none"},
+    "no interreflection": {"bounces": False},
     "normals all as sure": {"seen": "sure"},
     "squares, not pseudo-Huber": {"robust_scale": 1e6},
     "clipped values as they are": {"seen": "unclipped"},
@@ -75,14 +72,14 @@ def observations_of(dataset: str) -> tuple[list[str], list[Observations], Rotati
 def light_of(block: Block, materials: Materials, operator: Operator) -> Light:
     """The light of one block, its materials fixed: rounds of insertion and descent while held-out observations gain."""
     problem = JointProblem([block], operator)
-    bundle, light, best, least = DEFAULT, starting_light(block, materials), None, np.inf
+    options, light, best, least = DEFAULT, starting_light(block, materials), None, np.inf
     every = np.ones(7 * len(materials), bool)
-    for number in range(bundle.rounds):
-        at = with_new_lobes(problem, Point(materials, [light]), bundle, number)
-        at = descend(problem, at, Descent(bundle.iterations, bundle.tolerance), fixed=every)
+    for number in range(options.rounds):
+        at = with_new_lobes(problem, Point(materials, [light]), options, number)
+        at = descend(problem, at, Descent(options.iterations, options.tolerance), fixed=every)
         light = blurred(pruned(at.point.lights[0]), materials.sharpest)
         held_out = problem.held_out_loss(Point(materials, [light]))
-        if held_out > (1 - bundle.least_gain) * least:
+        if held_out > (1 - options.least_gain) * least:
             break
         best, least = light, held_out
     return best or light
@@ -134,6 +131,18 @@ def _photos_left_out(splits: Sequence[Split], k: int, whole: Solution, materials
     return found
 
 
+def with_exposures(illumination: Illumination) -> Light:
+    """Its light with the exposures that were not known (NaN), and the first photo's moved into the weights."""
+    light, block = illumination.light, illumination.block
+    guess = msgspec.structs.replace(light, log_exposure=np.where(np.isnan(light.log_exposure), 0.0, light.log_exposure))
+    for k in np.flatnonzero(np.isnan(light.log_exposure)):
+        of_photo = msgspec.structs.replace(illumination, block=block.take(block.photo == k), light=guess)
+        shown, expected = (np.median(radiance, axis=0) for radiance in (of_photo.block.radiance, of_photo.radiance()))
+        guess.log_exposure[k] = np.log(np.maximum(shown, 1e-6) / np.maximum(expected, 1e-6)).mean()
+    first = guess.log_exposure[0]
+    return msgspec.structs.replace(light, weight=light.weight * np.exp(first), log_exposure=guess.log_exposure - first)
+
+
 def measured(dataset: str, photos: bool) -> dict:
     names, seen_by_photos, rotations = observations_of(dataset)
     splits = splits_of(seen_by_photos, rotations)
@@ -162,7 +171,6 @@ def measured(dataset: str, photos: bool) -> dict:
                     }
                     for m, n in enumerate(names)
                 }
-                result["tone"] = {b.name: np.exp(light.log_tone).round(3).tolist() for b, light in zip(seen, solution.point.lights, strict=True)}
                 result["self_shadowing"] = solution.shadows.kept
             bar.update()
         result["left_out"] = left_out(splits, whole, count, operator, bar.update) if photos else {}
@@ -171,8 +179,7 @@ def measured(dataset: str, photos: bool) -> dict:
 
 def _differs(how: dict, whole: Solution) -> bool:
     """Whether the solve as it is has what a variant goes without."""
-    has = {"tone": any(one.kept for one in whole.tone), "specular": whole.lambertian.any(), "self_shadowing": whole.shadows.kept}
-    has |= {"interreflection": whole.interreflection.kept, "light_prior": whole.light_prior.kept}
+    has = {"specular": whole.lambertian.any(), "shadows": whole.shadows.kept, "bounces": whole.interreflection.kept}
     return all(has.get(part, True) for part in how)
 
 

@@ -41,10 +41,10 @@ from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Run
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
@@ -154,8 +154,8 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
-    bundle = Bundle(light_prior="none", rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
-    return solve(JointProblem(blocks, operator), from_nothing(3), Run(bundle)).point.materials
+    options = FewLobes(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
+    return few_lobes(JointProblem(blocks, operator), from_nothing(3), Run(options)).point.materials
 
 
 def normal_error(photo: Photo, pose: Pose) -> float:

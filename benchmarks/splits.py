@@ -21,15 +21,16 @@ from factorlib.model.noise import Noise
 from factorlib.model.observed import Rotations, blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import Solution, solve
-from factorlib.solve.history import Run
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import Start, from_nothing
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import Start, from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.history import Solution
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate
 
 CELL, SHARE, MERGE_DEGREES = 0.1, 0.15, 2.0
-DEFAULT = Bundle(tolerance=1e-3)
+DEFAULT = FewLobes(tolerance=1e-3)
 
 
 class Split(msgspec.Struct, frozen=True):
@@ -77,11 +78,14 @@ def _cells(block: Block) -> Int[np.ndarray, " n"]:
 
 
 def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
-    how = {key: value for key, value in how.items() if key != "seen"}
+    """With lights of few lobes.  how: options of `FewLobes`, of the loss and of the start, and effects that are off."""
+    how = {key: value for key, value in how.items() if key not in ("seen", "solver")}
     none_specular, usual = np.full(materials, how.pop("lambertian", False)), Loss()
     loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
     start = Start(from_nothing(materials).point, none_specular, none_specular)
-    return solve(JointProblem(list(blocks), operator, loss, threaded), start, Run(msgspec.structs.replace(DEFAULT, **how)))
+    effects = how.pop("shadows", True), how.pop("bounces", True)
+    problem = JointProblem(list(blocks), operator, loss, threaded).with_effects(*effects)
+    return few_lobes(problem, start, Run(msgspec.structs.replace(DEFAULT, **how)))
 
 
 def shown(solution: Solution, block: Block, operator: Operator) -> Block:

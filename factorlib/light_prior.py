@@ -53,12 +53,12 @@ def means_of(path: Path, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
         raise InputError(str(error), file=path, cure="a map of 64 rows or more will do") from None
 
 
-def prior_of(paths: Sequence[Path], count: int | None = None, bar: Progress | None = None) -> LightPrior:
-    """The prior of the maps in some files; with two or more also its leave-one-out scores."""
+def prior_of(paths: Sequence[Path], count: int | None = None, bar: Progress | None = None, scored: bool = True) -> LightPrior:
+    """The prior of the maps in some files; with two or more, where `scored`, also its leave-one-out scores, which take most of the time."""
     cells, bar = fibonacci_sphere(count or CELLS), bar or Progress(disable=True)
     means = np.stack([means_of(path, cells) for path in bar.track(paths, description="reading")])
     logs, task = log_cells(means), bar.add_task("leaving one out", total=len(paths))
-    scores = leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done)) if len(paths) > 1 else None
+    scores = leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done)) if scored and len(paths) > 1 else None
     sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
 

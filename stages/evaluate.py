@@ -18,8 +18,9 @@ from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.materials import compare_materials
-from factorlib.evaluate.metrics import reasons_of
+from factorlib.evaluate.metrics import SECTIONS, reasons_of
 from factorlib.evaluate.relighting import compare_relighting
+from factorlib.evaluate.relit_set import compare_relit_set
 from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
@@ -46,9 +47,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     seen = _seen(resynthesis, lights)
     component = connected_components({light: names for light, names in seen.items() if names})
     progress(1, 3, "materials, light and relighting")
-    sections = _against_truth(inputs, out, truth, lights, seen, component) if truth else dict.fromkeys(
-        ("materials", "relighting", "light", "normals", "poses")
-    )  # fmt: skip
+    sections = _against_truth(inputs, out, truth, lights, seen, component) if truth else dict.fromkeys(SECTIONS)
     metrics = Metrics(
         set=Counts(len(lights), len(inputs.facts["dataset.materials"]), len(seen), len(set(component.values()))),
         resynthesis=resynthesis,
@@ -71,6 +70,7 @@ def _against_truth(
     return {
         "materials": compare_materials(estimates, materials, component),
         "relighting": compare_relighting(estimates, materials, found_lights, true_lights, seen),
+        "relit_set": compare_relit_set(estimates, materials, found_lights, true_lights),
         "light": compare_lights(found_lights, true_lights, _mirrored(inputs, lights)),
         "normals": _normals(inputs, truth, lights),
         "poses": _poses(inputs, truth),

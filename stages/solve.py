@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -17,7 +17,7 @@ from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import LightSlice
 from factorlib.diagnose.answer import Answer
 from factorlib.diagnose.coverage import relative_standard_errors
-from factorlib.diagnose.posterior import Posterior
+from factorlib.diagnose.posterior import Posterior, in_gauge_of
 from factorlib.diagnose.uncertainty import StandardErrors, standard_errors
 from factorlib.diagnose.warnings import after_solving, before_solving, unusable_observations
 from factorlib.errors import InputError
@@ -36,16 +36,19 @@ from factorlib.results.materials import write_materials
 from factorlib.results.solution import Earlier, read_earlier
 from factorlib.results.uncertainty import write_uncertainty
 from factorlib.solve import options
-from factorlib.solve.bundle import Solution, models, seen_under_prior, solve
-from factorlib.solve.history import Event, Run
-from factorlib.solve.natural import sure_ones
-from factorlib.solve.options import Bundle, Choices
+from factorlib.solve.few_lobes.history import Run as FewLobesRun
+from factorlib.solve.few_lobes.options import FewLobes, LobeChoices
+from factorlib.solve.few_lobes.rounds import from_nothing as one_lobe_each
+from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.fit import sure_ones
+from factorlib.solve.history import Event, Solution
+from factorlib.solve.options import Choices
 from factorlib.solve.paper import Paper, Prior, Samplings
 from factorlib.solve.paper import solve as solve_as_the_paper
-from factorlib.solve.progress import of_rounds, of_subsets
+from factorlib.solve.progress import of_parts, of_rounds, of_subsets
 from factorlib.solve.resume import Journal
-from factorlib.solve.rounds import from_nothing
-from factorlib.solve.warm import from_earlier
+from factorlib.solve.solve import Run, from_nothing, solve
+from factorlib.solve.warm import from_earlier, with_decided
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.exposure import at_one_exposure, relative_exposures
 from factorlib.urm.observations import Observations, concatenate
@@ -54,15 +57,16 @@ log = logging.getLogger("factorlib.solve")
 PAPER, NOISE, LOSS = Paper(), Noise(), Loss()  # where defaults stand
 
 
-class Params(Choices, frozen=True, forbid_unknown_fields=True):
-    """Those of the bundle solver, those of the paper's solver (paper_…), and what both take.
+class Params(LobeChoices, frozen=True, forbid_unknown_fields=True):
+    """Those of the joint solve, those of the solver of few lobes, those of the paper's solver (paper_…), and what all take.
 
     The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
-    from it, and whether they have specular parts, whether there are shadows, and whether surfaces light each other, stays as it was decided there.
+    from it, and whether there are shadows, and whether surfaces light each other, stays as it was decided there.
     """
 
-    solver: Literal["bundle", "paper"] = "bundle"
-    """bundle: this project's solver; paper: that of Wang, Ritschel and Mitra, the baseline."""
+    solver: Literal["bundle", "few_lobes", "paper"] = "bundle"
+    """bundle: this project's solver, lights are cells; few_lobes: lights are few lobes, for exact scenes; paper: that of Wang, Ritschel
+    and Mitra, the baseline."""
     operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
     """How a lobe's reflection is computed; auto: network, and paper_network for the paper's solver."""
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 2.0
@@ -70,7 +74,7 @@ class Params(Choices, frozen=True, forbid_unknown_fields=True):
     held_out: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.1
     """Share of the observations that is not fitted and chooses the model."""
     prior: Prior = LOSS.prior
-    """Weight of the paper's prior on the tint of lights."""
+    """Weight of the paper's prior on the tint of lights, for the solver of few lobes."""
     noise_absolute: Annotated[float, msgspec.Meta(gt=0)] = NOISE.absolute
     """Standard deviation of a radiance, as a share of its illumination's mean radiance."""
     noise_relative: Annotated[float, msgspec.Meta(ge=0)] = NOISE.relative
@@ -99,7 +103,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def operator_of(params: Params) -> str:
     """The name of the operator that the solver takes."""
-    automatic = {"bundle": "network", "paper": "paper_network"}[params.solver]
+    automatic = "paper_network" if params.solver == "paper" else "network"
     return automatic if params.operator == "auto" else params.operator
 
 
@@ -115,8 +119,8 @@ def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earl
     """The solution to start from, where one is given, its exposures beside what EXIF says."""
     if "start" not in inputs.folders:
         return None
-    if params.solver == "paper":
-        raise InputError("the paper's solver starts from nothing", key="solve.start", cure="leave it out, or set solve.solver=bundle")
+    if params.solver != "bundle":
+        raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure="leave it out, or set solve.solver=bundle")
     return read_earlier(inputs["start"]).beside(relative)
 
 
@@ -125,14 +129,19 @@ def _solved(params: Params, problem: JointProblem, earlier: Earlier | None, inpu
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
         return solve_as_the_paper(problem, len(names), paper, of_subsets(progress))
-    bundle = Bundle(**{name: getattr(params, name) for name in Choices.__struct_fields__})
-    start = from_earlier(earlier, names, bundle.specular) if earlier else from_nothing(len(names))
-    for choice in ("self_shadowing", "interreflection"):
-        if earlier and getattr(bundle, choice) == "auto" and getattr(earlier, choice):
-            bundle = msgspec.structs.replace(bundle, **{choice: getattr(earlier, choice)})
-    report = of_rounds(progress, bundle, len(models(problem, bundle)))
     journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
-    return solve(problem, start, Run(bundle, report, journal=journal))
+    if params.solver == "few_lobes":
+        few = FewLobes(**_own(params, LobeChoices))
+        return few_lobes(problem, one_lobe_each(len(names)), FewLobesRun(few, of_rounds(progress, few.rounds), journal=journal))
+    choices = Choices(**_own(params, Choices))
+    start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
+    choices = with_decided(choices, earlier) if earlier else choices
+    return solve(problem, start, Run(choices, of_parts(progress, choices), journal))
+
+
+def _own(params: Params, struct: type[msgspec.Struct]) -> dict[str, Any]:
+    """The parameters that `struct` has."""
+    return {name: getattr(params, name) for name in struct.__struct_fields__}
 
 
 def _write(out: Path, answer: Answer, params: Params) -> None:
@@ -153,12 +162,13 @@ def _write(out: Path, answer: Answer, params: Params) -> None:
 def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Standard errors of the materials, and relative ones of each light."""
     solution = answer.solution
-    if solution.natural:
+    if solution.materials:
         of_materials, of_lights = (
-            Posterior(seen_under_prior(of, params), found, read_light_prior())
-            for of, found in ((sure_ones(problem), solution.sure), (problem, solution.natural))
+            Posterior(of.sampled(params.observations, params.seed), fit, read_light_prior())
+            for of, fit in ((sure_ones(problem), solution.materials), (problem, solution.lights))
         )
-        return of_materials.standard_errors(), of_lights.relative_standard_errors()
+        errors = in_gauge_of(of_materials.standard_errors(), solution.materials.point.materials, solution.point.materials)
+        return errors, of_lights.relative_standard_errors()
     errors = standard_errors(problem, solution.point)
     of_light = partial(relative_standard_errors, loss=problem.loss, sigma=errors.deviation)
     found = problem.spread(of_light, problem.illuminations(solution.point))

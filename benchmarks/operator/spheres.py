@@ -32,7 +32,7 @@ from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes
 from factorlib.reflection.brdf import smith, specular
 from factorlib.report.png import data_uri
-from factorlib.solve.weights import nonnegative_minimum
+from factorlib.solve.few_lobes.weights import nonnegative_minimum
 
 LIGHT = Path(__file__).resolve().parents[2] / "data" / "synthetic" / "truth" / "garden_light.exr"
 ROUGHNESS = (0.1, 0.2, 0.35, 0.6, 1.0)

@@ -37,8 +37,8 @@ FOLDER = ROOT / "build" / "bench" / "scale"
 DOCS = ROOT / "docs" / "distributed.md"
 # At most 12 lobes a light, inserted at once; nothing that the set has not (shadows, light between surfaces, tone curves).
 SETTINGS = (
-    "urm.directions=0 solve.lobes=12 solve.insert=12 solve.rounds=1 solve.iterations=5 solve.polish=0 solve.settle=0 solve.sample=400 "
-    "solve.light_prior=none solve.self_shadowing=off solve.interreflection=off solve.tone=off solve.specular=on"
+    "urm.directions=0 solve.solver=few_lobes solve.lobes=12 solve.insert=12 solve.rounds=1 solve.iterations=5 solve.polish=0 solve.settle=0 solve.sample=400 "
+    "solve.specular=on"
 )
 OVERHEAD = ("workers", "scheduler", "run")
 

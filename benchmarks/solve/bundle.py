@@ -1,4 +1,4 @@
-"""The bundle solver on a set: operators, lobe limits and reductions of the observations.
+"""The solver of few lobes on a set: operators, lobe limits and reductions of the observations.
 
 Time starts before the observations are reduced.  Points over time are the accepted ones of
 every round and of the polish; they are scored after the solve, off the clock.
@@ -20,10 +20,11 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Event, Run
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.history import Event
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
 
@@ -35,14 +36,14 @@ class Variant(msgspec.Struct, frozen=True):
 
     operator: str = "network"
     merge_degrees: float = 2.0
-    lobes: int = Bundle().lobes
-    sample: int = Bundle().sample
+    lobes: int = FewLobes().lobes
+    sample: int = FewLobes().sample
 
     @property
     def name(self) -> str:
         default = Variant()
         fields = [f for f in self.__struct_fields__ if getattr(self, f) != getattr(default, f)]
-        return "bundle" + "".join(f", {f.replace('_degrees', '')} {getattr(self, f)}" for f in fields)
+        return "few lobes" + "".join(f", {f.replace('_degrees', '')} {getattr(self, f)}" for f in fields)
 
 
 DEFAULT = Variant()
@@ -81,9 +82,9 @@ def snapshots(spheres: SphereSet, variant: Variant, without: frozenset = frozens
         answer = answer_of(blocks, point.materials, point.lights)
         found.append(Snapshot(clock.taken(), f"{event.phase} {event.round}", event.lobes, answer))
 
-    options = Bundle(lobes=variant.lobes, sample=variant.sample)
+    options = FewLobes(lobes=variant.lobes, sample=variant.sample)
     problem = JointProblem(blocks, operator, spread=threaded)
-    result = solve(problem, from_nothing(len(seen.materials)), Run(options, snapshot=keep)).point
+    result = few_lobes(problem, from_nothing(len(seen.materials)), Run(options, snapshot=keep)).point
     answer = answer_of(blocks, result.materials, result.lights)
     return [*found, Snapshot(clock.taken(), "result", sum(map(len, result.lights)), answer)]
 

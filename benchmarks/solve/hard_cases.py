@@ -1,7 +1,7 @@
 """The hard cases of the joint solve: what is seen, what is true, and how far the answer is from it.
 
 Observations of spheres under lights made of a few lobes, rendered by the operator that solves, with 2 % noise, go the way of
-the stage: `blocks_of_observations`, `solve`, standard errors, what cannot be determined.  `CASES` are worse in one way each.
+the stage: `blocks_of_observations`, `few_lobes`, standard errors, what cannot be determined.  `CASES` are worse in one way each.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import Solution, solve
-from factorlib.solve.history import Run
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations
 
 OPERATOR = reflection_operator("network")
-QUICK = Bundle(light_prior="none", lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
+QUICK = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
 FIVE = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2], [0.3, 0.3, 0.05], [0.25, 0.2, 0.3]]),
     specular=np.array([[0.12, 0.12, 0.12], [0.2, 0.2, 0.2], [0.4, 0.35, 0.3], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]),
@@ -259,11 +260,11 @@ BOUNDS = {
 }
 
 
-def answered(given: Case, bundle: Bundle = QUICK, operator: Operator = OPERATOR) -> Answer:
+def answered(given: Case, options: FewLobes = QUICK, operator: Operator = OPERATOR) -> Answer:
     """The answer, compared with the clean observations."""
-    problem, names = JointProblem(blocks_of_observations(given.seen, Noise(), seed=bundle.seed), operator), given.seen.materials
+    problem, names = JointProblem(blocks_of_observations(given.seen, Noise(), seed=options.seed), operator), given.seen.materials
     said = undetermined_by_observations(names, problem.blocks)
-    solution = solve(problem, from_nothing(len(given.truth)), Run(bundle))
+    solution = few_lobes(problem, from_nothing(len(given.truth)), Run(options))
     found, materials = solution.point, solution.point.materials
     errors = standard_errors(problem.with_loss(solution.loss), found)
     said += undetermined_by_answer(names, problem.blocks, materials, errors.materials)
@@ -272,12 +273,12 @@ def answered(given: Case, bundle: Bundle = QUICK, operator: Operator = OPERATOR)
     return Answer(k, roughness, radiance_error(problem, solution, given.clean), said, solution)
 
 
-def of_random_starts(given: Case, count: int = 10, bundle: Bundle = QUICK) -> list[Answer]:
+def of_random_starts(given: Case, count: int = 10, options: FewLobes = QUICK) -> list[Answer]:
     """From as many starting materials, held-out cells and samples."""
     random = np.random.default_rng(0)
     starts = [(random.uniform(0.15, 0.9), random.uniform(0.05, 0.6)) for _ in range(count)]
     return [
-        answered(given, msgspec.structs.replace(bundle, start_roughness=roughness, start_specular_share=share, seed=seed))
+        answered(given, msgspec.structs.replace(options, start_roughness=roughness, start_specular_share=share, seed=seed))
         for seed, (roughness, share) in enumerate(starts)
     ]
 

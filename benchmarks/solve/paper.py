@@ -1,4 +1,4 @@
-"""The paper's solver on a set, in the same form as the bundle solver's; each point and the result as there.
+"""The paper's solver on a set, in the same form as the solver of few lobes'; each point and the result as there.
 
 `share` of the observations may be taken, the same of every pair: the paper's run is 5 samplings of each, so that its
 time is proportional to their number, and `extrapolated` is the time divided by the share.

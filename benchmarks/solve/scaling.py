@@ -1,4 +1,4 @@
-"""Time of the bundle solver against the filled entries of the matrix: n × n, from 9 entries to 1600.
+"""Time of the solver of few lobes against the filled entries of the matrix: n × n, from 9 entries to 1600.
 
 Small spheres (`PIXELS`² pixels each) rendered by the operator that solves them, under random lights of `LOBES` lobes, so
 that only size grows.  The exponent is the slope of log time over log entries, by least squares.
@@ -20,15 +20,15 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Run
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.observations import Observations
 
 PIXELS, LOBES = 12, 6
 SIDES = (3, 5, 10, 20, 40)
-OPTIONS = Bundle(light_prior="none", lobes=12, insert=6, rounds=3, tolerance=1e-3)
+OPTIONS = FewLobes(lobes=12, insert=6, rounds=3, tolerance=1e-3)
 
 
 def run(sides=SIDES, limit_s: float = 600.0) -> dict:
@@ -44,7 +44,7 @@ def timed(n: int):
     operator = reflection_operator("network")
     joint = JointProblem(problem(n, operator), operator, spread=threaded)
     clock = Clock()
-    solve(joint, from_nothing(n), Run(OPTIONS))
+    few_lobes(joint, from_nothing(n), Run(OPTIONS))
     return clock.taken()
 
 

@@ -17,10 +17,14 @@ from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
 from factorlib.results.solution import Earlier
 from factorlib.results.uncertainty import Uncertainty
-from factorlib.solve.bundle import Solution
 from factorlib.solve.evidence import Evidence
+from factorlib.solve.history import Solution
 
-LOBES_CHOSEN_BY = {"bundle": "held-out loss per round, see convergence.parquet", "paper": "given"}
+LOBES_CHOSEN_BY = {
+    "bundle": "cells of the light prior, of which the brightest split while held-out observations gain",
+    "few_lobes": "held-out loss per round, see convergence.parquet",
+    "paper": "given",
+}
 
 
 class Answer(msgspec.Struct, frozen=True):
@@ -35,7 +39,7 @@ class Answer(msgspec.Struct, frozen=True):
     problem: JointProblem
     solution: Solution
     relative: dict[str, float]
-    solver: Literal["bundle", "paper"]
+    solver: Literal["bundle", "few_lobes", "paper"]
     earlier: Earlier | None = None
 
     def material_table(self, errors: StandardErrors) -> table.MaterialTable:
@@ -72,7 +76,7 @@ class Answer(msgspec.Struct, frozen=True):
         return table.Model(
             solver=self.solver,
             lobes={block.name: len(light) for block, light in zip(blocks, solution.point.lights, strict=True)},
-            lobes_chosen_by="the lattice of the light prior" if solution.light_prior.kept else LOBES_CHOSEN_BY[self.solver],
+            lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase in ("round", "subset")],
             specular={name: not bool(solution.lambertian[m]) for m, name in enumerate(names)},
             specular_chosen_by=_by_name(names, solution.specular),
@@ -80,8 +84,8 @@ class Answer(msgspec.Struct, frozen=True):
             self_shadowing_chosen_by=_losses(solution.shadows),
             interreflection=solution.interreflection.kept,
             interreflection_chosen_by=_losses(solution.interreflection),
-            light_prior=solution.light_prior.kept,
-            light_prior_chosen_by=_losses(solution.light_prior),
+            light_prior=self.solver == "bundle",
+            splitting_chosen_by=[_decision(one) for one in solution.splitting],
             tone=self.tone(),
             tone_chosen_by=_by_name([block.name for block in blocks], solution.tone),
             started_from=self.started_from(),
@@ -113,11 +117,15 @@ def _errors(names: Sequence[str], errors: StandardErrors) -> dict[str, table.Sta
 
 
 def _losses(evidence: Evidence) -> dict[str, float]:
-    """Of the models that were tried."""
-    losses = {"with": evidence.held_out_loss_with, "without": evidence.held_out_loss_without}
-    return {f"held_out_loss_{name}": loss for name, loss in losses.items() if loss is not None}
+    """The held-out losses of the models that were tried, and the margin."""
+    names = ("held_out_loss_with", "held_out_loss_without", "margin")
+    return {name: value for name in names if (value := getattr(evidence, name)) is not None}
+
+
+def _decision(evidence: Evidence) -> table.Decision:
+    return table.Decision(evidence.kept, evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin)
 
 
 def _by_name(names: Sequence[str], evidence: Sequence[Evidence]) -> dict[str, table.Decision]:
     chosen = zip(names, evidence, strict=False)
-    return {name: table.Decision(one.kept, one.held_out_loss_with, one.held_out_loss_without) for name, one in chosen}
+    return {name: _decision(one) for name, one in chosen}

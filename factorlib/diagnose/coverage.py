@@ -1,4 +1,4 @@
-"""Which directions of a light the data constrain: the standard error of its radiance there.
+"""Which directions of a light of few lobes the data constrain: the standard error of its radiance there.
 
 Let a be the whitened response of a lobe of unit weight at direction d, about `WIDTH_DEG` wide, and J the Jacobian by all unknowns
 other than the lobes (materials, exposures, tone curves).  With the light of other directions known, the information about the weight
@@ -21,6 +21,8 @@ from factorlib.light.lobes import lobe_integral
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes
 from factorlib.model.loss import Loss
+from factorlib.solve.few_lobes.jacobian import linearise, places_of
+from factorlib.solve.few_lobes.unknowns import unknowns
 
 PROBE_SHARPNESS = 100.0  # of the lobes whose weight's error is computed
 WIDTH_DEG = float(np.degrees(np.sqrt(2 / PROBE_SHARPNESS)))  # where such a lobe has fallen to 1/e: 8°
@@ -69,10 +71,10 @@ def _jacobians(illumination: Illumination, loss: Loss) -> list[Float[np.ndarray,
 
     Materials that the block does not show have no columns.
     """
-    light, unknowns = illumination.light, illumination.unknowns
-    first = len(unknowns) - light.unknowns
-    whole = [np.zeros((len(illumination.block), len(unknowns))) for _ in range(3)]
-    for part in illumination.linearise(msgspec.structs.replace(loss, robust_scale=1e6)):
-        whole[part.channel][part.rows, np.searchsorted(unknowns, part.places)] = part.jacobian.numpy()
-    others = np.r_[0:first, first + 6 * len(light) : len(unknowns)]
+    light, every = illumination.light, places_of(illumination)
+    first = len(every) - unknowns(light)
+    whole = [np.zeros((len(illumination.block), len(every))) for _ in range(3)]
+    for part in linearise(illumination, msgspec.structs.replace(loss, robust_scale=1e6)):
+        whole[part.channel][part.rows, np.searchsorted(every, part.places)] = part.jacobian.numpy()
+    others = np.r_[0:first, first + 6 * len(light) : len(every)]
     return [jacobian[:, others] for jacobian in whole]

@@ -1,4 +1,4 @@
-"""Standard errors of the materials, honest about what the model cannot say, in a fixed gauge.
+"""Standard errors of materials under lights of few lobes, honest about what the model cannot say, in a fixed gauge.
 
 With all lights eliminated, S is the materials' information and s_k the score of cluster k of observations: its part of
 the gradient, less what the lights take up of it.  Were residuals independent noise, the covariance would be σ² S⁻¹.
@@ -35,7 +35,7 @@ from scipy.stats import t as student_t
 
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import ROUGHNESS
-from factorlib.model.cells import clusters_of
+from factorlib.model.clusters import clusters_of
 from factorlib.model.components import connected_components
 from factorlib.model.gauge import is_free
 from factorlib.model.illumination import Illumination
@@ -44,9 +44,9 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
-from factorlib.solve.arrow import ArrowSystem
-from factorlib.solve.cholesky import positive_definite_inverse
-from factorlib.solve.normal_equations import NormalEquations, normal_equations
+from factorlib.solve.few_lobes.arrow import ArrowSystem
+from factorlib.solve.few_lobes.normal_equations import NormalEquations, normal_equations
+from factorlib.solve.marginal import positive_definite_inverse
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 ABSOLUTE = "; in components with interreflection nothing is held fixed"

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 NO_TRUTH = "the dataset names no truth"
 
 
-SECTIONS = ("materials", "relighting", "light", "normals", "poses")
+SECTIONS = ("materials", "relighting", "relit_set", "light", "normals", "poses")
 MISSING = {
     "materials": "the truth says nothing about materials that were seen",
     "relighting": "the truth lacks materials or lights",
+    "relit_set": "the truth lacks materials or lights",
     "light": "the truth names no illumination of this set",
     "normals": "the truth has no normals for these photos",
     "poses": "the truth has no poses of these objects",
@@ -20,7 +21,7 @@ MISSING = {
 def reasons_of(sections: dict[str, object], has_truth: bool) -> dict[str, str]:
     """Why each section that is None is.
 
-    >>> reasons_of({"materials": None, "relighting": 1, "light": 1, "normals": 1, "poses": 1}, False)
+    >>> reasons_of({"materials": None, "relighting": 1, "relit_set": 1, "light": 1, "normals": 1, "poses": 1}, False)
     {'materials': 'the dataset names no truth'}
     """
     return {name: MISSING[name] if has_truth else NO_TRUTH for name in SECTIONS if not sections[name]}

@@ -85,10 +85,19 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return np.zeros((3, len(directions)))
         return np.array(self.profile) @ legendre(directions @ up).T
 
-    def precision(self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)) -> Float[np.ndarray, "3p 3p"]:
-        """Inverse covariance of u: log R of all `directions`, then log G, then log B: Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k²; factors: s_k² of (4)."""
-        of_y = enumerate(zip(MIX, factors, strict=True))
-        return sum(np.kron(np.outer(row, row), _inverse(self.covariance(k, directions)) / factor) for k, (row, factor) in of_y)
+    def precision(
+        self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)
+    ) -> tuple[Float[np.ndarray, "3p 3p"], float]:
+        """Inverse covariance Q of u, and log det Q, up to what does not depend on `factors`, the s_k² of (4).
+
+        u is log R of all `directions`, then log G, then log B:  Q = Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k²
+        """
+        precision, log_determinant, p = 0.0, 0.0, len(directions)
+        for k, (row, factor) in enumerate(zip(MIX, factors, strict=True)):
+            inverse, log_of_inverse = _inverse(self.covariance(k, directions))
+            precision = precision + np.kron(np.outer(row, row), inverse / factor)
+            log_determinant += log_of_inverse - p * np.log(factor)
+        return precision, float(log_determinant)
 
     def likeliest_factors(
         self, directions: Float[np.ndarray, "p 3"], log_radiance: Float[np.ndarray, "3 p"], covariance: Float[np.ndarray, "3p 3p"]
@@ -97,7 +106,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         p, factors = len(directions), []
         by_channel = covariance.reshape(3, p, 3, p)
         for k, row in enumerate(MIX):
-            inverse, y = _inverse(self.covariance(k, directions)), row @ log_radiance
+            inverse, y = _inverse(self.covariance(k, directions))[0], row @ log_radiance
             spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
             factors.append(float((self.freedom[k] + y @ inverse @ y + np.sum(inverse * spread)) / (self.freedom[k] + p)))
         return factors
@@ -118,10 +127,10 @@ def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
     return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
 
 
-def _inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Of a positive definite matrix, exactly symmetric."""
+def _inverse(matrix: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], float]:
+    """The inverse of a positive definite matrix, exactly symmetric, and the log of the inverse's determinant."""
     inverse = np.linalg.inv(matrix)
-    return (inverse + inverse.T) / 2
+    return (inverse + inverse.T) / 2, -float(np.linalg.slogdet(matrix)[1])
 
 
 def read_light_prior(path: Path | None = None) -> LightPrior:

@@ -2,9 +2,9 @@
 
     problem       JointProblem: the observations, the operator and the loss; it answers every question about a point
     point         Point: the unknowns, which are materials and lights
-    illumination  one illumination at a point: radiance, residuals, responses of lobes
-    jacobian      the derivatives of radiance by all unknowns
-    responses     what observations reflect of lobes of weight one; the only caller of the reflection operator
+    illumination  one illumination at a point: radiance, residuals, and their derivatives by all unknowns
+    lights        a light: log radiance on cells of the sphere, which may split
+    responses     what observations reflect of lobes of weight one; the only caller of the reflection operator;  reflected: tabulated
     observed      observations, grouped by illumination, as blocks
 
 `factorlib.solve` finds the best point.

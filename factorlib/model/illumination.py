@@ -1,70 +1,117 @@
-"""One illumination of the joint problem at a point: what its photos show, and what the model says they should.
+"""One illumination of the joint problem at a point: what its photos show, what the model says they should, and all derivatives.
 
-    predicted  y_ic = τ_i(e_i Σ_p w_pc B_ipc + G_ic),   B_ipc = k_d,c D_ip + k_s,c S_ip,   G_ic = k_d,c G_d,ic + k_s,c G_s,ic,   τ the tone curve
+    linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),       w = PEAK exp(u)
+    predicted  y_ic = τ_i(ℓ_ic), τ the photo's tone curve
     residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 
-D and S are the responses of `factorlib.model.responses`, G is what other surfaces send (`factorlib.model.interreflection`).  These two modules are where a new physical effect is added.
+D and S are the responses of `factorlib.model.responses`, e is the photo's exposure, G what other surfaces send
+(`factorlib.model.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one and the same sum.
+
+Unknowns: log k_d, log k_s (RGB each) and roughness of a material; u of every cell and channel; log exposures and log tone exponents.  A
+channel's residuals depend on the cells of that channel alone, so the Jacobian is a dense block a channel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
+from factorlib.images.tone import by_log_exponent
 from factorlib.model.blocks import Block
-from factorlib.model.jacobian import Linearised, linearised
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.responses import Responses, Rows, bounced_of, material_slices, radiance_of, responses, unit_values
-from factorlib.model.tone import slope_at, toned
+from factorlib.model.reflected import Reflected, Reflections
+from factorlib.model.responses import CHUNK, Rows, diffuse_response, specular_response
+from factorlib.model.tone import exponents, slope_at, toned
 from factorlib.reflection.operator import Operator
 
 
+class Shown(NamedTuple):
+    """What n observations should show.
+
+    diffuse, specular   the factors of k_d and k_s in ℓ;  radiance  y
+    responses           material, its rows, its responses; empty where the operator itself was asked
+    """
+
+    diffuse: Float[np.ndarray, "n 3"]
+    specular: Float[np.ndarray, "n 3"]
+    linear: Float[np.ndarray, "n 3"]
+    radiance: Float[np.ndarray, "n 3"]
+    responses: list[tuple[int, slice, Reflected]]
+
+    def residual_of(self, block: Block) -> Float[np.ndarray, "n 3"]:
+        """r of the block that these are the observations of."""
+        return block.residuals(self.radiance)
+
+
+class Linearised(NamedTuple):
+    """One channel of the observations of one material, whitened, weighted by the robust loss and divided by √T; float32.
+
+    diffuse, specular   the two parts of ∂r/∂u of the channel's cells;  by_roughness  ∂²r/∂u ∂roughness
+    by_material         ∂r by log k_d, log k_s and roughness, the unknowns `places` of the materials
+    by_photo            ∂r by the log exposures of all photos but the first, then by the log tone exponents
+    """
+
+    channel: int
+    rows: slice
+    places: Int[np.ndarray, "3"]
+    diffuse: Float[np.ndarray, "n p"]
+    specular: Float[np.ndarray, "n p"]
+    by_roughness: Float[np.ndarray, "n p"]
+    by_material: Float[np.ndarray, "n 3"]
+    by_photo: Float[np.ndarray, "n q"]
+    residual: Float[np.ndarray, " n"]
+
+
 class Illumination(msgspec.Struct, frozen=True):
-    """The observations in one light, that light, the materials and the reflection operator; radiance is in the block's unit."""
+    """The observations in one light, that light, the materials and the reflection operator; radiance is in the block's unit.
+
+    table: the tabulated responses of this block to the cells of this light; None: the operator itself is asked
+    """
 
     block: Block
     light: Light
     materials: Materials
     operator: Operator
+    table: Reflections | None = None
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
         """The factor of each observation's photo on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
-    def fitted(self) -> Illumination:
-        """With the observations alone that are not held out."""
-        return msgspec.structs.replace(self, block=self.block.fitted())
+    def shown(self) -> Shown:
+        """Radiance, and what it is made of."""
+        block, kd, ks = self.block, self.materials.diffuse, self.materials.specular
+        diffuse, specular, responses = self._lit()
+        diffuse, specular = diffuse * self.exposure, specular * self.exposure
+        if block.bounced is not None:
+            diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
+        linear = kd[block.material] * diffuse + ks[block.material] * specular
+        return Shown(diffuse, specular, linear, toned(linear, self.light, block.photo), responses)
 
-    def with_light(self, light: Light) -> Illumination:
-        """The same observations and materials in another light."""
-        return msgspec.structs.replace(self, light=light)
-
-    @property
-    def unknowns(self) -> Int[np.ndarray, " k+l"]:
-        """Numbers of the unknowns on which its radiance depends, ascending: 7 of each material that it shows, then the light's l."""
-        shown = 7 * np.unique(self.block.material)[:, None] + np.arange(7)
-        return np.concatenate([shown.reshape(-1), 7 * len(self.materials) + np.arange(self.light.unknowns)])
-
-    def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Σ_p D w and Σ_p S w at `rows`: radiance of a material of that roughness with k_d = 1 and with k_s = 1, before exposure, without bounces."""
-        parts = unit_values(self.block, rows, self.light.unit_lobes, roughness, self.operator)
-        diffuse, specular = (part @ self.light.weight for part in parts)
-        return diffuse, specular
+    def _lit(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], list[tuple[int, slice, Reflected]]]:
+        """Σ_p D w and Σ_p S w at all observations."""
+        weight, roughness, responses = self.light.weight, self.materials.roughness, []
+        diffuse, specular = np.zeros((len(self.block), 3)), np.zeros((len(self.block), 3))
+        if self.table is None:
+            for m, rows in material_slices(self.block):
+                diffuse[rows], specular[rows] = self.lit(rows, float(roughness[m]))
+            return diffuse, specular, responses
+        for m in np.unique(self.block.material).tolist():
+            rows, of = self.table.rows(m), self.table.at(m, float(roughness[m]))
+            diffuse[rows], specular[rows] = of.diffuse @ weight.astype(np.float32), of.specular @ weight.astype(np.float32)
+            responses.append((m, rows, of))
+        return diffuse, specular, responses
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """y: what every observation should show."""
-        linear, exposure = np.zeros_like(self.block.radiance), self.exposure
-        for m, rows in material_slices(self.block):
-            parts = self.lit(rows, float(self.materials.roughness[m]))
-            linear[rows] = radiance_of(exposure[rows], self.materials.diffuse[m], self.materials.specular[m], *parts)
-            linear[rows] += bounced_of(self.block, rows, self.materials, m)
-        return toned(linear, self.light, self.block.photo)
+        return self.shown().radiance
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:
         """r, in σ of the noise model."""
@@ -74,32 +121,65 @@ class Illumination(msgspec.Struct, frozen=True):
         """Robust loss of every observation, mean over its channels."""
         return loss.of_residuals(self.residuals()).mean(1)
 
-    def fit_loss(self, loss: Loss) -> float:
-        """The loss of the observations that are not held out, with priors."""
-        residual = self.residuals()[~self.block.held_out]
-        return float(np.sum(loss.of_residuals(residual))) + loss.of_light(self.block, self.light).value
-
-    def responses(self) -> Iterator[Responses]:
-        """D and S of all observations, with derivatives, in chunks of rows."""
-        return responses(self.block, self.light, self.materials, self.operator)
-
-    def linearise(self, loss: Loss, known: Iterable[Responses] | None = None) -> Iterator[Linearised]:
-        """Whitened residuals and their Jacobian, in chunks of rows and channel by channel; known: `responses`, if computed before."""
-        for some in self.responses() if known is None else known:
-            yield from linearised(self.block, self.light, self.materials, some, loss)
+    def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Σ_p D w and Σ_p S w at `rows`, were their material of that roughness: without exposure and bounces."""
+        lobes, weight = self.light.unit_lobes, self.light.weight
+        diffuse = diffuse_response(self.block, rows, lobes, self.operator)
+        return diffuse @ weight, specular_response(self.block, rows, lobes, roughness, self.operator) @ weight
 
     def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""
-        block, materials = self.block, self.materials
-        diffuse = np.empty((len(rows), len(lobes)))
-        specular = np.empty_like(diffuse)
-        for m in np.unique(block.material[rows]):
+        block, materials, response = self.block, self.materials, np.empty((2, len(rows), len(lobes)))
+        for m in np.unique(block.material[rows]).tolist():
             of = block.material[rows] == m
-            diffuse[of], specular[of] = unit_values(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
-        scale = block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows])
-        scale *= self.exposure[rows]
-        material = block.material[rows]
-        return np.stack([
-            scale[:, c, None] * (materials.diffuse[material, c, None] * diffuse + materials.specular[material, c, None] * specular)
-            for c in range(3)
-        ])  # fmt: skip
+            response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
+            response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
+        scale = block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows]) * self.exposure[rows]
+        kd, ks = materials.diffuse[block.material[rows]], materials.specular[block.material[rows]]
+        return np.stack([scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)])
+
+    def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
+        """Residuals and derivatives at `shown`, which is that of this illumination with its table; held-out observations have weight 0."""
+        block, light, materials = self.block, self.light, self.materials
+        residual = block.residuals(shown.radiance)
+        counts = ~block.held_out[:, None] & ~(block.clipped & (residual >= 0))
+        pull = np.sqrt(counts * loss.trust(residual) / temperature)
+        scale = pull * block.precision
+        rising = scale * slope_at(shown.radiance, light, block.photo)  # ∂r/∂ℓ
+        by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), exponents(light, block.photo)) if len(light.log_tone) else None
+        lit = shown.linear
+        if block.bounced is not None:
+            sent = materials.diffuse[block.material] * block.bounced[:, :3] + materials.specular[block.material] * block.bounced[:, 3:]
+            lit = lit - sent
+        photos = np.eye(len(light.log_exposure))[block.photo]
+        for m, rows, of in shown.responses:
+            for c in range(3):
+                kd, ks = np.float32(materials.diffuse[m, c]), np.float32(materials.specular[m, c])
+                bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
+                by_roughness = of.by_roughness * (ks * bright)
+                own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
+                by_photo = photos[rows, 1:] * (lit[rows, c] * rising[rows, c])[:, None]
+                if by_tone is not None:
+                    by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
+                yield Linearised(
+                    c,
+                    rows,
+                    7 * m + np.array([c, 3 + c, 6]),
+                    of.diffuse * (kd * bright),
+                    of.specular * (ks * bright),
+                    by_roughness,
+                    np.column_stack([*own, by_roughness.sum(1, dtype=float)]).astype(np.float32),
+                    by_photo.astype(np.float32),
+                    (residual * pull)[rows, c].astype(np.float32),
+                )
+
+
+def material_slices(block: Block) -> list[tuple[int, slice]]:
+    """(material, rows) of runs of one material, of at most CHUNK rows."""
+    starts = np.flatnonzero(np.diff(block.material, prepend=-1))
+    ends = np.append(starts, len(block))[1:]
+    return [
+        (int(block.material[a]), slice(i, min(i + CHUNK, b)))
+        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
+        for i in range(a, b, CHUNK)
+    ]

@@ -1,24 +1,26 @@
-"""A light: its lobes, and the exposures and tone curves of its photos, with their vector of unknowns.
+"""A light: log radiance on cells of the sphere, and the exposures and tone curves of its photos.
 
-A lobe's unknowns are chosen so that they hardly depend on each other: its energy e = w/λ', with λ' = λ/(1 − e^{−2λ}), instead of
-its peak w, and
+A cell is a lobe w·exp(λ(ω·z − 1)), half as wide as its neighbours are apart, so that equal weights make a nearly constant light:
 
-    s = −log(1/λ + b),      b = 2 min α²
+    λ = 1 / (WIDTH · spacing)²,      w = PEAK · exp(u),      PEAK = 1 / (2π WIDTH²)                                  (1)
 
-instead of log λ.  A reflection widens a lobe's variance 1/λ by about b, so photographs show the sum 1/λ + b.  A rougher surface under
-a sharper lobe looks the same; in s such a change is a straight line, in log λ a curve that only small steps can follow.
+With n cells on the sphere the spacing is √(4π/n), and n/(2λ) = 2π WIDTH² of them overlap in any direction.  That number does not depend on
+n, so u is the log radiance of a cell of any size, and a cell that splits in four (λ four times as large, each four a quarter of a spacing to
+either side) keeps the light as it is but for its own blur.
 """
 
 from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.lobes import lobe_integral
-from factorlib.model.bounds import SHARPNESS, TONE, sharpest_resolved
 
-MOST_TURN, MOST_S, MOST_EXPOSURE, MOST_TONE = 0.3, 1.0, 1.0, 0.2  # largest change of an unknown in one step
+WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
+PEAK = 1 / (2 * np.pi * WIDTH**2)
+DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 
 
 class UnitLobes(msgspec.Struct, frozen=True):
@@ -32,6 +34,11 @@ class UnitLobes(msgspec.Struct, frozen=True):
 
     def __len__(self) -> int:
         return len(self.sharpness)
+
+
+def even_cells(count: int) -> UnitLobes:
+    """`count` cells of one size, equation (1)."""
+    return UnitLobes(fibonacci_sphere(count), np.full(count, count / (4 * np.pi * WIDTH**2)))
 
 
 class Light(msgspec.Struct, frozen=True):
@@ -60,60 +67,42 @@ class Light(msgspec.Struct, frozen=True):
         return UnitLobes(self.axis, self.sharpness)
 
     @property
-    def unknowns(self) -> int:
-        """How many unknowns the light has: the length of a step."""
-        return 6 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
-
-    @property
-    def unit_energy(self) -> Float[np.ndarray, " p"]:
-        """1/λ': energy of a lobe of unit weight over 2π, steradians."""
-        return lobe_integral(self.sharpness) / (2 * np.pi)
+    def log_radiance(self) -> Float[np.ndarray, "3 p"]:
+        """u of each cell, channel by channel: equation (1)."""
+        return np.log(np.maximum(self.weight.T, DARKEST) / PEAK)
 
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
-        """e: energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * self.unit_energy[:, None]
+        """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
+        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
 
-    def tangents(self) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-        """Two unit vectors that span each axis' tangent plane."""
-        helper = np.where(np.abs(self.axis[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-        first = np.cross(self.axis, helper)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return first, np.cross(self.axis, first)
+    @property
+    def unknowns(self) -> int:
+        """The number of unknowns that `moved` takes: log radiances, exposures of all photos but the first, tone exponents."""
+        return 3 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
 
-    def sharpness_slopes(self, blur: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        """∂ log λ/∂s and, at constant energy, ∂ log w/∂s;  blur: b."""
-        by_s = 1 + blur * self.sharpness
-        doubled = np.maximum(2 * self.sharpness, 1e-9)
-        return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
+    def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
+        """The same cells with other radiances."""
+        return msgspec.structs.replace(self, weight=PEAK * np.exp(u.T))
 
-    def moved(self, step: Float[np.ndarray, " l"], blur: float) -> Light:
-        """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
-        p = len(self)
-        by = step[: 6 * p].reshape(6, p)
-        first, second = self.tangents()
-        turn = np.clip(by[:2], -MOST_TURN, MOST_TURN)
-        axis = self.axis + turn[0][:, None] * first + turn[1][:, None] * second
-        variance = (1 / self.sharpness + blur) * np.exp(-np.clip(by[2], -MOST_S, MOST_S)) - blur
-        log_sharpness = -np.log(np.clip(variance, 1 / sharpest_resolved(blur), 1 / SHARPNESS[0]))
-        by_exposure, by_tone = np.split(step[6 * p :], [len(self.log_exposure) - 1])
-        return Light(
-            axis / np.linalg.norm(axis, axis=1, keepdims=True),
-            log_sharpness,
-            np.maximum(self.energy + by[3:].T, 0.0) / (lobe_integral(np.exp(log_sharpness))[:, None] / (2 * np.pi)),
-            self.log_exposure + np.concatenate([[0.0], np.clip(by_exposure, -MOST_EXPOSURE, MOST_EXPOSURE)]),
-            np.clip(self.log_tone + np.clip(by_tone, -MOST_TONE, MOST_TONE), *np.log(TONE)),
-        )
-
-    def take(self, rows: np.ndarray | slice) -> Light:
-        """The lobes `rows` alone, by numbers or a mask."""
-        return msgspec.structs.replace(self, axis=self.axis[rows], log_sharpness=self.log_sharpness[rows], weight=self.weight[rows])
-
-    def joined(self, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
-        """With q further lobes appended."""
+    def split(self, which: Bool[np.ndarray, " p"]) -> Light:
+        """The light with each cell of `which` replaced by four of its radiance, which follow all others: see the head of the module."""
+        axis, sharpness = self.axis[which], self.sharpness[which]
+        first, second = tangents(axis)
+        aside = (0.25 / (WIDTH * np.sqrt(sharpness)))[:, None]
+        corners = [axis + aside * (a * first + b * second) for a in (-1, 1) for b in (-1, 1)]
+        corners = np.vstack([corner / np.linalg.norm(corner, axis=1, keepdims=True) for corner in corners])
         return msgspec.structs.replace(
             self,
-            axis=np.vstack([self.axis, lobes.axis]),
-            log_sharpness=np.concatenate([self.log_sharpness, np.log(lobes.sharpness)]),
-            weight=np.vstack([self.weight, weight]),
+            axis=np.vstack([self.axis[~which], corners]),
+            log_sharpness=np.concatenate([self.log_sharpness[~which], np.tile(self.log_sharpness[which] + np.log(4), 4)]),
+            weight=np.vstack([self.weight[~which], np.tile(self.weight[which], (4, 1))]),
         )
+
+
+def tangents(axis: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+    """Two unit vectors that span the tangent plane of each unit `axis`."""
+    helper = np.where(np.abs(axis[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(axis, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)

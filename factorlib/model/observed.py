@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.model.blocks import Block
-from factorlib.model.cells import HELD_OUT_CELL, held_out_by_cells
+from factorlib.model.clusters import HELD_OUT_CELL, held_out_by_cells
 from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.urm.observations import Observations

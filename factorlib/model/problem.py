@@ -1,15 +1,15 @@
 """The joint problem: what is known about materials and lights, and every question that can be asked about a point.
 
     problem = JointProblem(blocks, operator, loss, spread)      point = Point(materials, lights)
-    problem.radiance(point)   .residuals(point)   .linearise(point)   .held_out_loss(point)
+    problem.radiance(point)   .residuals(point)   .held_out_loss(point)
 
-Every observation depends on one material (7 unknowns) and one light (6 unknowns a lobe).  So questions are answered illumination by
+Every observation depends on one material (7 unknowns) and one light (3 unknowns a cell).  So questions are answered illumination by
 illumination (`factorlib.model.illumination`), and `spread` may do that on several workers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import msgspec
 import numpy as np
@@ -17,7 +17,6 @@ from jaxtyping import Float
 
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
-from factorlib.model.jacobian import Linearised
 from factorlib.model.loss import Loss
 from factorlib.model.point import Point
 from factorlib.reflection.operator import Operator
@@ -45,14 +44,6 @@ class JointProblem(msgspec.Struct, frozen=True):
     def residuals(self, point: Point) -> list[Float[np.ndarray, "n 3"]]:
         """Whitened residuals, block by block, one-sided where clipped; held-out observations too."""
         return [illumination.residuals() for illumination in self.illuminations(point)]
-
-    def linearise(self, point: Point) -> list[Iterator[Linearised]]:
-        """Residuals and Jacobian of the observations that are fitted, block by block, in chunks of rows and channel by channel."""
-        return [illumination.linearise(self.loss) for illumination in self.illuminations(point)]
-
-    def fit_loss(self, point: Point) -> float:
-        """The loss of the observations that are not held out, with priors."""
-        return sum(illumination.fit_loss(self.loss) for illumination in self.illuminations(point))
 
     def held_out_losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
         """Robust loss of each held-out observation, block by block; if no observation at all is held out, of each observation."""
@@ -86,17 +77,18 @@ class JointProblem(msgspec.Struct, frozen=True):
         blocks = [block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)]
         return msgspec.structs.replace(self, blocks=blocks)
 
+    def fitted(self) -> JointProblem:
+        """The observations that are not held out."""
+        return msgspec.structs.replace(self, blocks=[block.fitted() for block in self.blocks])
+
     def restricted(self, lights: Sequence[int]) -> JointProblem:
         """The blocks of numbers `lights` alone."""
         return msgspec.structs.replace(self, blocks=[self.blocks[k] for k in lights])
 
-    def without_shadows(self) -> JointProblem:
-        """The same observations, as if meshes cast no shadows."""
-        return msgspec.structs.replace(self, blocks=[block.without_shadows() for block in self.blocks])
-
-    def without_bounces(self) -> JointProblem:
-        """The same observations, as if surfaces sent no light to each other."""
-        return msgspec.structs.replace(self, blocks=[block.without_bounces() for block in self.blocks])
+    def with_effects(self, shadows: bool, bounces: bool) -> JointProblem:
+        """The same observations, as if meshes cast no shadows, or as if what hides the light were black."""
+        blocks = self.blocks if bounces else [block.without_bounces() for block in self.blocks]
+        return msgspec.structs.replace(self, blocks=blocks if shadows else [block.without_shadows() for block in blocks])
 
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""

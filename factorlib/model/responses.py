@@ -14,19 +14,16 @@ and beside it what other surfaces send there, which the photo itself shows, so w
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TypeVar
 
-import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.model.blocks import Block
-from factorlib.model.lights import Light, UnitLobes
-from factorlib.model.materials import Materials
-from factorlib.model.shadowing import Turning, shadowed, shadowed_response
+from factorlib.model.lights import UnitLobes
+from factorlib.model.shadowing import shadowed_diffuse, shadowed_specular
 from factorlib.reflection.operator import Operator
 
 CHUNK = 4096  # observations whose responses are computed at once
@@ -39,12 +36,23 @@ def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular
     return exposure * (diffuse * by_diffuse + specular * by_specular)
 
 
-def bounced_of(block: Block, rows: Rows, materials: Materials, m: int) -> Float[np.ndarray, "n 3"] | float:
-    """Equation (2) at `rows`, which show material m; 0 for a block without bounces."""
-    if block.bounced is None:
-        return 0.0
-    sent = block.bounced[rows]
-    return materials.diffuse[m] * sent[:, :3] + materials.specular[m] * sent[:, 3:]
+def diffuse_response(
+    block: Block, rows: Rows, lobes: UnitLobes, operator: Operator
+) -> Float[np.ndarray, "n p"]:
+    """D at `rows`; float64."""
+    sharpness, nz = (_tensor(v, operator) for v in (lobes.sharpness, block.normal[rows] @ lobes.axis.T))
+    with torch.no_grad():
+        return shadowed_diffuse(operator.diffuse(sharpness, nz), block, rows, lobes).double().numpy()
+
+
+def specular_response(
+    block: Block, rows: Rows, lobes: UnitLobes, roughness: float, operator: Operator
+) -> Float[np.ndarray, "n p"]:
+    """S at `rows`, for a material of that roughness; float64."""
+    no, nz, oz = cosines(block.normal[rows], block.view[rows], lobes.axis)
+    inputs = (_tensor(v, operator) for v in (np.float64(roughness), lobes.sharpness, no, nz, oz))
+    with torch.no_grad():
+        return shadowed_specular(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
 
 
 def cosines(normal: A, view: A, axis: A) -> tuple[A, A, A]:
@@ -52,59 +60,8 @@ def cosines(normal: A, view: A, axis: A) -> tuple[A, A, A]:
     return (normal * view).sum(1), normal @ axis.T, view @ axis.T
 
 
-def operator_inputs(block: Block, rows: Rows, lobes: UnitLobes, roughness: float, dtype: torch.dtype) -> list[Tensor]:
-    """roughness, λ, n·o, n·z, o·z of lobes at the observations `rows`, as an operator of that `dtype` takes them."""
-    inputs = np.float64(roughness), lobes.sharpness, *cosines(block.normal[rows], block.view[rows], lobes.axis)
-    return [torch.as_tensor(value).to(dtype) for value in inputs]
-
-
-def unit_values(
-    block: Block, rows: Rows, lobes: UnitLobes, roughness: float, operator: Operator
-) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, "n p"]]:
-    """D and S at `rows`, for a material of that roughness; float64."""
-    roughness_, sharpness, no, nz, oz = operator_inputs(block, rows, lobes, roughness, operator.dtype)
-    with torch.no_grad():
-        parts = operator.diffuse(sharpness, nz), operator.specular(roughness_, sharpness, no, nz, oz)
-        diffuse, specular = shadowed(parts, block, rows, lobes, roughness)
-    return diffuse.double().numpy(), specular.double().numpy()
-
-
-class Responses(msgspec.Struct, frozen=True):
-    """What `rows` of one material reflect of each lobe of weight one, with shadows and exposure, and the derivatives.
-
-    parts    the fields of the operator's Response [n, p]
-    turning  how shadows alone change them as lobes turn; None without shadows
-    """
-
-    material: int
-    rows: slice
-    parts: dict[str, Float[Tensor, "n p"]]
-    turning: Turning | None
-
-    def basis(self, materials: Materials, c: int) -> Float[Tensor, "n p"]:
-        """Radiance in channel c by the lobes' weights there: k_d D + k_s S, exposed."""
-        return materials.diffuse[self.material, c] * self.parts["diffuse"] + materials.specular[self.material, c] * self.parts["specular"]
-
-
-def responses(block: Block, light: Light, materials: Materials, operator: Operator) -> Iterator[Responses]:
-    """The responses of all observations of a block, in chunks of rows."""
-    for m, rows in material_slices(block):
-        roughness = float(materials.roughness[m])
-        exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
-        response = operator.response(*operator_inputs(block, rows, light.unit_lobes, roughness, operator.dtype))
-        parts = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
-        yield Responses(m, rows, *shadowed_response(parts, block, rows, light, roughness))
-
-
-def material_slices(block: Block) -> list[tuple[int, slice]]:
-    """(material, rows) of runs of one material, of at most CHUNK rows."""
-    starts = np.flatnonzero(np.diff(block.material, prepend=-1))
-    ends = np.append(starts, len(block))[1:]
-    return [
-        (int(block.material[a]), slice(i, min(i + CHUNK, b)))
-        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
-        for i in range(a, b, CHUNK)
-    ]
+def _tensor(values: np.ndarray, operator: Operator) -> Tensor:
+    return torch.as_tensor(values).to(operator.dtype)
 
 
 class UnitReflection(torch.autograd.Function):

@@ -15,21 +15,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from factorlib.light.visibility import MovingLobes, Seen, cosine_weights, highlight_weights, kernel, seen, seen_share
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.model.blocks import Block
-from factorlib.model.lights import Light, UnitLobes
+from factorlib.model.lights import UnitLobes
 
 TOGETHER = 512  # observations whose visibility a processor's cache holds
 
 
-class Turning(msgspec.Struct, frozen=True):
-    """Derivatives [n, p] of the responses by turns of their lobes toward the two tangents, through visibility alone."""
-
-    diffuse: tuple[Tensor, Tensor]
-    specular: tuple[Tensor, Tensor]
-
-
-class Rows(msgspec.Struct, frozen=True):
+class Shadowed(msgspec.Struct, frozen=True):
     """Observations of one photo from which something is hidden: their places among the rows asked for, and what they see (0 to 1)."""
 
     places: Tensor
@@ -39,7 +32,7 @@ class Rows(msgspec.Struct, frozen=True):
     directions: Float[Tensor, "k 3"]
 
 
-def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, " n"]) -> Iterator[Rows]:
+def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, " n"]) -> Iterator[Shadowed]:
     """Those of `rows` from which something is hidden, photo by photo, at most TOGETHER at once."""
     visibility, photo = block.visibility[rows], block.photo[rows]
     hidden = (visibility < 255).any(1)
@@ -47,51 +40,32 @@ def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, " n"]) -> Iterator
         directions, places = torch.from_numpy(block.directions[k]).float(), np.flatnonzero(hidden & (photo == k))
         for some in np.split(places, range(TOGETHER, len(places), TOGETHER)):
             normal, view = (torch.from_numpy(v[rows][some]).float() for v in (block.normal, block.view))
-            yield Rows(torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions)
+            yield Shadowed(torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions)
 
 
-def shadowed(
-    parts: tuple[Tensor, Tensor], block: Block, rows: slice | Int[np.ndarray, " n"], lobes: UnitLobes, roughness: float
-) -> tuple[Tensor, Tensor]:
-    """The responses `parts` = (diffuse, specular) [n, p] to lobes at `rows`, with shadows."""
+def shadowed_diffuse(response: Tensor, block: Block, rows: slice | Int[np.ndarray, " n"], lobes: UnitLobes) -> Tensor:
+    """The diffuse response [n, p] to lobes at `rows`, with shadows."""
     if block.visibility is None:
-        return parts
-    diffuse, specular = (part.clone() for part in parts)
+        return response
+    response = response.clone()
     axis, sharpness = (torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness))
     for some in shadowed_rows(block, rows):
-        light = kernel(some.directions, axis, sharpness)
-        glossy, _ = highlight_weights(some.normal, some.view, some.directions, float(roughness))
-        diffuse[some.places] *= seen_share(some.visibility, cosine_weights(some.normal, some.directions), light).to(diffuse.dtype)
-        specular[some.places] *= seen_share(some.visibility, glossy, light).to(specular.dtype)
-    return diffuse, specular
+        weights = cosine_weights(some.normal, some.directions)
+        share = seen_share(some.visibility, weights, kernel(some.directions, axis, sharpness))
+        response[some.places] *= share.to(response.dtype)
+    return response
 
 
-def shadowed_response(
-    r: dict[str, Tensor], block: Block, rows: slice, light: Light, roughness: float
-) -> tuple[dict[str, Tensor], Turning | None]:
-    """The fields [n, p] of an operator's Response with shadows, by the product rule, and how shadows change as lobes turn."""
+def shadowed_specular(
+    response: Tensor, block: Block, rows: slice | Int[np.ndarray, " n"], lobes: UnitLobes, roughness: float
+) -> Tensor:
+    """The specular response [n, p] to lobes at `rows`, for a material of that roughness, with shadows."""
     if block.visibility is None:
-        return r, None
-    r = {name: value.clone() for name, value in r.items()}
-    turning = Turning(*(tuple(torch.zeros_like(r["diffuse"]) for _ in range(2)) for _ in range(2)))
-    axis, sharpness, *tangents = (torch.from_numpy(v).float() for v in (light.axis, light.sharpness, *light.tangents()))
-    lobes = MovingLobes(axis, sharpness, tuple(tangents))
+        return response
+    response = response.clone()
+    axis, sharpness = (torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness))
     for some in shadowed_rows(block, rows):
-        glossy, by_roughness = highlight_weights(some.normal, some.view, some.directions, float(roughness))
-        cosine = cosine_weights(some.normal, some.directions)
-        for part, weights, rough in (("diffuse", cosine, None), ("specular", glossy, by_roughness)):
-            share = seen(some.visibility, weights, some.directions, lobes, rough)
-            _multiply(r, getattr(turning, part), part, some.places, share)
-    return r, turning
-
-
-def _multiply(r: dict[str, Tensor], turning: tuple[Tensor, Tensor], part: str, places: Tensor, share: Seen) -> None:
-    whole = r[part][places]
-    for name in r:
-        if name.startswith(part):
-            r[name][places] *= share.share
-    r[f"{part}_by_log_sharpness"][places] += whole * share.by_log_sharpness
-    if share.by_roughness is not None:
-        r[f"{part}_by_roughness"][places] += whole * share.by_roughness
-    for target, slope in zip(turning, (share.by_first, share.by_second), strict=True):
-        target[places] = whole * slope
+        weights, _ = highlight_weights(some.normal, some.view, some.directions, float(roughness))
+        share = seen_share(some.visibility, weights, kernel(some.directions, axis, sharpness))
+        response[some.places] *= share.to(response.dtype)
+    return response

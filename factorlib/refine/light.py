@@ -1,7 +1,7 @@
 """The light that explains one photo, given materials and normals.  It is found anew for every pose, so that no pose has an advantage.
 
 The light of the solve was fitted to the pose that is to be tested, so it is not used.  Lobes are chosen by matching pursuit from the
-dictionary of `factorlib.solve.insertion`, which depends on no pose; their weights are a non-negative least-squares problem.
+dictionary of `factorlib.solve.few_lobes.insertion`, which depends on no pose; their weights are a non-negative least-squares problem.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
 from factorlib.robust import robust_deviation
-from factorlib.solve.insertion import candidates, lobes_inserted, pruned
-from factorlib.solve.start import starting_light
-from factorlib.solve.weights import nonnegative_minimum
+from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted, pruned
+from factorlib.solve.few_lobes.start import starting_light
+from factorlib.solve.few_lobes.weights import nonnegative_minimum
 
 ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves
 SAMPLE = 1400  # observations that vote about lobes, the same in every round

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from factorlib.report.text import number, significant
 from factorlib.results.materials import Decision, Model
 
-WITH, WITHOUT = "held_out_loss_with", "held_out_loss_without"
+WITH, WITHOUT, MARGIN = "held_out_loss_with", "held_out_loss_without", "margin"
 
 
 def choices(model: Model) -> list[str]:
@@ -23,7 +23,10 @@ def _lights(model: Model) -> list[str]:
     if model.solver == "paper":
         return [f"Each light is {count} lobes, a number that was given, as in the paper's solver."]
     found = [f"Each light is {count} lobes: {model.lobes_chosen_by}."] if model.lobes_chosen_by else [f"Each light is {count} lobes."]
-    return [*found, _kept("What is known of natural light, as a prior,", model.light_prior, model.light_prior_chosen_by)]
+    if not model.light_prior:
+        return found
+    splittings = [f"{'kept' if one.kept else 'not kept'}{_tried(one)}" for one in model.splitting_chosen_by]
+    return [*found, *([f"The brightest cells of each light were split: {'; then '.join(splittings)}."] if splittings else [])]
 
 
 def _effects(model: Model) -> list[str]:
@@ -34,11 +37,14 @@ def _effects(model: Model) -> list[str]:
 
 
 def _kept(name: str, kept: bool, losses: Mapping[str, float]) -> str:
-    return f"{name} is {'' if kept else 'not '}in the model{_losses(losses.get(WITH), losses.get(WITHOUT))}."
+    return f"{name} is {'' if kept else 'not '}in the model{_losses(losses.get(WITH), losses.get(WITHOUT), losses.get(MARGIN))}."
 
 
-def _losses(with_it: float | None, without: float | None) -> str:
-    return "" if with_it is None or without is None else f" (held-out loss {significant(with_it)} with it, {significant(without)} without)"
+def _losses(with_it: float | None, without: float | None, margin: float | None) -> str:
+    if with_it is None or without is None:
+        return ""
+    by = "" if margin is None else f", {number(abs(margin), 1)} standard errors {'for' if margin > 0 else 'against'} it"
+    return f" (held-out loss {significant(with_it)} with it, {significant(without)} without{by})"
 
 
 def _specular(model: Model) -> list[str]:
@@ -59,4 +65,4 @@ def _tone(model: Model) -> list[str]:
 
 
 def _tried(decision: Decision | None) -> str:
-    return "" if decision is None else _losses(decision.held_out_loss_with, decision.held_out_loss_without)
+    return "" if decision is None else _losses(decision.held_out_loss_with, decision.held_out_loss_without, decision.margin)

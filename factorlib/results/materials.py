@@ -79,11 +79,15 @@ class Tone(msgspec.Struct, frozen=True):
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """Whether a part of the model was kept, and the mean held-out loss with and without it; None for what was not tried."""
+    """Whether a part of the model was kept, and the mean held-out loss with and without it; None for what was not tried.
+
+    margin: by how many standard errors the loss is higher without it
+    """
 
     kept: bool
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
+    margin: float | None = None
 
 
 class Started(msgspec.Struct, frozen=True):
@@ -96,15 +100,16 @@ class Started(msgspec.Struct, frozen=True):
 class Model(msgspec.Struct, frozen=True):
     """What was decided of the model, and by what.
 
-    lobes:           number of lobes by illumination
-    held_out_loss:   after each round
+    lobes:           number of lobes, or cells, by illumination
+    held_out_loss:   after each round, of a solver that has rounds
     specular:        whether a material has a specular part
-    light_prior:     whether lights follow the statistics of natural light
-    self_shadowing_chosen_by, interreflection_chosen_by, light_prior_chosen_by: the held-out loss of each model that was tried
+    light_prior:     whether lights are cells that follow the statistics of natural light
+    self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried, and the margin in standard errors
+    splitting_chosen_by: of each time that cells were split
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
     """
 
-    solver: Literal["bundle", "paper"] = "bundle"
+    solver: Literal["bundle", "few_lobes", "paper"] = "bundle"
     lobes: dict[str, int] = {}
     lobes_chosen_by: str = ""
     held_out_loss: list[float] = []
@@ -115,7 +120,7 @@ class Model(msgspec.Struct, frozen=True):
     interreflection: bool = False
     interreflection_chosen_by: dict[str, float] = {}
     light_prior: bool = False
-    light_prior_chosen_by: dict[str, float] = {}
+    splitting_chosen_by: list[Decision] = []
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     started_from: Started | UnsetType = UNSET

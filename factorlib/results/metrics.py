@@ -6,6 +6,7 @@ set          counts of photos, materials, illuminations and of the connected com
 resynthesis  always there: `factorlib.evaluate.resynthesis`
 materials    `factorlib.evaluate.materials`
 relighting   `factorlib.evaluate.relighting`
+relit_set    `factorlib.evaluate.relit_set`: the relit set score
 light        `factorlib.evaluate.lights`
 normals      photo -> `NormalError`; see `factorlib.evaluate.geometry`
 poses        photo -> object -> `PoseError`
@@ -134,6 +135,22 @@ class Relighting(msgspec.Struct, frozen=True):
     mean_unobserved: dict[str, Kinds] | None
 
 
+class RelitSet(msgspec.Struct, frozen=True):
+    """The relit set score over all pairs of a recovered material and a recovered light, dB, higher is better, beside its null's.
+
+    pairs: how many;  worst_material, worst_light: the pair that scores worst_psnr_db
+    factor: per channel, times the recovered reflectances and divided out of the recovered lights
+    """
+
+    pairs: int
+    mean_psnr_db: float
+    worst_psnr_db: float
+    null_mean_psnr_db: float
+    worst_material: str
+    worst_light: str
+    factor: Vec3
+
+
 class LightError(msgspec.Struct, frozen=True):
     """Fractions of the truth's root mean square, and degrees; 0 is perfect."""
 
@@ -194,6 +211,7 @@ class Metrics(msgspec.Struct, frozen=True):
     normals: dict[str, NormalError] | None
     poses: dict[str, dict[str, PoseError]] | None
     reasons: dict[str, str]
+    relit_set: RelitSet | None = None
 
 
 def write_metrics(path: str | Path, metrics: Metrics) -> None:

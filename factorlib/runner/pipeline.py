@@ -248,7 +248,7 @@ def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
 
 def _how(target: str, keys: list[str]) -> str:
     near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
-    return near if near.startswith("did") else 'write stage.parameter=value, as in SET="solve.lobes=64"'
+    return near if near.startswith("did") else 'write stage.parameter=value, as in SET="solve.cells=800"'
 
 
 def check_values(pipeline: Pipeline, file: Path) -> Pipeline:

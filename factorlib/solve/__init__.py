@@ -1,12 +1,15 @@
 """The joint problem solved: one reflectance per material and one light per illumination, from all photos at once.
 
-Photometric bundle adjustment.  Every observation touches one material (7 unknowns) and one illumination (6 a
-lobe), so the normal equations have an arrow shape and the illuminations are eliminated one by one (Schur).
+Photometric bundle adjustment.  Every observation touches one material (7 unknowns) and one illumination (3 a cell), so the normal equations
+have an arrow shape and the illuminations are eliminated one by one (Schur).
 
-    bundle      the solver: rounds, choices, polish
-    rounds      lobes are inserted where residuals are large, as long as held-out observations are explained better
-    descent     Levenberg–Marquardt: step (arrow, bounds), control (damping, termination), weights
-    evidence    compare: which of two models explains held-out observations better; thresholds
+    solve       the solver: choices, materials, splitting, lights
+    choices     what a scene needs of the model: shadows, bounces, tone curves;  evidence: how held-out observations decide
+    fit         materials and lights fitted together, and how much observations and prior count
+    descent     Levenberg–Marquardt: the step and the loop
+    marginal    what is minimised: the marginal likelihood, the lights integrated out;  material_prior: what is expected of materials
+    start, warm where a solve starts, from nothing or from an earlier solution
+    few_lobes   another solver, for exact scenes: lights are few lobes with free axes;  it decides nothing for the first
     paper       the paper's solver, the baseline
 
 What photos should show, and all derivatives, is in `factorlib.model`.

@@ -1,55 +1,140 @@
-"""Levenberg–Marquardt over all materials and lights: damped steps, taken when they lower the loss.
+"""Levenberg–Marquardt on materials and lights: one system of arrow shape, one step, one loop.
 
-Radiance is linear in the lobes' weights, and its derivatives by axes and sharpnesses are proportional to the weights.  So the step
-predicts badly what happens where one lobe takes over the energy of another while it moves.  The weights of a step are therefore not
-used: with lobes and materials where the step put them, the weights are fitted anew (an embedded point iteration; Jeong et al. 2012,
-Hong et al. 2017).  That costs little, for the next system needs the same responses.
+With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) and gradients g_m, g_i, eliminating every light leaves
+
+    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                (1)
+
+where d_i is the gradient of the determinant by the light, which moves materials but, in Laplace's approximation, not the light.  There are
+7 unknowns a material.  A light's C has rows for the materials that it shows alone, so that cost grows with those few.  Damping
+multiplies the diagonal, so that a step does not depend on the units of an unknown.
+
+What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.model.problem import JointProblem
-from factorlib.solve.control import Damping, Termination
-from factorlib.solve.iterate import Iterate, fit_weights
-from factorlib.solve.step import damped_step
+from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS, TONE
+from factorlib.model.lights import Light
+from factorlib.model.problem import Spread
+from factorlib.solve.marginal import Field, Marginal, marginal
+from factorlib.solve.material_prior import Gaussian, MaterialPrior, materials_of
 
-Accepted = Callable[[int, Iterate], None]  # called with the number of an iteration and the accepted iterate
+MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
+MOST_LOG_RADIANCE, MOST_EXPOSURE, MOST_TONE = 1.5, 1.0, 0.2  # change of a light's unknowns in one step
+DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
+FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
+TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
+
+Report = Callable[[float], None]  # called at every point that is tried, with the mean robust loss there
+
+
+class State(NamedTuple):
+    """Unknowns, and the systems there; theta: log k_d, log k_s, roughness."""
+
+    theta: Float[np.ndarray, "m 7"]
+    fields: list[Field]
+    value: float
+    parts: list[Marginal]
+    prior: Gaussian
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """When a descent stops: after `iterations`, or after two steps in a row that gain less than `tolerance` of the loss."""
+    """prior: on materials;  spread: a map over lights;  tolerance: as TOLERANCE."""
 
-    iterations: int = 10
-    tolerance: float = 1e-4
+    prior: MaterialPrior
+    spread: Spread
+    report: Report = lambda loss: None
+    tolerance: float = TOLERANCE
+
+    def run(
+        self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, "m 7"], iterations: int
+    ) -> State:
+        """The state after at most so many steps; only the materials' unknowns that are `free` change, and all lights."""
+        given, damping = not free.any(), DAMPING
+        state = self.at(fields, theta, given)
+        for _ in range(iterations):
+            trial = self.at(*stepped(state, free, damping), given)
+            if trial.value < state.value:
+                small = state.value - trial.value < self.tolerance * abs(state.value)
+                state, damping = trial, damping * LOWER
+                if small:
+                    break
+            elif damping > MOST_DAMPING:
+                break
+            else:
+                damping = max(damping * HIGHER, DAMPING)
+        return state
+
+    def at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool) -> State:
+        """The state at materials; materials_given: as of `marginal`."""
+        materials = materials_of(theta)
+        fields = [
+            msgspec.structs.replace(f, illumination=msgspec.structs.replace(f.illumination, materials=materials)) for f in fields
+        ]
+        parts = list(self.spread(lambda field: marginal(field, materials_given=materials_given), fields))
+        prior, values = self.prior.at(theta), sum(3 * int((~f.illumination.block.held_out).sum()) for f in fields)
+        self.report(sum(part.loss for part in parts) / max(values, 1))
+        return State(theta, fields, sum(part.value for part in parts) + prior.value, parts, prior)
 
 
-def descend(
-    problem: JointProblem,
-    start: Iterate,
-    descent: Descent,
-    accepted: Accepted = lambda iteration, iterate: None,
-    fixed: Bool[np.ndarray, " 7m"] | None = None,
-) -> Iterate:
-    """Lower the loss from `start`, an iterate of this problem; every accepted point is reported.
+def stepped(
+    state: State, free: Bool[np.ndarray, "m 7"], damping: float
+) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
+    """Fields and materials after the damped step (1), each unknown within its range and changed by no more than is sound."""
+    H, g, solutions = state.prior.hessian.copy(), state.prior.gradient.copy(), []
+    for part in state.parts:
+        H[np.ix_(part.places, part.places)] += part.material_hessian
+        g[part.places] += part.material_gradient
+    H = damped(H, damping)
+    for part in state.parts:
+        factor = cho_factor(damped(part.light_hessian, damping), check_finite=False)
+        solution = cho_solve(factor, np.column_stack([part.cross_hessian.T, part.light_gradient, part.determinant_by_light]), check_finite=False)
+        H[np.ix_(part.places, part.places)] -= part.cross_hessian @ solution[:, :-2]
+        g[part.places] -= part.cross_hessian @ (solution[:, -2] + solution[:, -1])
+        solutions.append(solution)
+    may = free.reshape(-1)
+    change = np.linalg.solve(masked(H, may), np.where(may, -g, 0.0)).reshape(-1, 7)
+    theta = state.theta + change.clip(-MOST_CHANGE, MOST_CHANGE)
+    theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
+    theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
+    theta = np.where(free, theta, state.theta)
+    dm, fields = (theta - state.theta).reshape(-1), []
+    for field, part, solution in zip(state.fields, state.parts, solutions, strict=True):
+        step = -(solution[:, -2] + solution[:, :-2] @ dm[part.places])
+        one = field.illumination
+        fields.append(
+            msgspec.structs.replace(field, illumination=msgspec.structs.replace(one, light=moved(one.light, step)))
+        )
+    return fields, theta
 
-    fixed: unknowns of the materials that stay as they are
-    """
-    current, damping, termination = start, Damping(), Termination(descent.tolerance)
-    for iteration in range(descent.iterations):
-        step = damped_step(current, damping.value, fixed)
-        trial = fit_weights(problem, current.point.moved(step.materials, step.lights))
-        gained = current.loss - trial.loss
-        termination = termination.after(gained, step.predicted, current.loss)
-        damping = damping.after(gained, step.predicted)
-        if gained > 0:
-            current = trial
-            accepted(iteration, current)
-        if termination.reached:
-            break
-    return current
+
+def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
+    """The light after a step of its unknowns, each within its range and changed by no more than is sound."""
+    cells, exposures, tones = np.split(step, [3 * len(light), 3 * len(light) + len(light.log_exposure) - 1])
+    u = light.log_radiance + cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE)
+    exposures = np.concatenate([[0.0], exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)])
+    tone = np.clip(light.log_tone + tones.clip(-MOST_TONE, MOST_TONE), *np.log(TONE))
+    return msgspec.structs.replace(light.with_log_radiance(u), log_exposure=light.log_exposure + exposures, log_tone=tone)
+
+
+def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
+    """The matrix with its diagonal 1 + damping times as large, and positive."""
+    diagonal = np.diag(hessian)
+    floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
+    return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
+
+
+def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
+    """The matrix with rows and columns that are not free replaced by those of the identity, in the scale of the rest."""
+    scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
+    result = matrix * np.outer(free, free)
+    result[~free, ~free] = scale
+    return result

@@ -1,91 +1,82 @@
-"""Which of two models is used: the same decision for shadows, specular parts and tone curves.
+"""How every choice of the model is made: by observations that no candidate was fitted to.
 
-Both models are brought to (or near) their optimum on the observations that are fitted.  The richer model is used if the loss of the
-held-out observations, which neither model was fitted to, is so much higher without it that a threshold is passed
-(`factorlib.solve.thresholds`).
+Two models are fitted to the same observations, each for itself.  Held-out observations are those of whole cells of mirror directions
+(`factorlib.model.clusters`).  With a_i and b_i the mean robust losses of light i without and with the richer part, and n_i its held-out
+observations,
+
+    d = Σ_i n_i (log a_i − log b_i) / Σ_i n_i                                                                       (1)
+
+is the difference of the logarithms of geometric means over lights: the likelihood of residuals whose variance differs from light to light
+and is unknown.  A light whose normals are wrong has many times the loss of another, and in a sum its change would outweigh all others.
+
+Neighbouring residuals err alike, so the standard error of d is taken over clusters: with A_k, B_k the summed losses of cluster k of light i,
+the delta method gives log a_i − log b_i the variance K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)², K the number of clusters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
+from factorlib.model.clusters import clusters_of
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.thresholds import LEAST_DECREASE, Threshold
 
-Losses = Float[np.ndarray, " n"]  # of one light's held-out observations
+LEAST_LOSS = 1e-4  # in σ² of the noise model: what both candidates explain to this counts as equal
+# Standard errors.  What is there anyway goes only against evidence, what is further needs it; smaller cells have the same prior as larger
+# ones, so they need less of it.
+AGAINST, FOR, FINER = -2.0, 2.0, 1.0
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """Whether the richer model is kept, and the mean loss of the held-out observations that decided, with it and without it.
+    """Whether the richer model is kept, the geometric means of held-out losses that decided, and d in standard errors.
 
-    A loss is None where that model was not tried.  Of interreflection they are geometric means over lights (`decide_over_lights`).
+    A loss is None where that model was not tried.
     """
 
     kept: bool
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
+    margin: float | None = None
 
 
-class Candidates(NamedTuple):
-    """The best points of two models of one problem."""
+class Losses(NamedTuple):
+    """Robust losses of the held-out observations of each light, and their clusters."""
 
-    without: Point
-    richer: Point
+    values: list[Float[np.ndarray, " n"]]
+    clusters: list[Int[np.ndarray, " n"]]
 
 
-def compare(problem: JointProblem, candidates: Candidates, threshold: Threshold, material: int | None = None) -> Evidence:
-    """Whether the richer model is kept, by the problem's loss of held-out observations.
+def losses_of(problem: JointProblem, point: Point) -> Losses:
+    """The held-out observations' losses at a point; of every observation, if none is held out."""
+    none = problem.none_held_out
+    judged = [block.take(block.held_out | none) for block in problem.blocks]
+    return Losses(problem.held_out_losses(point), [clusters_of(block) for block in judged])
 
-    material: only observations of this material decide; None: all do.  Harm (`Threshold.harm`) counts over all observations
+
+def compare(without: Losses, richer: Losses, least: float) -> Evidence:
+    """Whether the richer model is kept: if d is more than `least` standard errors; where nothing is held out, it is not.
+
+    >>> same = Losses([np.array([1.0, 2.0, 3.0])], [np.array([0, 1, 2])])
+    >>> compare(same, same, FOR).kept, compare(same, same, AGAINST).kept
+    (False, True)
     """
-    without, richer = (np.concatenate(problem.held_out_losses(point)) for point in candidates)
-    own = _in_question(problem, material)
-    harmed = mean(without) > (1 + threshold.harm) * mean(richer)
-    decided = decide(mean(without[own]), mean(richer[own]), threshold)
-    return msgspec.structs.replace(decided, kept=decided.kept or harmed)
-
-
-def compare_by_light(problem: JointProblem, without: Sequence[Point], richer: Point, threshold: Threshold) -> list[Evidence]:
-    """As `compare`, for each light by its own observations; a light without held-out observations does not get the richer model.
-
-    without: several points of the simpler model; for each light the best of them counts
-    """
-    losses = zip(*(problem.held_out_losses(point) for point in (richer, *without)), strict=True)
-    return [decide(min(mean(other) for other in others), mean(richer), threshold) for richer, *others in losses]
-
-
-def decide_over_lights(without: Sequence[Losses], richer: Sequence[Losses], threshold: Threshold) -> Evidence:
-    """As `decide`, by the geometric mean over lights of each light's mean loss; lights without held-out observations have no say.
-
-    This is the likelihood of residuals whose variance differs from light to light and is unknown.  A light whose normals are wrong has many
-    times the loss of another, and in a sum of losses its change would outweigh those of all others.
-    """
-    number = [len(losses) for losses in richer]
-    logarithms = ([np.log(max(mean(losses), LEAST_DECREASE)) for losses in model] for model in (without, richer))
-    return decide(*(float(np.exp(np.average(of, weights=number))) if sum(number) else 0.0 for of in logarithms), threshold)
-
-
-def decide(without: float, richer: float, threshold: Threshold) -> Evidence:
-    """The evidence of two mean held-out losses.
-
-    >>> decide(without=1.3, richer=1.0, threshold=Threshold(gain=0.25)).kept
-    True
-    """
-    return Evidence(without > (1 + threshold.gain) * richer, richer, without)
-
-
-def mean(losses: Float[np.ndarray, " n"]) -> float:
-    """The mean of the losses; 0 if there are none."""
-    return float(losses.mean()) if len(losses) else 0.0
-
-
-def _in_question(problem: JointProblem, material: int | None) -> Bool[np.ndarray, " n"]:
-    held_out = [block.material[block.held_out | problem.none_held_out] for block in problem.blocks]
-    every = np.concatenate(held_out)
-    return every == material if material is not None else np.ones(len(every), bool)
+    counts = np.array([len(values) for values in richer.values])
+    if not counts.sum():
+        return Evidence(False)
+    differences, variances, logs = [], [], []
+    for a, b, cluster in zip(without.values, richer.values, richer.clusters, strict=True):
+        both = [np.bincount(cluster, losses + LEAST_LOSS) for losses in (a, b)]
+        shares = [sums / max(float(sums.sum()), 1e-300) for sums in both]
+        logs.append([np.log(np.mean(losses) + LEAST_LOSS) if len(losses) else 0.0 for losses in (a, b)])
+        differences.append(logs[-1][0] - logs[-1][1])
+        number = len(both[0])
+        variances.append(number / max(number - 1, 1) * float(np.sum((shares[0] - shares[1]) ** 2)))
+    share = counts / counts.sum()
+    d, error = float(share @ differences), float(np.sqrt(share**2 @ variances))
+    margin = d / max(error, 1e-12)
+    with_, without_ = (float(np.exp(share @ [pair[k] for pair in logs])) for k in (1, 0))
+    return Evidence(margin > least, with_, without_, margin)

@@ -1,4 +1,4 @@
-"""A run of the solver: its options, the events it reports, and the journal from which a stopped run goes on."""
+"""A run of a solver: what it reports, what it ends with, and the journal from which a stopped run goes on."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from collections.abc import Callable
 
 import msgspec
 import numpy as np
+from jaxtyping import Bool
 
+from factorlib.model.loss import Loss
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.iterate import Iterate
-from factorlib.solve.options import Bundle
-from factorlib.solve.resume import Journal
+from factorlib.solve.evidence import Evidence
+from factorlib.solve.fit import Fit
 
 
 class Event(msgspec.Struct, frozen=True):
@@ -37,27 +38,29 @@ def unwatched(event: Event, point: Point) -> None:
     """The default: no snapshots."""
 
 
-class Run(msgspec.Struct, frozen=True):
-    """options: how to solve;  report, snapshot: called at every accepted point;  journal: the parts that are done already."""
+class Solution(msgspec.Struct, frozen=True):
+    """The answer of a solver: a point, and what was decided of the model.
 
-    options: Bundle = Bundle()
-    report: Report = unreported
-    snapshot: Snapshot = unwatched
-    journal: Journal = msgspec.field(default_factory=Journal)
+    history     every accepted point on the way;  loss: the loss function that was lowered last
+    lambertian  materials without specular part
+    shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
+    specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
+    splitting   the evidence for each splitting of the lights' cells
+    materials   where lights are cells: the fit of the sure observations, whose materials the answer has;  lights: that of all
+    """
 
+    point: Point
+    history: list[Event]
+    loss: Loss
+    lambertian: Bool[np.ndarray, " m"]
+    shadows: Evidence = Evidence(False)
+    interreflection: Evidence = Evidence(False)
+    specular: list[Evidence] = []
+    tone: list[Evidence] = []
+    splitting: list[Evidence] = []
+    materials: Fit | None = None
+    lights: Fit | None = None
 
-class Recorder:
-    """Appends events to `history` and reports them; `problem` gives the held-out loss."""
-
-    def __init__(self, problem: JointProblem, history: list[Event], run: Run):
-        self.problem, self.history, self.run = problem, history, run
-
-    def record(self, round_: int, phase: str, iteration: int, iterate: Iterate) -> float:
-        """Record an iterate.  Returns its held-out loss if it ends a round (iteration −1), else NaN."""
-        point = iterate.point
-        held_out = self.problem.held_out_loss(point) if iteration < 0 else np.nan
-        loss = iterate.loss / self.problem.fitted_values
-        self.history.append(Event(round_, phase, iteration, loss, held_out, sum(map(len, point.lights))))
-        self.run.report(self.history[-1])
-        self.run.snapshot(self.history[-1], point)
-        return held_out
+    def shown(self, problem: JointProblem) -> JointProblem:
+        """The problem that the answer solves: with shadows and bounces or without, with the last loss."""
+        return problem.with_effects(self.shadows.kept, self.interreflection.kept).with_loss(self.loss)

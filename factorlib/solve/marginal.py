@@ -1,22 +1,27 @@
 """The marginal likelihood of the materials, the lights integrated out: one illumination's part of it, and its normal equations.
 
-A light is u, log radiance on a lattice; its prior is Gaussian with mean 0 and precision Q (`factorlib.light.prior`).  Observations are
-those of the forward model, with residuals r in σ of the noise model.  Neighbours' residuals err alike, so a squared residual counts as
-1/T of one (`factorlib.solve.natural.temperature`).  Minus twice the log posterior of a light is
+A light is u, log radiance on cells; its prior is Gaussian with mean 0 and precision Q (`factorlib.light.prior`).  Observations are those of
+the forward model, with residuals r in σ of the noise model.  Neighbours' residuals err alike, so a squared residual counts as 1/T of one
+(`factorlib.solve.fit`).  Minus twice the log posterior of a light is
 
     φ(u; θ) = Σ ρ(r)/T + uᵀ Q u,
 
 and with the light integrated out (Laplace's approximation about the minimising u) minus twice the log marginal likelihood of θ is
 
-    φ(u; θ) + log det H,        H = JᵀJ/T + Q,     J = ∂r/∂u                                                        (1)
+    φ(u; θ) + log det H − log det Q,        H = JᵀJ/T + Q,     J = ∂r/∂u                                            (1)
 
 up to a constant.  Without the determinant, light and materials are ambiguous in a way that always favours the light of least contrast and
 the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009, "Understanding and evaluating blind
-deconvolution algorithms").  Of a radiance that is linear in w = exp(u), ∂J/∂θ is known exactly, and with Σ = H⁻¹
+deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/∂θ and ∂J/∂u are known exactly, and with Σ = H⁻¹
 
-    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T.                                                                 (2)
+    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.               (2)
 
-Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.
+The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.solve.descent`).  Left out, it would
+push all reflectances down: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian Σ_i ∂J_i Σ ∂J_iᵀ of the first
+only steers steps, so every `SPARSE`-th row stands for its neighbours.
+
+Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.  Exposures and tone exponents belong to the light's block
+but are not integrated out: they have wide Gaussians about 0.
 """
 
 from __future__ import annotations
@@ -26,167 +31,155 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotri
 
-from factorlib.model.blocks import Block
+from factorlib.model.illumination import Illumination, Linearised
 from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
-from factorlib.model.tone import slope_at, toned
-from factorlib.solve.cholesky import positive_definite_inverse
-from factorlib.solve.lattice import Lattice, Reflected, Reflections
+from factorlib.model.loss import Loss
+
+SPARSE = 8  # rows of which one enters the Hessian of the determinant
+EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
 
 
 class Field(msgspec.Struct, frozen=True):
-    """One illumination: its observations, its lattice, its prior, and how much they count.
+    """One illumination and how much its parts count.
 
-    light        gives exposures and tone curves, which stay
-    precision    Q, channel by channel
-    temperature  T;  robust_scale: of the pseudo-Huber loss ρ, in σ
+    illumination  with its table;  precision: Q, channel by channel, with its log determinant
+    temperature   T;  loss: ρ
     """
 
-    block: Block
-    light: Light
-    lattice: Lattice
-    reflections: Reflections
+    illumination: Illumination
     precision: Float[np.ndarray, "3p 3p"]
+    log_determinant: float
     temperature: float
-    robust_scale: float
-
-
-class Shown(NamedTuple):
-    """Of the observations at a light and materials: residuals r, and the diffuse and specular radiances for k_d = 1 and k_s = 1."""
-
-    residual: Float[np.ndarray, "n 3"]
-    diffuse: Float[np.ndarray, "n 3"]
-    specular: Float[np.ndarray, "n 3"]
-    slope: Float[np.ndarray, "n 3"]
-    responses: list[tuple[int, slice, Reflected]]
+    loss: Loss
 
 
 class Marginal(NamedTuple):
     """The value of (1), the loss Σ ρ(r) in it, and the Gauss–Newton system of it: half the gradient and half the Hessian.
 
+    places   numbers of the k unknowns of the materials that the block shows, ascending;  the light has l unknowns, of which 3p are u
+    determinant_by_light   the second of (2)
     scores   the parts of the gradient of φ by materials and light, one a cluster of observations, where clusters were asked for
     """
 
     value: float
     loss: float
-    material_gradient: Float[np.ndarray, " 7m"]
-    material_hessian: Float[np.ndarray, "7m 7m"]
-    light_gradient: Float[np.ndarray, " 3p"]
-    cross_hessian: Float[np.ndarray, "7m 3p"]
-    light_hessian: Float[np.ndarray, "3p 3p"]
-    scores: Float[np.ndarray, "k 7m+3p"] | None = None
+    places: Int[np.ndarray, " k"]
+    material_gradient: Float[np.ndarray, " k"]
+    material_hessian: Float[np.ndarray, "k k"]
+    light_gradient: Float[np.ndarray, " l"]
+    cross_hessian: Float[np.ndarray, "k l"]
+    light_hessian: Float[np.ndarray, "l l"]
+    determinant_by_light: Float[np.ndarray, " l"]
+    scores: Float[np.ndarray, "g k+l"] | None = None
 
 
-def shown(field: Field, log_radiance: Float[np.ndarray, "3 p"], materials: Materials) -> Shown:
-    """What the model shows; radiance as `factorlib.model.illumination` has it, on the lattice."""
-    block, weight = field.block, field.lattice.weight(log_radiance).astype(np.float32)
-    diffuse, specular = np.empty((len(block), 3)), np.empty((len(block), 3))
-    responses = [
-        (int(m), field.reflections.rows(m), field.reflections.at(m, float(materials.roughness[m]))) for m in np.unique(block.material)
-    ]
-    for _, rows, of in responses:
-        diffuse[rows], specular[rows] = of.diffuse @ weight, of.specular @ weight
-    exposure = _exposure(field)
-    diffuse, specular = diffuse * exposure, specular * exposure
-    if block.bounced is not None:
-        diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
-    linear = materials.diffuse[block.material] * diffuse + materials.specular[block.material] * specular
-    radiance = toned(linear, field.light, block.photo)
-    slope = np.broadcast_to(slope_at(radiance, field.light, block.photo), radiance.shape)
-    return Shown(block.residuals(radiance), diffuse, specular, slope, responses)
-
-
-def loss_of(field: Field, seen: Shown) -> float:
-    """Σ ρ(r) of what is fitted."""
-    k, residual = field.robust_scale, seen.residual[~field.block.held_out]
-    return 2 * k**2 * float(np.sum(np.sqrt(1 + (residual / k) ** 2) - 1))
-
-
-def marginal(
-    field: Field,
-    log_radiance: Float[np.ndarray, "3 p"],
-    materials: Materials,
-    clusters: Int[np.ndarray, " n"] | None = None,
-    materials_given: bool = False,
-) -> Marginal:
+def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> Marginal:
     """The system of one illumination.
 
     clusters: number of each observation's cluster, from 0, for `Marginal.scores`;  materials_given: only the light is asked for, and
     equation (2), which takes most of the time, is left out of the gradient and the Hessian by materials
     """
-    seen, p, count = shown(field, log_radiance, materials), len(field.lattice), 7 * len(materials)
-    u = log_radiance.reshape(-1)
-    gradient, hessian = field.precision @ u, field.precision.copy()
-    by_material, of_materials, cross = np.zeros(count), np.zeros((count, count)), np.zeros((count, 3 * p))
-    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, count + 3 * p))
-    channels = []
-    for c in range(3):
-        own = slice(c * p, (c + 1) * p)
-        for part in _channel(field, log_radiance, materials, seen, c):
-            jacobian, places = part.diffuse + part.specular, part.places
-            hessian[own, own] += jacobian.T @ jacobian
-            gradient[own] += jacobian.T @ part.residual
-            of_materials[np.ix_(places, places)] += part.by_material.T @ part.by_material
-            by_material[places] += part.by_material.T @ part.residual
-            cross[places, own] += part.by_material.T @ jacobian
-            if scores is not None:
-                of = clusters[part.rows]
-                np.add.at(scores, (of[:, None], places[None]), part.by_material * part.residual[:, None])
-                for k in np.unique(of):
-                    scores[k, count + c * p : count + (c + 1) * p] += jacobian[of == k].T @ part.residual[of == k]
-            channels.append((own, part))
-    covariance, log_determinant = positive_definite_inverse(hessian)
-    loss = loss_of(field, seen)
-    total = loss / field.temperature + float(u @ field.precision @ u) + log_determinant
-    for own, part in () if materials_given else channels:
-        slopes = (part.diffuse, part.specular, part.by_roughness)
-        spread = [slope @ covariance[own, own].astype(np.float32) for slope in slopes]
-        by_material[part.places] += [float(np.vdot(spread[0] + spread[1], slope)) for slope in slopes]
-        of_materials[np.ix_(part.places, part.places)] += [[float(np.vdot(a, b)) for b in slopes] for a in spread]
-    return Marginal(total, loss, by_material, of_materials, gradient, cross, hessian, scores)
+    one, T = field.illumination, field.temperature
+    shown, light, p = one.shown(), one.light, len(one.light)
+    places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
+    k, size = len(places), light.unknowns
+    g_m, M, C = np.zeros(k), np.zeros((k, k)), np.zeros((k, size))
+    value, g_l, L = _priors(field, light)
+    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
+    parts, photos = list(one.linearise(shown, field.loss, T)), slice(3 * p, size)
+    for part in parts:
+        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        J = part.diffuse + part.specular
+        L[own, own] += J.T @ J
+        g_l[own] += J.T @ part.residual
+        M[np.ix_(at, at)] += part.by_material.T @ part.by_material
+        g_m[at] += part.by_material.T @ part.residual
+        C[at, own] += part.by_material.T @ J
+        if size > 3 * p:
+            L[photos, photos] += part.by_photo.T @ part.by_photo
+            g_l[photos] += part.by_photo.T @ part.residual
+            C[at, photos] += part.by_material.T @ part.by_photo
+            towards = part.by_photo.T @ J
+            L[photos, own] += towards
+            L[own, photos] += towards.T
+        if scores is not None:
+            _add_scores(scores, clusters[part.rows], part, J, at, slice(k + own.start, k + own.stop), k + 3 * p)
+    covariance, log_determinant = positive_definite_inverse(L[: 3 * p, : 3 * p])
+    loss = float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum())
+    value += loss / T + log_determinant - field.log_determinant
+    by_light = np.zeros(size)
+    for part in () if materials_given else parts:
+        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
+        g_m[at] += gradient
+        M[np.ix_(at, at)] += hessian
+        by_light[own] += by_cells
+    return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
 
 
-class _Part(NamedTuple):
-    """One channel of the observations of one material, whitened, weighted by the robust loss and divided by √T.
+def _priors(field: Field, light: Light) -> tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:
+    """uᵀQu and the Gaussians of exposures and tones: value, half the gradient, half the Hessian."""
+    u, Q = light.log_radiance.reshape(-1), field.precision
+    others = np.concatenate([light.log_exposure[1:], light.log_tone])
+    width = np.repeat([EXPOSURE, TONE], [len(light.log_exposure) - 1, len(light.log_tone)])
+    hessian = np.zeros((light.unknowns, light.unknowns))
+    hessian[: len(u), : len(u)] = Q
+    hessian[range(len(u), light.unknowns), range(len(u), light.unknowns)] = width**-2
+    gradient = np.concatenate([Q @ u, others / width**2])
+    return float(u @ gradient[: len(u)] + np.sum((others / width) ** 2)), gradient, hessian
 
-    diffuse, specular   parts of ∂r/∂u [n, p];  by_roughness: of ∂²r/∂u ∂roughness;  by_material: ∂r/∂θ [n, 3] of unknowns `places`
+
+def _of_determinant(
+    part: Linearised, covariance: Float[np.ndarray, "p p"]
+) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
+    """Equation (2) of one channel of one material: the first, its Hessian, the second; ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J."""
+    slopes, J = (part.diffuse, part.specular, part.by_roughness), part.diffuse + part.specular
+    spread = J @ covariance
+    few = [slope[::SPARSE] for slope in slopes]
+    many = len(spread) / max(len(few[0]), 1)
+    hessian = np.array([[float(np.vdot(a @ covariance, b)) for b in few] for a in few])
+    return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
+
+
+def _add_scores(
+    scores: Float[np.ndarray, "g s"],
+    cluster: Int[np.ndarray, " n"],
+    part: Linearised,
+    J: Float[np.ndarray, "n p"],
+    at: Int[np.ndarray, "3"],
+    own: slice,
+    photos: int,
+) -> None:
+    np.add.at(scores, (cluster[:, None], at[None]), part.by_material * part.residual[:, None])
+    for g in np.unique(cluster):
+        rows = cluster == g
+        scores[g, own] += J[rows].T @ part.residual[rows]
+        scores[g, photos:] += part.by_photo[rows].T @ part.residual[rows]
+
+
+class Inverse(NamedTuple):
+    """The inverse of a matrix, and the log of the matrix's determinant."""
+
+    matrix: Float[np.ndarray, "n n"]
+    log_determinant: float
+
+
+def positive_definite_inverse(matrix: Float[np.ndarray, "n n"]) -> Inverse:
+    """Inverse and log determinant of a symmetric positive definite matrix, by LAPACK's potrf and potri: half of what solving with
+    the identity takes.
+
+    Raises LinAlgError where it is not positive definite, or not a number.
+
+    >>> positive_definite_inverse(np.array([[4.0, 0.0], [0.0, 0.25]])).matrix.tolist()
+    [[0.25, 0.0], [0.0, 4.0]]
     """
-
-    rows: slice
-    places: Int[np.ndarray, "3"]
-    diffuse: Float[np.ndarray, "n p"]
-    specular: Float[np.ndarray, "n p"]
-    by_roughness: Float[np.ndarray, "n p"]
-    by_material: Float[np.ndarray, "n 3"]
-    residual: Float[np.ndarray, " n"]
-
-
-def _channel(field: Field, log_radiance: Float[np.ndarray, "3 p"], materials: Materials, seen: Shown, c: int) -> list[_Part]:
-    block, exposure, weight = field.block, _exposure(field)[:, 0], field.lattice.weight(log_radiance)[:, c]
-    residual, parts = seen.residual[:, c], []
-    root = np.sqrt(1 + (residual / field.robust_scale) ** 2)
-    counts = ~block.held_out & ~(block.clipped[:, c] & (residual >= 0))
-    pull = np.sqrt(counts / root / field.temperature)
-    scale = pull * block.precision[:, c] * seen.slope[:, c]
-    for m, rows, of in seen.responses:
-        kd, ks = materials.diffuse[m, c], materials.specular[m, c]
-        lit = (scale[rows] * exposure[rows])[:, None].astype(np.float32) * weight.astype(np.float32)
-        by_roughness = of.by_roughness * (np.float32(ks) * lit)
-        own = [kd * seen.diffuse[rows, c] * scale[rows], ks * seen.specular[rows, c] * scale[rows], by_roughness.sum(1, dtype=float)]
-        parts.append(
-            _Part(
-                rows,
-                7 * m + np.array([c, 3 + c, 6]),
-                of.diffuse * (np.float32(kd) * lit),
-                of.specular * (np.float32(ks) * lit),
-                by_roughness,
-                np.column_stack(own).astype(np.float32),
-                (residual * pull)[rows].astype(np.float32),
-            )
-        )
-    return parts
-
-
-def _exposure(field: Field) -> Float[np.ndarray, "n 1"]:
-    return np.exp(field.light.log_exposure)[field.block.photo][:, None]
+    factor, failed = dpotrf(matrix, lower=1, clean=1)
+    logarithm = np.nan if failed else 2 * float(np.log(np.diag(factor)).sum())
+    if not np.isfinite(logarithm):
+        raise LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite, or not finite")
+    inverse, _ = dpotri(factor, lower=1)
+    lower = np.tril(inverse, -1)
+    return Inverse(lower + lower.T + np.diag(np.diag(inverse)), logarithm)

@@ -47,8 +47,7 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import UnitReflection, cosines, radiance_of
-from factorlib.solve.bundle import Solution
-from factorlib.solve.history import Event, Report, Snapshot, unreported, unwatched
+from factorlib.solve.history import Event, Report, Snapshot, Solution, unreported, unwatched
 from factorlib.solve.options import Lobes, Seed
 from factorlib.solve.start import starting_materials
 
@@ -81,7 +80,7 @@ def solve(
     problem: JointProblem, materials: int, paper: Paper, report: Report = unreported, snapshot: Snapshot = unwatched
 ) -> Solution:
     """As of the bundle solver: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.model.gauge`."""
-    problem = problem.without_shadows().with_loss(Loss(prior=paper.prior))
+    problem = problem.with_effects(False, False).with_loss(Loss(prior=paper.prior))
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / paper.subset)

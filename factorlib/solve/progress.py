@@ -5,28 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from factorlib.solve.history import Event, Report
-from factorlib.solve.options import Bundle
+from factorlib.solve.options import Choices
 from factorlib.solve.paper import REPORTS
 
 Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
+PARTS = 6  # of the joint solve without splittings: three models, tone curves, materials, lights
+POINTS = 30  # of a part: about as many as are tried
 
 
 def of_subsets(progress: Progress) -> Report:
-    """Of the paper's solver."""
+    """The progress of the paper's solver."""
     return lambda event: progress(event.round + 1, REPORTS + 1, f"subset {event.iteration}: loss {event.loss:.3g}")
 
 
-def of_rounds(progress: Progress, bundle: Bundle, models: int) -> Report:
-    """Of the bundle solver; models: how many it chooses from."""
-    total, fitted, round_ = models * bundle.rounds + 1, 0, 0  # of the models to choose from, those that are done
+def of_rounds(progress: Progress, rounds: int) -> Report:
+    """The progress of the solver of few lobes, which takes at most so many rounds."""
 
     def report(event: Event) -> None:
         """Say how many of all rounds are done."""
-        nonlocal fitted, round_
-        fitted, round_ = fitted + (event.round < round_), event.round
-        of_round = (event.iteration + 1) / bundle.iterations if event.phase == "descent" else 1.0
-        done = fitted * bundle.rounds + event.round + min(of_round, 1.0) if event.phase != "polish" else total - 1
-        number = event.round if event.phase in ("descent", "round") else event.iteration
-        progress(done, total, f"{event.phase} {number}: loss {event.loss:.3g}, {event.lobes} lobes")
+        done = event.round if event.phase in ("descent", "round") else rounds
+        progress(done, rounds + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes")
+
+    return report
+
+
+def of_parts(progress: Progress, choices: Choices) -> Report:
+    """The progress of the joint solve."""
+
+    def report(event: Event) -> None:
+        """Say how many of all parts are done."""
+        done = event.round + min(event.iteration / POINTS, 1.0)
+        total = PARTS + choices.splittings
+        progress(min(done, total - 0.01), total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
 
     return report

@@ -1,7 +1,6 @@
 """The journal of a solve: the parts that are done, so that a solve that was killed goes on and ends in the same bytes.
 
-Every part (the rounds of a model, the choice of specular parts, each phase of the polish) is a deterministic function of the part
-before it, so a part that was saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory
+Every part (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the part before it, so a part that was saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory
 layout of an array can change the order of a sum, and so the last bits.
 """
 

@@ -1,7 +1,7 @@
-"""Where the joint descent starts: reflectances from mean radiances, one nearly constant lobe a light.
+"""Where a solve starts: reflectances and exposures from mean radiances, constant lights.
 
-The mean radiance of material m in illumination i is roughly light_i · reflectance_m per channel: a rank-one matrix
-with gaps, whose logarithm is fitted as a sum by least squares.
+The mean radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose logarithm is
+fitted as a sum by least squares.
 """
 
 from __future__ import annotations
@@ -13,10 +13,21 @@ from jaxtyping import Float
 
 from factorlib.model.blocks import Block
 from factorlib.model.bounds import LEAST_REFLECTANCE
-from factorlib.model.lights import Light
+from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Materials
+from factorlib.model.point import Point
 
-BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start; the gauge sets it in the end
+BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
+ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
+LEAST_RADIANCE = 1e-6  # of a block's mean
+
+
+def starting_point(
+    blocks: Sequence[Block], count: int, cells: int, roughness: float = ROUGHNESS, specular_share: float = SPECULAR_SHARE
+) -> Point:
+    """Materials 0 … `count`−1 whose diffuse part explains mean radiances, and one constant light of `cells` cells a block."""
+    materials = starting_materials(blocks, count, specular_share, roughness)
+    return Point(materials, [constant_light(block, materials, cells) for block in blocks])
 
 
 def starting_materials(blocks: Sequence[Block], count: int, specular_share: float, roughness: float) -> Materials:
@@ -29,15 +40,17 @@ def starting_materials(blocks: Sequence[Block], count: int, specular_share: floa
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
     """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
-    rows, right, weight = [], [], []
-    for i, block in enumerate(blocks):
-        for m in np.unique(block.material):
-            of = block.material == m
-            row = np.zeros(count + len(blocks))
-            row[[m, count + i]] = 1
-            rows.append(row)
-            right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), 1e-6)))
-            weight.append(np.sqrt(of.sum()))
+    rows, right, weight, first = [], [], [], count
+    for block in blocks:
+        for k in range(len(block.photos)):
+            for m in np.unique(block.material[block.photo == k]):
+                of = (block.material == m) & (block.photo == k)
+                row = np.zeros(count + sum(len(b.photos) for b in blocks))
+                row[[m, first + k]] = 1
+                rows.append(row)
+                right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), LEAST_RADIANCE)))
+                weight.append(np.sqrt(of.sum()))
+        first += len(block.photos)
     weighted = np.array(rows) * np.array(weight)[:, None]
     logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
     seen = np.array(rows)[:, :count].any(0)
@@ -45,9 +58,13 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
     return BRIGHTEST_AT_START * np.exp(logs - logs.max())
 
 
-def starting_light(block: Block, materials: Materials) -> Light:
-    """One broad lobe in front that gives the block's mean radiance."""
-    reflectance = np.average(materials.diffuse[block.material], axis=0, weights=block.precision.mean(1))
-    axis, sharpness = np.array([[0.0, 0.0, -1.0]]), 0.5
-    weight = block.radiance.mean(0) / np.maximum(reflectance, 1e-6)
-    return Light(axis, np.log([sharpness]), weight[None], np.zeros(len(block.photos)))
+def constant_light(block: Block, materials: Materials, cells: int) -> Light:
+    """The constant light that explains the mean radiance of a block's first photo, and the exposures of the others beside it."""
+    reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
+    logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
+    shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
+    levels = np.zeros((len(block.photos), 3))
+    levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
+    lobes = even_cells(cells)
+    light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
+    return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))

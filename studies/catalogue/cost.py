@@ -12,7 +12,7 @@ from studies.core.study import Claim, Scale, Setting, Study
 
 SIDES = {"full": (3, 5, 10, 20, 40), "quick": (3, 5)}
 BY_DEFAULT = {"full": (3, 5, 10), "quick": (3,)}
-SHORT = {"light_prior": "none", "lobes": 6, "insert": 6, "rounds": 1, "iterations": 4, "polish": 4}
+SHORT = {"lobes": 6, "insert": 6, "rounds": 1, "iterations": 4, "polish": 4}
 
 
 def settings(scale: Scale) -> list[Setting]:

@@ -1,12 +1,11 @@
 """Parts: what is each part of the model worth?
 
-Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, the prior of natural light,
-           how sure normals are, tone curves, the robust loss, and clipping (clipped values taken as they are, or their pixels left
-           out).  Sets of chairs as data/eames, smaller and of other seeds; real ones by `make bench-parts DATASETS=…`.
+Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, how sure normals are, the
+           robust loss, and clipping (clipped values taken as they are, or their pixels left out).  Lights are few lobes.
+           Sets of chairs as data/eames, smaller and of other seeds; real ones by `make bench-parts DATASETS=…`.
 Measured   a tenth of the sphere's width of mirror cells that no solve has seen, the same whatever is off; materials and lights against
            the truth.
-What cannot be switched off: the weak prior on k_s and the temperature of residuals under the light prior, materials from sure normals
-alone and lights from all, the gauge.
+What cannot be switched off: the gauge.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from studies.core.part import PARTS, Part
 from studies.core.study import Claim, Scale, Setting, Study
 
 QUICK = ("as-it-is", "bounce", "robust")
-WORTH = {"shadows": "shadows", "bounce": "bounces", "light-prior": "priors on lights", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
-FURTHER = {"tone": "tone curves", "clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
+WORTH = {"shadows": "shadows", "bounce": "bounces", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
+FURTHER = {"clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
 DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}  # measure -> what parts may do
 
 

@@ -1,9 +1,9 @@
 """Prior: what is the weight of the paper's prior on lights worth, and is natural light's worth more?
 
 Varied     the weight π of the paper's prior, the variance over channels of the light's summed lobes, 0 … 10: in this project's solver
-           with lights of a few lobes (`prior`), and in the paper's (`paper_prior`); and the prior of natural light (`light_prior`) at
-           the default weight.  The paper's solver has this project's operator, which is as exact as the paper's network and faster,
-           so that solvers are compared and not operators.  Sets of 3 × 3 (quick: 2 × 2).
+           with lights of a few lobes (`prior`), and in the paper's (`paper_prior`); and the prior of natural light, which the default
+           solver has.  The paper's solver has this project's operator, which is as exact as the paper's network and faster, so
+           that solvers are compared and not operators.  Sets of 3 × 3 (quick: 2 × 2).
 Measured   how coloured the lights are beside the true ones, what they and the materials predict, and their errors.
 """
 
@@ -17,9 +17,9 @@ OF_THE_PAPER = {"full": (0.0, 0.1, 1.0, 10.0), "quick": (0.1,)}
 
 def settings(scale: Scale) -> list[Setting]:
     """Weights of the one solver, of the other, then natural light."""
-    found = [(f"lobes-{i}", f"{w:g}", {"prior": w, "light_prior": "none"}) for i, w in enumerate(WEIGHTS[scale.name])]
+    found = [(f"lobes-{i}", f"{w:g}", {"prior": w, "solver": "few_lobes"}) for i, w in enumerate(WEIGHTS[scale.name])]
     found += [(f"paper-{i}", f"paper {w:g}", {"solver": "paper", "operator": "network", "paper_prior": w}) for i, w in enumerate(OF_THE_PAPER[scale.name])]
-    found += [("natural", "natural", {"light_prior": "on"})]
+    found += [("natural", "natural", {"solver": "bundle"})]
     return [scale.setting(name, label, x, solve=solve) for x, (name, label, solve) in enumerate(found)]
 
 

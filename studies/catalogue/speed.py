@@ -1,7 +1,7 @@
 """Speed against error: every solver, operator and reduction of this project on the same sets.
 
-Varied     the solver (this project's `bundle`, the paper's), its operator, most lobes a light, the merging of observations that are
-           alike, the sample, and the prior on lights.  Sets of 2 × 2, full ones too: there are twelve solvers, and the paper's with its own
+Varied     the solver (this project's `bundle` and `few_lobes`, the paper's), its operator, most lobes a light, the merging of observations
+           that are alike, and the sample.  Sets of 2 × 2, full ones too: there are eleven solvers, and the paper's with its own
            networks is slow.  The operator `reference` is left out: it takes hours.  Mitsuba's joint optimisation is in the study of comparisons.
 Measured   processor time of the stage `solve`, and what it predicts.
 """
@@ -12,10 +12,9 @@ from typing import Any
 
 from studies.core.study import Claim, Scale, Setting, Study, full_matrix
 
-LOBES = {"light_prior": "none"}
+LOBES = {"solver": "few_lobes"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("as it is", {}),
-    "natural-light": ("natural light", {"light_prior": "on"}),
     "lobes": ("lobes", LOBES),
     "closed-form": ("lobes, closed form", LOBES | {"operator": "closed_form"}),
     "lobes-16": ("16 lobes", LOBES | {"lobes": 16}),

@@ -50,7 +50,7 @@ def score_of(case: Part, folder: Path, observed: Path) -> Score:
     names, operator = list(dataset.spec.materials), reflection_operator("network")
     blocks = [split.seen for split in splits]
     solution = solved(blocks, len(names), operator, how)
-    answer = Answer(names, JointProblem(blocks, operator), solution, {}, "bundle")
+    answer = Answer(names, JointProblem(blocks, operator), solution, {}, "few_lobes")
     values = {"unseen": relative(unseen(splits, solution, operator)), "kept_parts": kept(answer)}
     of_cells = Score(values, {"unseen": relative([flat(split) for split in splits])})
     return of_cells | _of_materials(dataset, answer, splits) | _of_lights(dataset, answer)
@@ -66,9 +66,9 @@ def relative(decibels: Sequence[float]) -> float:
 
 
 def kept(answer: Answer) -> float:
-    """How many of shadows, bounce, light prior and tone the solve took."""
+    """How many of shadows and bounce the solve took."""
     found = answer.solution
-    return float(found.shadows.kept + found.interreflection.kept + found.light_prior.kept + any(one.kept for one in found.tone))
+    return float(found.shadows.kept + found.interreflection.kept)
 
 
 def _of_materials(dataset: Dataset, answer: Answer, splits: Sequence[Split]) -> Score:

@@ -22,7 +22,7 @@ STATUS = Path("/proc/self/status")
 
 
 class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """side: materials, and lights;  solve: options of the bundle solver that differ from their defaults"""
+    """side: materials, and lights;  solve: options of the solver of few lobes that differ from their defaults"""
 
     seed: int
     side: int
@@ -54,15 +54,15 @@ def measured(case: Sized) -> Cost:
     from benchmarks.solve.scaling import problem
     from factorlib.model.problem import JointProblem
     from factorlib.reflection import reflection_operator
-    from factorlib.solve.bundle import solve
-    from factorlib.solve.history import Run
-    from factorlib.solve.options import Bundle
-    from factorlib.solve.rounds import from_nothing
+    from factorlib.solve.few_lobes.history import Run
+    from factorlib.solve.few_lobes.options import FewLobes
+    from factorlib.solve.few_lobes.rounds import from_nothing
+    from factorlib.solve.few_lobes.solve import few_lobes
 
     operator = reflection_operator("network")
     joint = JointProblem(problem(case.side, operator, case.seed), operator)
     before, start = peak_bytes(), time.process_time()
-    solve(joint, from_nothing(case.side), Run(msgspec.convert({**case.solve, "seed": case.seed}, Bundle)))
+    few_lobes(joint, from_nothing(case.side), Run(msgspec.convert({**case.solve, "seed": case.seed}, FewLobes)))
     return Cost(time.process_time() - start, before, peak_bytes())
 
 

@@ -1,4 +1,4 @@
-"""A case of the study of the model's parts: a rendered set of chairs, solved with one part switched off."""
+"""A case of the study of the model's parts: a rendered set of chairs, solved with lights of few lobes and one part switched off."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from studies.core.study import Scale
 
 PARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "as-it-is": ("as it is", {}),
-    "shadows": ("no shadows", {"self_shadowing": "off", "interreflection": "off"}),
-    "bounce": ("no bounce", {"interreflection": "off"}),
-    "light-prior": ("no light prior", {"light_prior": "none"}),
+    "shadows": ("no shadows", {"shadows": False, "bounces": False}),
+    "bounce": ("no bounce", {"bounces": False}),
     "normals": ("all normals sure", {"seen": "sure"}),
-    "tone": ("no tone curve", {"tone": "off"}),
     "robust": ("squares", {"robust_scale": 1e6}),
     "clipped-as-data": ("clipped as data", {"seen": "unclipped"}),
     "clipped-left-out": ("clipped left out", {"seen": "dropped"}),
@@ -22,7 +20,7 @@ PARTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """part: of `PARTS`;  solve: further options of the bundle solver"""
+    """part: of `PARTS`;  solve: further options of the solver of few lobes"""
 
     seed: int
     part: str

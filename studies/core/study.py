@@ -52,7 +52,7 @@ class Scale(msgspec.Struct, frozen=True):
         return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", x, full_matrix(materials, lights))
 
 
-FEW_LOBES = {"light_prior": "none", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
+FEW_LOBES = {"solver": "few_lobes", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
 FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
 QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, light_rows=32, light_spp=8)
 

@@ -19,8 +19,8 @@ from factorlib.runner.project import LIBRARY
 from tests.runner.toy import files_of
 
 SMALL = (
-    "urm.directions=0 solve.lobes=4 solve.insert=4 solve.rounds=1 solve.iterations=3 solve.polish=1 solve.settle=1 solve.sample=200 "
-    "solve.light_prior=none solve.self_shadowing=off solve.interreflection=off solve.tone=off solve.specular=on"
+    "urm.directions=0 solve.solver=few_lobes solve.lobes=4 solve.insert=4 solve.rounds=1 solve.iterations=3 solve.polish=1 solve.settle=1 solve.sample=200 "
+    "solve.specular=on"
 )
 
 

@@ -13,16 +13,16 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.arrow import ArrowSystem
-from factorlib.solve.bundle import solve
-from factorlib.solve.descent import Descent, descend
-from factorlib.solve.history import Run
-from factorlib.solve.iterate import evaluate
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.few_lobes.arrow import ArrowSystem
+from factorlib.solve.few_lobes.descent import Descent, descend
+from factorlib.solve.few_lobes.history import Run
+from factorlib.solve.few_lobes.iterate import evaluate
+from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.rounds import from_nothing
+from factorlib.solve.few_lobes.solve import few_lobes
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
-FEW_LOBES = Bundle(light_prior="none", lobes=16, insert=8, rounds=4, specular="on")
+FEW_LOBES = FewLobes(lobes=16, insert=8, rounds=4, specular="on")
 NOISE = 0.5
 
 
@@ -78,7 +78,7 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
         rng = np.random.default_rng(seed)
         blocks = [block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)]
         problem = JointProblem(blocks, OPERATOR)
-        solution = solve(problem, from_nothing(3), Run(FEW_LOBES))
+        solution = few_lobes(problem, from_nothing(3), Run(FEW_LOBES))
         found, errors = solution.point.materials, standard_errors(problem.with_loss(solution.loss), solution.point).materials
         factor = factor_between(found, MATERIALS)
         true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)

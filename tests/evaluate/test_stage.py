@@ -43,6 +43,8 @@ def test_every_part_is_scored_beside_its_null(linked):
     assert linked["set"] == {"photos": 3, "materials": 3, "illuminations": 3, "components": 1}
     mean = linked["resynthesis"]["mean"]["none"]
     assert mean["estimate"]["psnr_tonemapped_db"] > mean["null"]["psnr_tonemapped_db"] + 10
+    relit = linked["relit_set"]
+    assert relit["pairs"] == 9 and relit["mean_psnr_db"] >= relit["worst_psnr_db"] > relit["null_mean_psnr_db"] + 5
     assert linked["light"]["mean"]["scalar_per_set"]["mirror"]["estimate"]["rmse"] < 1e-3  # only scaled, by 1.1
     assert linked["normals"]["day"]["estimate"]["median_deg"] < 0.1 < linked["normals"]["day"]["null"]["median_deg"]
     assert linked["poses"]["dusk"]["balls"]["rotation_deg"] == pytest.approx(0)
@@ -56,7 +58,7 @@ def test_a_larger_error_is_reported_larger(linked, tmp_path):
 
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     found = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
-    assert found["materials"] is found["light"] is found["relighting"] is None
+    assert found["materials"] is found["light"] is found["relighting"] is found["relit_set"] is None
     assert set(found["reasons"].values()) == {NO_TRUTH}
     assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
 

@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.long, pytest.mark.skipif(not Path("/proc/self/stat").e
 STAGES = ("masks", "align", "urm", "train", "solve", "export", "render", "evaluate", "report")
 EACH = 5
 QUICK = ["masks.pixels=3000", "urm.most=5000", "urm.directions=0", "solve.rounds=1", "solve.lobes=12", "solve.iterations=2", "solve.polish=1"]
-QUICK += ["solve.self_shadowing=off", "solve.interreflection=off", "solve.light_prior=none", "solve.tone=off", "export.height=32", "export.mitsuba_height=32"]
+QUICK += ["solve.solver=few_lobes", "export.height=32", "export.mitsuba_height=32"]
 LEFT_OUT = "study"  # the photo whose poses are searched
 
 

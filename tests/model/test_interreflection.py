@@ -4,33 +4,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light, sphere_normals
+from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Run
-from factorlib.solve.normal_equations import energy_equations, normal_equations
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
-from factorlib.solve.weights import fitted_illumination
 from factorlib.urm.observations import Observations, concatenate
-from tests.model.test_shadowing import bowls, rough_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
-LOSS = Loss(robust_scale=3.0, prior=0.0)
-
-
 @pytest.fixture(scope="module", params=["linear", "toned"])
 def given(request):
     """Observations of two photos in a light fixed to the world, half of them reached by light from other surfaces, and a wrong light."""
@@ -42,41 +30,12 @@ def given(request):
     return Illumination(data, Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone), MATERIALS, OPERATOR)
 
 
-def moved_light(given, step):
-    return given.with_light(given.light.moved(step, MATERIALS.blur))
-
-
-def moved_materials(given, step):
-    return msgspec.structs.replace(given, materials=Materials.of_vector(MATERIALS.vector() + step))
-
-
-@pytest.mark.parametrize("moved", [moved_light, moved_materials])
-def test_gradients_are_finite_differences_of_the_loss(given, moved):
-    found, step = normal_equations(given, LOSS), 1e-6
-    gradient = found.light_gradient if moved is moved_light else found.material_gradient
-    expected = [(moved(given, d).fit_loss(LOSS) - moved(given, -d).fit_loss(LOSS)) / (4 * step) for d in np.eye(len(gradient)) * step]
-    np.testing.assert_allclose(gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
-
-
-def test_weights_are_fitted_to_what_bounces_leave(given):
-    """Energies have the same equations alone; observations of a light and of bounces give that light back."""
-    light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
-    lit, p = given.with_light(light), len(light)
-    part, whole = energy_equations(lit, lit.responses(), LOSS), normal_equations(lit, LOSS)
-    np.testing.assert_allclose(part.loss, whole.loss)
-    np.testing.assert_allclose(part.gradients.reshape(-1), whole.light_gradient[3 * p : 6 * p], rtol=1e-9)
-    data = msgspec.structs.replace(given.block, radiance=lit.radiance(), precision=np.ones_like(given.block.precision))
-    dark = msgspec.structs.replace(light, weight=light.weight / 3)
-    found = fitted_illumination(Illumination(data, dark, MATERIALS, OPERATOR), Loss(robust_scale=1e6, prior=0.0)).light
-    np.testing.assert_allclose(found.weight, light.weight, rtol=1e-5, atol=1e-6 * light.weight.max())
-
-
 def test_bounces_add_a_known_radiance(given):
     light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
     data, kd, ks = given.block, MATERIALS.diffuse[given.block.material], MATERIALS.specular[given.block.material]
     with_, without = (Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.without_bounces()))
     np.testing.assert_allclose(with_ - without, kd * data.bounced[:, :3] + ks * data.bounced[:, 3:])
-    assert JointProblem([data], OPERATOR).without_shadows().blocks[0].bounced is None
+    assert JointProblem([data], OPERATOR).with_effects(shadows=False, bounces=True).blocks[0].bounced is None
 
 
 def bowl(albedo, depth=0.5, size=40, count=1024, name="bowl") -> Observations:
@@ -155,66 +114,3 @@ def test_what_interreflection_determines_the_gauge_leaves(given):
     point = Point(MATERIALS, [given.light])
     np.testing.assert_array_equal(in_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
     assert (in_gauge(point, [given.block.without_bounces()]).materials.diffuse != MATERIALS.diffuse).any()
-
-
-def lit_bowls(name, seed) -> Observations:
-    """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
-    seen, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
-    exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
-    facing = met_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
-    met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
-    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, UNMET).astype(np.uint16))
-    shown = seen.radiance
-    for _ in range(8):
-        sent = bounced_light(seen, shown)
-        shown = seen.radiance + MATERIALS.diffuse[seen.material] * sent[:, :3] + MATERIALS.specular[seen.material] * sent[:, 3:]
-    return msgspec.structs.replace(seen, radiance=shown)
-
-
-@pytest.fixture(scope="module")
-def rooms():
-    return [blocks_of_observations(lit_bowls(f"room{i}", 20 + i), Noise(0.02, 0.02))[0] for i in range(2)]
-
-
-QUICK = Bundle(light_prior="none", lobes=8, insert=4, rounds=3, iterations=6, polish=8, tolerance=1e-3, self_shadowing="on")
-
-
-def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are(rooms):
-    error = {}
-    for choice in ("off", "auto"):
-        options = msgspec.structs.replace(QUICK, interreflection=choice)
-        solution = solve(JointProblem(rooms, reflection_operator("network")), from_nothing(3), Run(options))
-        error[choice] = np.abs(solution.point.materials.diffuse / MATERIALS.diffuse - 1).mean()  # absolute: no factor is taken out
-    assert solution.interreflection.kept
-    assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
-    assert error["auto"] < 0.5 * error["off"]
-
-
-def tilted(seen, seed, degrees):
-    """The same observations, their normals wrong by a smooth field of tilts of at most so many degrees an axis."""
-    rng = np.random.default_rng(seed)
-    waves = np.sin(seen.normal @ (2 * rng.normal(size=(3, 3))).T + rng.uniform(0, 6, 3))
-    normal = seen.normal + np.radians(degrees) * waves
-    return msgspec.structs.replace(seen, normal=(normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(seen.normal.dtype))
-
-
-@pytest.mark.parametrize("bounced", [False, True])
-def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
-    """Where the photos show no bounces, those computed from the mesh still explain a little of what wrong normals cause.  They fit best
-    when they are weak, so a solve that kept them would make all reflectances ten times too small."""
-    lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
-    direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
-    shown = [one if bounced else msgspec.structs.replace(one, radiance=other.radiance) for one, other in zip(lit, direct, strict=True)]
-    blocks = [blocks_of_observations(tilted(one, 10 + i, 12.0), Noise(0.02, 0.02))[0] for i, one in enumerate(shown)]
-    solution = solve(JointProblem(blocks, reflection_operator("network")), from_nothing(3), Run(QUICK))
-    assert solution.interreflection.kept == bounced
-    assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
-
-
-def test_off_is_the_solve_of_the_same_observations_without_codes(rooms):
-    without, operator = [room.without_bounces() for room in rooms], reflection_operator("network")
-    quick = msgspec.structs.replace(QUICK, lobes=3, insert=3, rounds=1, iterations=2, polish=1, sample=100)
-    off = msgspec.structs.replace(quick, interreflection="off")
-    one, other = (solve(JointProblem(b, operator), from_nothing(3), Run(options)) for b, options in ((rooms, off), (without, quick)))
-    assert not one.interreflection.kept and not other.interreflection.kept
-    np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())

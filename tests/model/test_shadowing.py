@@ -1,32 +1,21 @@
-"""Self-shadowing in the solve: hemispherical bowls, whose visibility is known by hand, traced by brute force."""
+"""Self-shadowing in the model: hemispherical bowls, whose visibility is known by hand, traced by brute force."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light, sphere_normals
+from benchmarks.solve.problems import MATERIALS, random_light, sphere_normals
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
-from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Run
-from factorlib.solve.insertion import candidates, lobes_inserted
-from factorlib.solve.normal_equations import normal_equations
-from factorlib.solve.options import Bundle
-from factorlib.solve.rounds import from_nothing
 from factorlib.urm.observations import Observations
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 NAMES = ("red", "green", "blue")
-LOSS = Loss(robust_scale=3.0, prior=0.0)
-
-
 def bowl_sees(normals, directions):
     """A ray from −n leaves the sphere at −n + 2(n·d)d; it is free where that lies before the rim."""
     exit_z = -normals[:, 2:] + 2 * (normals @ directions.T) * directions[:, 2]
@@ -76,19 +65,6 @@ def rooms():
     return [blocks_of_observations(bowls(f"room{i}", rough_light(20 + i)), Noise(0.02, 0.02))[0] for i in range(2)]
 
 
-@pytest.fixture(scope="module")
-def problem():
-    """Observations of two photos in a light fixed to the world, each hiding other directions, and a wrong light."""
-    rng = np.random.default_rng(1)
-    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=14)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    directions = np.stack([fibonacci_sphere(96), fibonacci_sphere(96) @ turn.T])
-    visibility = (rng.random((len(data), 96)) * 255).astype(np.uint8)
-    guess = random_light(rng, 4, photos=2)
-    guess = Light(guess.axis, np.minimum(guess.log_sharpness, 3), guess.weight / 10, guess.log_exposure)
-    return msgspec.structs.replace(data, visibility=visibility, directions=directions), guess
-
-
 def test_model_in_shadow_is_the_traced_radiance(rooms):
     for data, seed in zip(rooms, (20, 21), strict=True):
         light = rough_light(seed)
@@ -101,49 +77,7 @@ def test_model_in_shadow_is_the_traced_radiance(rooms):
         assert error < 0.2 * ignored
 
 
-def test_gradients_are_finite_differences(problem):
-    """Visibility is computed in single precision, so steps are long and the tolerance is wide."""
-    data, light = problem
-    found, step = normal_equations(Illumination(data, light, MATERIALS, OPERATOR), LOSS), 2e-3
-
-    def by_light(move):
-        return Illumination(data, light.moved(move, MATERIALS.blur), MATERIALS, OPERATOR).fit_loss(LOSS)
-
-    def by_material(move):
-        return Illumination(data, light, Materials.of_vector(MATERIALS.vector() + move), OPERATOR).fit_loss(LOSS)
-
-    for function, gradient in ((by_light, found.light_gradient), (by_material, found.material_gradient)):
-        moves = np.eye(len(gradient)) * step
-        expected = np.array([(function(d) - function(-d)) / (4 * step) for d in moves])
-        np.testing.assert_allclose(gradient, expected, rtol=0.02, atol=2e-3 * np.abs(expected).max())
-
-
 def test_nothing_hidden_is_nothing_computed():
     seen = bowls("room", rough_light(3), size=8)
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
     assert blocks_of_observations(open_, Noise())[0].visibility is None
-
-
-def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
-    """One observation's worth of light from the side that everything is hidden from explains nothing."""
-    data = blocks_of_observations(bowls("room", rough_light(3), size=8), Noise())[0]
-    hidden = data.directions[0, :, 0] > 0.2
-    visibility = np.where(hidden, 0, data.visibility).astype(np.uint8)
-    dark = Light(np.array([[0.0, 0.0, -1.0]]), np.zeros(1), np.full((1, 3), 1e-6), np.zeros(1))
-    hidden_from = msgspec.structs.replace(data, visibility=visibility)
-    illumination = Illumination(hidden_from, dark, MATERIALS, OPERATOR)
-    grown = lobes_inserted(illumination, 8, candidates(illumination, 0))
-    assert (grown.axis[1:, 0] < 0.35).all()
-
-
-def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(rooms):
-    quick, error = Bundle(light_prior="none", lobes=8, insert=4, rounds=3, iterations=10, polish=20, tolerance=1e-3), {}
-    for choice in ("off", "auto"):
-        problem = JointProblem(rooms, reflection_operator("network"))
-        solution = solve(problem, from_nothing(3), Run(msgspec.structs.replace(quick, self_shadowing=choice)))
-        found = solution.point.materials
-        factor = factor_between(found, MATERIALS)
-        error[choice] = np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(), np.abs(found.roughness - MATERIALS.roughness).mean()
-    assert solution.shadows.kept and solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
-    assert error["auto"][0] < 0.5 * error["off"][0]
-    assert error["auto"][1] < error["off"][1] + 0.01

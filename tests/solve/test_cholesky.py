@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorlib.solve.cholesky import positive_definite_inverse
+from factorlib.solve.marginal import positive_definite_inverse
 
 
 def test_inverse_and_determinant_are_those_of_numpy_and_exactly_symmetric():

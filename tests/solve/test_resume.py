@@ -8,17 +8,18 @@ from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.problem import JointProblem
-from factorlib.reflection import reflection_operator
-from factorlib.solve import insertion, rounds
-from factorlib.solve.bundle import solve
-from factorlib.solve.history import Run
-from factorlib.solve.options import Bundle
+from factorlib.solve import choices
+from factorlib.solve import solve as solving
+from factorlib.solve.fit import Schedule
+from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
-from factorlib.solve.rounds import from_nothing
+from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.stage import serial_map
+from tests.solve.made import OPERATOR, PRIOR
 
-OPERATOR = reflection_operator("network")
-BUNDLE = Bundle(light_prior="none", lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
+CHOICES = Choices(cells=24, splittings=1, observations=100)
+PARTS = ("effects", "tone", "materials", "splitting", "lights")
+PHASES = ("no shadows", "shadows", "shadows and bounces", "tone curves", "materials and lights", "splitting 1", "lights")
 
 
 class Killed(Exception):
@@ -26,25 +27,31 @@ class Killed(Exception):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small():
-    """Most of the time would go into looking for lobes, and few observations would leave no phase to settle."""
+def short():
+    """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(insertion, "DICTIONARY", {1.0: 16, 30.0: 60})
-        patch.setattr(rounds, "A_LOBE", 5)
+        patch.setattr(choices, "TRIAL", Schedule(2, (3,)))
+        patch.setattr(choices, "CURVED", Schedule(together=(2,), estimate=False))
+        for name, schedule in (("MATERIALS", Schedule(2, (2,))), ("AFTER_SPLITTING", Schedule(1, (2,))), ("LIGHTS", Schedule(together=(0, 2)))):
+            patch.setattr(solving, name, schedule)
         yield
 
 
 @pytest.fixture(scope="module")
 def blocks():
-    """Two lights with two photos each, some of which is hidden by what is made up: two models to choose from."""
+    """Two lights with two photos each, some of which is hidden, and some sent by other surfaces, as is made up."""
     rng = np.random.default_rng(4)
-    made = [block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=8, seed=i) for i in range(2)]
-    visibility = [(255 * (rng.random((len(b), 96)) < 0.9)).astype(np.uint8) for b in made]
-    directions = np.stack([fibonacci_sphere(96)] * 2)
-    return [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, visibility, strict=True)]
+    made = [block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=6, seed=i) for i in range(2)]
+    further = {"directions": np.stack([fibonacci_sphere(96)] * 2)}
+    return [
+        msgspec.structs.replace(
+            b, visibility=(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8), bounced=0.01 * rng.random((len(b), 6)), **further
+        )
+        for b in made
+    ]
 
 
-def answer(blocks, journal=None, stop=lambda event: False):
+def answer(blocks, journal=None, stop=lambda event: False, spread=serial_map):
     """All numbers of an answer, and the events reported."""
     events = []
 
@@ -53,11 +60,12 @@ def answer(blocks, journal=None, stop=lambda event: False):
         if stop(event):
             raise Killed
 
-    found = solve(JointProblem(blocks, OPERATOR), from_nothing(3), Run(BUNDLE, report, journal=journal or Journal()))
+    found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), Run(CHOICES, report, journal or Journal(), PRIOR))
     p = found.point
-    parts = [p.materials.vector(), found.lambertian, *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
-    decided = msgspec.json.encode([found.history, found.shadows, found.specular, found.loss])
-    return np.concatenate(parts).tobytes() + decided, events
+    parts = [p.materials.vector(), *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
+    decided = [found.history, found.shadows, found.interreflection, found.tone, found.splitting, found.loss]
+    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.lights)]
+    return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
 
 
 @pytest.fixture(scope="module")
@@ -65,53 +73,57 @@ def whole(blocks):
     return answer(blocks)
 
 
-def places(events):
-    """The number of the event at which each place to stop is first reached."""
-    second = next(k for k in range(1, len(events)) if events[k].round < events[k - 1].round)  # the other model begins
-    polish = [k for k, event in enumerate(events) if event.phase == "polish"]
-    return {
-        "a later round": next(k for k, event in enumerate(events) if event.round == 1),
-        "second model": second,
-        "second model, its last round": polish[0] - 1,
-        "polish, after the choice": polish[0],
-        "settle": polish[-1],
-    }
+class Fragile(Checkpoint):
+    """A checkpoint after which the process dies, once it holds a part."""
+
+    def __init__(self, path, part):
+        super().__init__(path)
+        self.part = part
+
+    def save(self, state):
+        super().save(state)
+        if self.part in state:
+            raise Killed
 
 
-PLACES = ("a later round", "second model", "second model, its last round", "polish, after the choice", "settle")
-
-
-@pytest.mark.parametrize("place", PLACES)
-def test_a_killed_solve_goes_on_to_the_same_bits(blocks, whole, tmp_path, place):
-    bits, events = whole
-    at = places(events)[place]
-    seen = []
+@pytest.mark.parametrize("part", PARTS)
+def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, part):
+    path = tmp_path / "solve.pt"
     with pytest.raises(Killed):
-        answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")), lambda event: seen.append(event) or len(seen) == at + 1)
-    again, _ = answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")))
-    assert again == bits
+        answer(blocks, Journal(Fragile(path, part)))
+    again, events = answer(blocks, Journal(Checkpoint(path)))
+    assert again == whole[0]
+    assert msgspec.json.encode(events) == msgspec.json.encode(whole[1])  # of parts that were done, too, for who shows progress
+
+
+def test_every_part_reports_what_it_does(whole):
+    _, events = whole
+    seen = [event.phase for event in events]
+    assert set(seen) <= set(PHASES) and {"no shadows", "shadows", "tone curves", "materials and lights", "splitting 1", "lights"} <= set(seen)
+    assert sorted(seen, key=PHASES.index) == seen and all(np.isfinite(event.loss) for event in events)
+    assert [event.round for event in events] == sorted(event.round for event in events)
+
+
+@pytest.mark.parametrize("phase", ["shadows", "materials and lights", "lights"])
+def test_a_solve_killed_in_the_midst_of_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, phase):
+    path, seen = tmp_path / "solve.pt", []
+    with pytest.raises(Killed):
+        answer(blocks, Journal(Checkpoint(path)), lambda event: event.phase == phase and (seen.append(event) or len(seen) == 2))
+    assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
 
 
 def test_what_was_done_is_not_done_again(blocks, tmp_path):
-    """Killed in the last phase, hardly anything is computed again; the rounds are reported again, for who shows progress."""
-    file, work = tmp_path / "solve.pt", []
-
-    def killed_in_the_last_phase(function, items):
-        if "polish 0" in (Checkpoint(file).load() or {}):
-            raise Killed
-        return serial_map(function, items)
-
+    """Killed after the last part, nothing of a descent is computed again."""
+    path, work = tmp_path / "solve.pt", []
     with pytest.raises(Killed):
-        problem = JointProblem(blocks, OPERATOR, spread=killed_in_the_last_phase)
-        solve(problem, from_nothing(3), Run(BUNDLE, lambda event: None, journal=Journal(Checkpoint(file))))
+        answer(blocks, Journal(Fragile(path, "lights")))
 
     def counted(function, items):
         work.append(len(items))
         return serial_map(function, items)
 
-    run = Run(BUNDLE, lambda event: work.append(0), journal=Journal(Checkpoint(file)))
-    solve(JointProblem(blocks, OPERATOR, spread=counted), from_nothing(3), run)
-    assert sum(work) <= len(blocks) * (BUNDLE.settle + 2)  # where it starts, its steps, the end in gauge
+    answer(blocks, Journal(Checkpoint(path)), spread=counted)
+    assert not work
 
 
 def test_a_file_that_cannot_be_read_starts_the_solve_again(blocks, whole, tmp_path):

@@ -15,7 +15,7 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.solution import FILES
-from factorlib.solve.thresholds import INTERREFLECTION
+from factorlib.solve.evidence import FOR
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
@@ -47,7 +47,7 @@ def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None,
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in seen}
     folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
     inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
-    quick = {"lobes": 6, "insert": 4, "rounds": 2, "iterations": 5, "polish": 3, "merge_degrees": 0.0, "light_prior": "none"}
+    quick = {"cells": 40, "splittings": 0, "observations": 300, "merge_degrees": 0.0}
     solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
     return out
 
@@ -72,15 +72,15 @@ def test_writes_the_fixed_artifacts(tmp_path, linked):
     assert (out / "convergence.parquet").exists() and (out / "uncertainty.json").exists()
 
 
-def test_lights_with_a_prior_are_a_lattice_with_errors_and_coverage(tmp_path, linked):
-    out = run(tmp_path, linked, light_prior="on")
+def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_path, linked):
+    out = run(tmp_path, linked, splittings=1)
     found = read_json(out / "materials.json")
-    assert found["model"]["light_prior"] and found["model"]["lobes"] == {"a": 400, "b": 400}
-    assert set(found["model"]["light_prior_chosen_by"]) == {"held_out_loss_with", "held_out_loss_without"}
+    (splitting,) = found["model"]["splitting_chosen_by"]
+    assert set(splitting) == {"kept", "held_out_loss_with", "held_out_loss_without", "margin"}
+    cells = 40 + 3 * 24 * splitting["kept"]
+    assert found["model"]["light_prior"] and found["model"]["lobes"] == {"a": cells, "b": cells}
     assert min(min(m["stderr"]["diffuse"]) for m in found["materials"].values()) > 0
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
-    again = read_json(run(tmp_path / "again", linked, start=out) / "materials.json")  # a lattice is no start for a few lobes
-    assert max(again["model"]["lobes"].values()) <= 12 and not again["model"]["light_prior"]
 
 
 def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, linked):
@@ -88,17 +88,18 @@ def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, li
         random = np.random.default_rng(0).integers(0, 2, (len(part), 128))
         return msgspec.structs.replace(part, visibility=np.full_like(random, 255) if kind == "nothing" else 255 * random)
 
-    same = [run(tmp_path / "plain", linked), run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()})]
+    few = {"cells": 24, "observations": 150, "tone": "off"}
+    same = [run(tmp_path / "plain", linked, **few), run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()}, **few)]
     for file in sorted(p.relative_to(same[0]) for p in same[0].rglob("*") if p.is_file()):
         assert (same[0] / file).read_bytes() == (same[1] / file).read_bytes(), file
     wrong = {k: hidden(v, "random") for k, v in linked.items()}  # radiance was made without
-    models = {c: read_json(run(tmp_path / c, wrong, self_shadowing=c) / "materials.json")["model"] for c in ("auto", "on", "off")}
+    models = {c: read_json(run(tmp_path / c, wrong, self_shadowing=c, **few) / "materials.json")["model"] for c in ("auto", "on", "off")}
     assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
     evidence = models["auto"]["self_shadowing_chosen_by"]
-    assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"]
+    assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"] and evidence["margin"] < -2
     for file in ("lobes.parquet", "uncertainty.json"):
         assert (tmp_path / "auto" / "out" / file).read_bytes() == (tmp_path / "off" / "out" / file).read_bytes(), file
-    assert set(models["on"]["self_shadowing_chosen_by"]) == {"held_out_loss_with"}
+    assert models["on"]["self_shadowing_chosen_by"] == {}
 
 
 def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_start(tmp_path, linked):
@@ -108,19 +109,16 @@ def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_s
         return msgspec.structs.replace(part, visibility=np.where(hidden, 0, 255).astype(np.uint8), met=met)
 
     seen = {k: lit(v) for k, v in linked.items()}
-    tables = {
-        c: read_json(run(tmp_path / c, seen, self_shadowing="on", interreflection=c) / "materials.json") for c in ("auto", "on", "off")
-    }
+    few = {"cells": 24, "observations": 150, "tone": "off", "self_shadowing": "on"}
+    tables = {c: read_json(run(tmp_path / c, seen, interreflection=c, **few) / "materials.json") for c in ("auto", "on", "off")}
     models = {c: table["model"] for c, table in tables.items()}
     assert models["on"]["interreflection"] and not models["off"]["interreflection"]
     evidence = models["auto"]["interreflection_chosen_by"]
-    assert models["auto"]["interreflection"] == (
-        evidence["held_out_loss_without"] > (1 + INTERREFLECTION.gain) * evidence["held_out_loss_with"]
-    )
+    assert models["auto"]["interreflection"] == (evidence["margin"] > FOR)
     assert "no free factor" in tables["on"]["gauge"]["rule"] and "no free factor" not in tables["off"]["gauge"]["rule"]
     assert models["off"]["interreflection_chosen_by"] == {}
     earlier = tmp_path / "auto" / "out"
-    again = read_json(run(tmp_path / "again", seen, start=earlier, self_shadowing="on") / "materials.json")["model"]
+    again = read_json(run(tmp_path / "again", seen, start=earlier, **few) / "materials.json")["model"]
     assert again["interreflection"] == models["auto"]["interreflection"]
     assert len(again["interreflection_chosen_by"]) < 2  # as it was decided
 
@@ -170,9 +168,18 @@ def test_the_papers_solver_writes_the_same_artifacts(tmp_path, linked):
     assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
 
 
+def test_the_solver_of_few_lobes_writes_the_same_artifacts(tmp_path, linked):
+    few = {"lobes": 6, "insert": 4, "rounds": 2, "iterations": 3, "polish": 2, "sample": 100}
+    out = run(tmp_path, linked, solver="few_lobes", **few)
+    found = read_json(out / "materials.json")
+    assert found["model"]["solver"] == "few_lobes" and not found["model"]["light_prior"]
+    assert max(found["model"]["lobes"].values()) <= 6 and set(found["materials"]) == set(NAMES)
+    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
+
+
 @pytest.mark.parametrize(
     "solver, operator, taken",
-    [("bundle", "auto", "network"), ("paper", "auto", "paper_network"), ("paper", "network", "network")],
+    [("bundle", "auto", "network"), ("few_lobes", "auto", "network"), ("paper", "auto", "paper_network"), ("paper", "network", "network")],
 )
 def test_each_solver_has_an_operator_of_its_own(solver, operator, taken):
     assert solve.operator_of(solve.Params(solver=solver, operator=operator)) == taken
@@ -185,24 +192,23 @@ class Killed(Exception):
 def test_a_killed_solve_goes_on_to_the_same_bytes(tmp_path, linked):
     said = []
 
-    def killed_in_the_polish(done, total, text=""):
+    def killed_while_lights_are_fitted(done, total, text=""):
         said.append(text)
-        if text.startswith("polish"):
+        if text.startswith("lights"):
             raise Killed
 
     whole = run(tmp_path / "whole", linked)
     with pytest.raises(Killed):
-        run(tmp_path / "killed", linked, killed_in_the_polish, tmp_path / "unfinished")
+        run(tmp_path / "killed", linked, killed_while_lights_are_fitted, tmp_path / "unfinished")
     out = run(tmp_path / "killed", linked, unfinished=tmp_path / "unfinished")
     for file in sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file()):
         assert (whole / file).read_bytes() == (out / file).read_bytes(), file
 
 
 def test_a_start_gives_the_answer_from_nothing_and_is_said(tmp_path, linked):
-    steady = {"rounds": 4, "iterations": 10, "polish": 15, "lobes": 12, "specular": "on"}
-    first = run(tmp_path / "first", {"a": linked["a"]}, **steady)
-    cold = run(tmp_path / "cold", linked, **steady)
-    warm = run(tmp_path / "warm", linked, start=first, **steady)
+    first = run(tmp_path / "first", {"a": linked["a"]})
+    cold = run(tmp_path / "cold", linked)
+    warm = run(tmp_path / "warm", linked, start=first)
     a, b = (read_json(folder / "materials.json") for folder in (warm, cold))
     assert a["model"]["started_from"] == {"materials": sorted(NAMES), "illuminations": ["a"]}
     assert "started_from" not in b["model"]
@@ -210,9 +216,10 @@ def test_a_start_gives_the_answer_from_nothing_and_is_said(tmp_path, linked):
         assert a["materials"][name]["roughness"] == pytest.approx(b["materials"][name]["roughness"], abs=0.03)
 
 
-def test_the_papers_solver_takes_no_start(tmp_path, linked):
+@pytest.mark.parametrize("solver", ["paper", "few_lobes"])
+def test_other_solvers_take_no_start(tmp_path, linked, solver):
     with pytest.raises(InputError, match="starts from nothing"):
-        run(tmp_path, linked, solver="paper", start=tmp_path)
+        run(tmp_path, linked, solver=solver, start=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -254,19 +261,19 @@ def of_one_room(exposures: dict[str, float], said: dict[str, float | None]) -> d
 
 def exposures_of(folder, seen, **params):
     light = {name: {"illumination": "room", "world_from_camera": None} for name in seen}
-    out = run(folder, seen, light=light, specular="on", tone="off", rounds=1, **params)
+    out = run(folder, seen, light=light, tone="off", **params)
     return {name: factors[0] for name, factors in read_json(out / "exposures.json").items()}
 
 
 def test_photos_of_one_light_start_from_what_exif_says_of_their_exposures(tmp_path):
     true = {"a": 1.0, "b": 64.0}  # six stops
-    found = exposures_of(tmp_path / "said", of_one_room(true, {"a": 0.5, "b": 30.0}), iterations=1, polish=0, settle=0)
+    found = exposures_of(tmp_path / "said", of_one_room(true, {"a": 0.5, "b": 30.0}))
     assert found["a"] == 1 and found["b"] == pytest.approx(64, rel=0.1)
-    unsaid = exposures_of(tmp_path / "unsaid", of_one_room(true, {"a": 0.5, "b": None}), iterations=1, polish=0, settle=0)
+    unsaid = exposures_of(tmp_path / "unsaid", of_one_room(true, {"a": 0.5, "b": None}))
     assert abs(np.log(unsaid["b"] / 64)) > abs(np.log(found["b"] / 64))
 
 
 def test_exif_of_a_photo_made_brighter_later_is_only_where_the_solve_starts(tmp_path, caplog):
-    found = exposures_of(tmp_path, of_one_room({"a": 1.0, "b": 1.2}, {"a": 1.0, "b": 3.0}), iterations=8, polish=4)
+    found = exposures_of(tmp_path, of_one_room({"a": 1.0, "b": 1.2}, {"a": 1.0, "b": 3.0}))
     assert found["b"] == pytest.approx(1.2, rel=0.02)
     assert "photo 'b': by its EXIF its exposure is 3 of its light's first photo" in caplog.text

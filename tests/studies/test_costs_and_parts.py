@@ -14,7 +14,7 @@ from benchmarks.solve import hard_cases
 from benchmarks.splits import CHANGES, splits_of
 from factorlib.evaluate.ball import constant_light
 from factorlib.runner.project import LIBRARY
-from factorlib.solve.options import Bundle
+from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.urm.observations import Observations
 from studies.catalogue.contents import STUDIES
 from studies.core import cost, hard, part, table
@@ -57,7 +57,7 @@ def operator_free_kinds():
 
 
 def test_options_of_parts_are_options():
-    known = {*Bundle.__struct_fields__, "robust_scale", "seen"}
+    known = {*FewLobes.__struct_fields__, "robust_scale", "seen", "shadows", "bounces"}
     for _, how in part.PARTS.values():
         assert how.keys() <= known and how.get("seen", "sure") in CHANGES
 
@@ -66,7 +66,7 @@ def test_options_of_parts_are_options():
 
 
 def test_a_cost_is_of_a_process_of_its_own_and_grows_with_the_work():
-    few = {"light_prior": "none", "lobes": 2, "insert": 2, "rounds": 1, "iterations": 1, "polish": 0, "settle": 0}
+    few = {"lobes": 2, "insert": 2, "rounds": 1, "iterations": 1, "polish": 0, "settle": 0}
     ballast = np.ones(40_000_000)  # 320 MB here are none there
     small, large = cost_of(Sized(0, 1, few)), cost_of(Sized(0, 3, few | {"iterations": 4, "polish": 4}))
     assert 0 < small.seconds < large.seconds and small.before <= small.peak < 10**9 + ballast.nbytes

@@ -10,7 +10,8 @@ from factorlib.conventions import FRONT
 from factorlib.evaluate.ball import constant_light
 from factorlib.evaluate.gauge import connected_components
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.solve import natural, rounds
+from factorlib.solve import fit
+from factorlib.solve.few_lobes import rounds
 from factorlib.stage import Inputs, silent
 from studies.catalogue.paper_sets import docksta, unlinked
 from studies.core.case import World, light_name
@@ -82,13 +83,13 @@ def test_a_mesh_of_few_triangles_has_few():
 
 
 def test_the_robust_loss_is_off_inside_and_back_after_an_error():
-    before = rounds.LEAST_ROBUST_SCALE, natural.ROBUST_SCALE
+    before = rounds.LEAST_ROBUST_SCALE, fit.ROBUST
     with robust_loss(True):
-        assert (rounds.LEAST_ROBUST_SCALE, natural.ROBUST_SCALE) == before
+        assert (rounds.LEAST_ROBUST_SCALE, fit.ROBUST) == before
     with pytest.raises(ZeroDivisionError), robust_loss(False):
-        assert rounds.LEAST_ROBUST_SCALE == natural.ROBUST_SCALE == BEYOND_ALL
+        assert rounds.LEAST_ROBUST_SCALE == fit.ROBUST.robust_scale == BEYOND_ALL
         raise ZeroDivisionError
-    assert (rounds.LEAST_ROBUST_SCALE, natural.ROBUST_SCALE) == before
+    assert (rounds.LEAST_ROBUST_SCALE, fit.ROBUST) == before
 
 
 def test_docksta_is_linked_by_one_material():
@@ -99,7 +100,7 @@ def test_docksta_is_linked_by_one_material():
         assert len(set(component.values())) == parts
 
 
-SOLVE = {"light_prior": "none", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
+SOLVE = {"cells": 24, "splittings": 0, "observations": 100}
 
 
 def test_a_case_from_lights_to_scores_warm(tmp_path):

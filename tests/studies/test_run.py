@@ -21,7 +21,7 @@ from studies.run.project import data_of, studies
 from studies.run.verbs import copy_pictures, forget, make
 from studies.steps.spheres import conclude, observe, score, solve, worlds
 
-SOLVE = {"light_prior": "none", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
+SOLVE = {"solver": "few_lobes", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
 TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, solve=SOLVE, light_rows=8, light_spp=1)
 NAME = "matrix-size"
 
@@ -57,7 +57,7 @@ def test_a_change_of_the_scores_solves_nothing_again(tmp_path):
     """Neither what a study says nor how it is scored is in the key of a solve."""
     records = survey(studies(TINY, tmp_path), NAME, None, []).records
     solve_ = next(record for step, record in records.items() if step.stage == "solve")
-    assert "source:studies.core.case" in solve_ and "source:stages.solve" in solve_ and "source:factorlib.solve.bundle" in solve_
+    assert "source:studies.core.case" in solve_ and "source:stages.solve" in solve_ and "source:factorlib.solve.solve" in solve_
     assert not {"source:studies.core.score", "source:studies.core.study", "source:studies.core.world", "source:studies.catalogue.matrix_size", "source:studies.report.figure"} & solve_.keys()
     assert not any("templates" in name or name.endswith("pipeline.yaml") for name in solve_ if name.startswith("data:studies"))
 

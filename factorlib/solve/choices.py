@@ -1,0 +1,133 @@
+"""What a scene needs of the model, decided in the model that gives the answer.
+
+    effects   nothing, shadows of the given meshes, or shadows and the light that surfaces send each other: each is fitted from nothing, on
+              fewer observations and cells.  Shadows stay unless the evidence is against them, bounces need evidence
+    tone      exponents of tone curves are freed for all photos, and kept where evidence is for them, where the loss without them is more
+              than `CURVED_GAIN` higher, and where they end within what cameras do: an exponent also fits some errors of the rest of
+              the model, such as normals
+    roughness where there are few materials, the start decides in which valley a fit ends: a smooth surface in a soft light looks like a rough
+              one in a sharp light.  The fit from several starts that explains held-out observations best goes on
+
+All by `factorlib.solve.evidence`, on observations whose normals are sure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+
+from factorlib.light.prior import LightPrior
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.tone import beyond_cameras, with_curves
+from factorlib.solve.evidence import AGAINST, FOR, Evidence, Losses, compare, losses_of
+from factorlib.solve.fit import Fit, Schedule, fitted, start_of
+from factorlib.solve.options import Choices
+
+TRIAL_OBSERVATIONS, TRIAL_CELLS = 1500, 250  # of a light, while models are compared
+TRIAL = Schedule(lights=6, together=(14, 8))
+CURVED, CURVED_GAIN = Schedule(together=(8,), estimate=False), 0.25  # gains of lights without curves whose normals are wrong: up to .2
+FEW = 2  # materials: with so few, several starts are tried
+STARTS = (0.15, 0.4, 0.8)  # roughness
+
+Report = Callable[[str, Fit], Callable[[float], None]]  # by what is done, and its start: what to call at every point that is tried
+
+
+class Effects(msgspec.Struct, frozen=True):
+    """The fit of the chosen model on few observations, and the evidence for its parts."""
+
+    fit: Fit
+    shadows: Evidence
+    bounces: Evidence
+
+    def of(self, problem: JointProblem) -> JointProblem:
+        """The problem with what was chosen."""
+        return problem.with_effects(self.shadows.kept, self.bounces.kept)
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """A fit of one model, and what it makes of held-out observations."""
+
+    fit: Fit
+    losses: Losses
+
+
+def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
+    """The observations on which models are compared."""
+    return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
+
+
+def effects_chosen(
+    problem: JointProblem, starts: list[Point], prior: LightPrior, choices: Choices, report: Report
+) -> Effects:
+    """Shadows and bounces; problem: sure observations;  starts: of which the best counts."""
+    sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
+    shadows = {"on": hidden, "off": False, "auto": None if hidden else False}[choices.self_shadowing]
+    bounces = {"on": True, "off": False, "auto": None}[choices.interreflection] if problem.has_bounces else False
+    tried: dict[tuple[bool, bool], Trial] = {}
+
+    def trial(with_shadows: bool, with_bounces: bool) -> Trial:
+        """The best fit of one model."""
+        if (with_shadows, with_bounces) not in tried:
+            name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
+            model = sample.with_effects(with_shadows, with_bounces)
+            begun = [start_of(start) for start in starts]
+            fits = [fitted(model, one, prior, TRIAL, _all_free(one.point), report(name, one)) for one in begun]
+            trials = [Trial(fit, losses_of(model, fit.point)) for fit in fits]
+            tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one.losses))
+        return tried[with_shadows, with_bounces]
+
+    said = Evidence(bool(shadows)) if shadows is not None else compare(trial(False, False).losses, trial(True, False).losses, AGAINST)
+    if not said.kept:
+        return Effects(trial(False, False).fit, said, Evidence(False))
+    lit = Evidence(bool(bounces)) if bounces is not None else compare(trial(True, False).losses, trial(True, True).losses, FOR)
+    return Effects(trial(True, lit.kept).fit, said, lit)
+
+
+def _all_free(point: Point) -> np.ndarray:
+    return np.ones((len(point.materials), 7), bool)
+
+
+def _geometric_mean(losses: Losses) -> float:
+    """Of the lights' mean losses, weighted by their observations: its logarithm, to six digits, so that rounding does not decide."""
+    counts = [len(values) for values in losses.values]
+    logs = [len(values) and np.log(max(float(np.mean(values)), 1e-12)) for values in losses.values]
+    return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
+
+
+class Curves(msgspec.Struct, frozen=True):
+    """The fit with the tone curves that are kept, and the evidence for each light's."""
+
+    fit: Fit
+    evidence: list[Evidence]
+
+
+def curves_chosen(problem: JointProblem, fit: Fit, prior: LightPrior, choices: Choices, report: Report) -> Curves:
+    """Tone curves; problem: sure observations, with the effects that were chosen;  fit: of few of them."""
+    lights = fit.point.lights
+    had = [len(light.log_tone) > 0 for light in lights]
+    if choices.tone == "off" or problem.none_held_out:
+        return Curves(fit, [Evidence(has) for has in had])
+    sample, freed = sample_of(problem, choices), [light if has else with_curves(light) for light, has in zip(lights, had, strict=True)]
+    curved = _with_lights(fit, freed)
+    curved = fitted(sample, curved, prior, CURVED, _all_free(fit.point), report("tone curves", curved))
+    before, after = losses_of(sample, fit.point), losses_of(sample, curved.point)
+    evidence = []
+    for k, light in enumerate(curved.point.lights):
+        one = compare(Losses([before.values[k]], [before.clusters[k]]), Losses([after.values[k]], [after.clusters[k]]), FOR)
+        gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
+        kept = one.kept and gain > CURVED_GAIN and not beyond_cameras(light)
+        evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))
+    if all(one.kept for one in evidence):
+        return Curves(curved, evidence)
+    if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
+        return Curves(fit, evidence)
+    kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
+    begun = _with_lights(fit, kept)
+    return Curves(fitted(sample, begun, prior, CURVED, _all_free(fit.point), report("tone curves", begun)), evidence)
+
+
+def _with_lights(fit: Fit, lights: list) -> Fit:
+    return msgspec.structs.replace(fit, point=Point(fit.point.materials, lights))

@@ -1,0 +1,175 @@
+"""Materials and lights fitted together, by marginal likelihood, and how much each light's observations and prior count.
+
+If residuals were independent, the sum of them over a cluster of n would have a variance of n σ².  It is larger, for residuals are alike (the
+design effect of L. Kish, Survey Sampling, 1965) and larger than the noise model says.  The factor is the temperature T, by which squared
+residuals are divided:
+
+    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`     k: clusters of nearby mirror directions;  r: in σ, clipped at 3   (1)
+
+`least` is 1 while materials are fitted: cells are never quite fine enough, and with less noise than the model says materials would make up
+for that.  Given the materials, lights may be as exact as the residuals are.
+
+Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.  So are the factors by
+which the light's contrast and colour differ from those of a typical light (equation (4) of `factorlib.light.prior`).
+
+Materials are fitted to the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
+rougher than it is, however little it weighs.  Lights are fitted once more to all observations, given those materials: rims and thin parts
+show directions that nothing else shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.light.prior import LightPrior
+from factorlib.model.blocks import Block
+from factorlib.model.clusters import clusters_of
+from factorlib.model.illumination import Illumination
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.model.reflected import Reflections
+from factorlib.solve.descent import Descent, State
+from factorlib.solve.marginal import Field, Marginal, positive_definite_inverse
+from factorlib.solve.material_prior import MaterialPrior, materials_of, unknowns_of
+
+SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
+DARK = 0.2  # of the noise model's absolute part is left where normals are sure
+ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
+START_TEMPERATURE = 10.0
+LEAST_AT_START = 0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
+
+
+class Hyperparameters(msgspec.Struct, frozen=True):
+    """How much one light's observations and prior count.
+
+    temperature   T of (1), by which squared residuals are divided
+    factors       s_k² of the prior: contrast of luminance and of colour beside those of a typical light
+    """
+
+    temperature: float = START_TEMPERATURE
+    factors: list[float] = msgspec.field(default_factory=lambda: [1.0, 1.0, 1.0])
+
+
+class Fit(msgspec.Struct, frozen=True):
+    """A point, how much each light's observations and prior count there, and minus twice the log marginal likelihood."""
+
+    point: Point
+    hyperparameters: list[Hyperparameters]
+    value: float = float("inf")
+
+
+class Schedule(msgspec.Struct, frozen=True):
+    """How many steps a fit takes.
+
+    lights     of the lights alone, materials given, before all else
+    together   of materials and lights; hyperparameters are estimated anew before each of these descents but the first
+    estimate   whether they are estimated before the first one too: after a splitting, residuals are those of the splitting
+    least      the least temperature of (1)
+    """
+
+    lights: int = 0
+    together: tuple[int, ...] = ()
+    estimate: bool = True
+    least: float = 1.0
+
+
+def fitted(
+    problem: JointProblem,
+    start: Fit,
+    prior: LightPrior,
+    schedule: Schedule,
+    free: Bool[np.ndarray, "m 7"],
+    report: Callable[[float], None] = lambda loss: None,
+) -> Fit:
+    """The fit of the observations that are not held out.
+
+    start: where the descent begins; its cells stay;  free: unknowns of the materials that change;  report: called at every point that is
+    tried, with the mean robust loss of what is fitted
+    """
+    problem = problem.fitted()
+    materials = above_zero(start.point.materials, free)
+    point = Point(materials, start.point.lights)
+    descent = Descent(MaterialPrior(materials, problem.blocks), problem.spread, report)
+    fields = list(problem.spread(lambda one: field_of(*one, prior), list(zip(problem.illuminations(point), start.hyperparameters, strict=True))))
+    state, hyperparameters = descent.run(fields, unknowns_of(materials), np.zeros_like(free), schedule.lights), start.hyperparameters
+    for number, iterations in enumerate(schedule.together):
+        fields = state.fields
+        if number or schedule.estimate:
+            parts = list(zip(state.fields, state.parts, strict=True))
+            hyperparameters = list(problem.spread(lambda one: estimated(*one, prior, schedule.least), parts))
+            fields = [recounted(field, one, prior) for field, one in zip(state.fields, hyperparameters, strict=True)]
+        state = descent.run(fields, state.theta, free, iterations)
+    return Fit(_point_of(state, materials, free), hyperparameters, state.value)
+
+
+def _point_of(state: State, start: Materials, free: Bool[np.ndarray, "m 7"]) -> Point:
+    """Unknowns that are not free are those of the start to the last bit."""
+    rows = np.where(free, materials_of(state.theta).rows(), start.rows())
+    return Point(Materials(rows[:, :3], rows[:, 3:6], rows[:, 6]), [field.illumination.light for field in state.fields])
+
+
+def field_of(illumination: Illumination, one: Hyperparameters, prior: LightPrior) -> Field:
+    """The illumination with its table, and how much it and the prior count."""
+    table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator)
+    precision, log_determinant = prior.precision(illumination.light.axis, one.factors)
+    return Field(msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST)
+
+
+def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
+    """The field with other hyperparameters."""
+    precision, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
+    return msgspec.structs.replace(field, precision=precision, log_determinant=log_determinant, temperature=one.temperature)
+
+
+def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
+    """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
+    light = field.illumination.light
+    cells = 3 * len(light)
+    covariance = positive_definite_inverse(part.light_hessian[:cells, :cells]).matrix
+    factors = prior.likeliest_factors(light.axis, light.log_radiance, covariance)
+    return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)
+
+
+def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
+    """T of (1)."""
+    number, bounded = clusters_of(block), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    sums = [np.bincount(number, channel) for channel in bounded.T]
+    return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
+
+
+def above_zero(materials: Materials, free: Bool[np.ndarray, "m 7"]) -> Materials:
+    """The materials, reflectances that are free raised to at least `LEAST_AT_START`."""
+    rows = materials.rows()
+    rows[:, :6] = np.where(free[:, :6], np.maximum(rows[:, :6], LEAST_AT_START), rows[:, :6])
+    return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
+
+
+def sure_ones(problem: JointProblem) -> JointProblem:
+    """The observations that materials are fitted to: those whose normals are sure, with less noise in the dark."""
+    blocks = [block.take(sure(block)) for block in problem.blocks]
+    blocks = [block.with_noise(msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute)) for block in blocks]
+    return msgspec.structs.replace(problem, blocks=blocks)
+
+
+def sure(block: Block) -> Bool[np.ndarray, " n"]:
+    """Whether each normal's confidence is at least `SURE` times the median of its material in this light, by weight."""
+    result = np.ones(len(block), bool)
+    if block.confidence is None:
+        return result
+    weight = np.square(block.precision * block.noise.sigma(block.radiance)).max(1)
+    for m in np.unique(block.material):
+        rows = block.material == m
+        typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
+        result[rows] = block.confidence[rows] >= SURE * typical
+    return result
+
+
+def start_of(point: Point, hyperparameters: Sequence[Hyperparameters] | None = None) -> Fit:
+    """A point before any descent."""
+    return Fit(point, list(hyperparameters or [Hyperparameters() for _ in point.lights]))

@@ -1,0 +1,60 @@
+"""Interreflection under few lobes: derivatives, and weights fitted to what bounces leave."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.solve.problems import MATERIALS, block, random_light
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.reflection import reflection_operator
+from factorlib.solve.few_lobes import unknowns
+from factorlib.solve.few_lobes.jacobian import fit_loss, with_light
+from factorlib.solve.few_lobes.normal_equations import energy_equations, normal_equations
+from factorlib.solve.few_lobes.responses import responses
+from factorlib.solve.few_lobes.weights import fitted_illumination
+
+OPERATOR = reflection_operator("closed_form", dtype="float64")
+LOSS = Loss(robust_scale=3.0, prior=0.0)
+
+
+@pytest.fixture(scope="module", params=["linear", "toned"])
+def given(request):
+    """Observations of two photos in a light fixed to the world, half of them reached by light from other surfaces, and a wrong light."""
+    rng = np.random.default_rng(1)
+    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=14)
+    data = msgspec.structs.replace(data, bounced=rng.random((len(data), 6)) * (rng.random((len(data), 1)) < 0.5))
+    guess = random_light(rng, 4, photos=2)
+    tone = np.log([1.3, 0.8]) if request.param == "toned" else np.zeros(0)
+    return Illumination(data, Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone), MATERIALS, OPERATOR)
+
+
+def moved_light(given, step):
+    return with_light(given, unknowns.moved_light(given.light, step, MATERIALS.blur))
+
+
+def moved_materials(given, step):
+    return msgspec.structs.replace(given, materials=Materials.of_vector(MATERIALS.vector() + step))
+
+
+@pytest.mark.parametrize("moved", [moved_light, moved_materials])
+def test_gradients_are_finite_differences_of_the_loss(given, moved):
+    found, step = normal_equations(given, LOSS), 1e-6
+    gradient = found.light_gradient if moved is moved_light else found.material_gradient
+    expected = [(fit_loss(moved(given, d), LOSS) - fit_loss(moved(given, -d), LOSS)) / (4 * step) for d in np.eye(len(gradient)) * step]
+    np.testing.assert_allclose(gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
+
+
+def test_weights_are_fitted_to_what_bounces_leave(given):
+    """Energies have the same equations alone; observations of a light and of bounces give that light back."""
+    light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
+    lit, p = with_light(given, light), len(light)
+    part, whole = energy_equations(lit, responses(lit), LOSS), normal_equations(lit, LOSS)
+    np.testing.assert_allclose(part.loss, whole.loss)
+    np.testing.assert_allclose(part.gradients.reshape(-1), whole.light_gradient[3 * p : 6 * p], rtol=1e-9)
+    data = msgspec.structs.replace(given.block, radiance=lit.radiance(), precision=np.ones_like(given.block.precision))
+    dark = msgspec.structs.replace(light, weight=light.weight / 3)
+    found = fitted_illumination(Illumination(data, dark, MATERIALS, OPERATOR), Loss(robust_scale=1e6, prior=0.0)).light
+    np.testing.assert_allclose(found.weight, light.weight, rtol=1e-5, atol=1e-6 * light.weight.max())

@@ -1,0 +1,229 @@
+"""What is in the model is decided by what is held out: shadows, bounces, tone curves, the start."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.solve.problems import MATERIALS, factor_between, sphere_normals
+from factorlib.diagnose.identifiability import unlikely_curves
+from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.tone import curve
+from factorlib.model.interreflection import bounced_light
+from factorlib.model.lights import even_cells
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations
+from factorlib.model.problem import JointProblem
+from factorlib.solve.choices import CURVED_GAIN, sample_of
+from factorlib.solve.evidence import AGAINST, FOR
+from factorlib.solve.options import Choices
+from factorlib.solve.solve import Run, from_nothing, solve
+from factorlib.urm.observations import Observations
+from tests.model.test_shadowing import bowls, rough_light
+from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
+
+QUICK = Choices(cells=60, splittings=0, observations=300)
+OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
+MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all photos share is known less than those between photos
+
+
+def solved(blocks, choices=QUICK, **others):
+    choices = msgspec.structs.replace(choices, **others)
+    return solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), Run(choices, prior=PRIOR))
+
+
+# ── shadows and bounces, on bowls ────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def shaded():
+    return [blocks_of_observations(bowls(f"room{i}", rough_light(20 + i)), Noise(0.02, 0.02))[0] for i in range(2)]
+
+
+def lit_bowls(name, seed) -> Observations:
+    """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
+    seen, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
+    exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
+    facing = met_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
+    met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
+    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, UNMET).astype(np.uint16))
+    shown = seen.radiance
+    for _ in range(8):
+        sent = bounced_light(seen, shown)
+        shown = seen.radiance + MATERIALS.diffuse[seen.material] * sent[:, :3] + MATERIALS.specular[seen.material] * sent[:, 3:]
+    return msgspec.structs.replace(seen, radiance=shown)
+
+
+@pytest.fixture(scope="module")
+def lit():
+    return [blocks_of_observations(lit_bowls(f"room{i}", 20 + i), Noise(0.02, 0.02))[0] for i in range(2)]
+
+
+def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
+    error = {}
+    for choice in ("off", "auto"):
+        solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
+        found = solution.point.materials
+        factor = factor_between(found, MATERIALS)
+        error[choice] = np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(), np.abs(found.roughness - MATERIALS.roughness).mean()
+    assert solution.shadows.kept and solution.shadows.margin > FOR
+    assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
+    assert error["auto"][0] < 0.5 * error["off"][0], error
+    assert error["auto"][1] < error["off"][1] + 0.01, error
+
+
+def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are(lit):
+    error = {}
+    for choice in ("off", "auto"):
+        solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
+        error[choice] = np.abs(solution.point.materials.diffuse / MATERIALS.diffuse - 1).mean()  # absolute: no factor is taken out
+    assert solution.interreflection.kept and solution.interreflection.margin > FOR
+    assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
+    assert error["auto"] < 0.5 * error["off"], error
+
+
+def tilted(seen, seed, degrees):
+    """The same observations, their normals wrong by a smooth field of tilts of at most so many degrees an axis."""
+    rng = np.random.default_rng(seed)
+    waves = np.sin(seen.normal @ (2 * rng.normal(size=(3, 3))).T + rng.uniform(0, 6, 3))
+    normal = seen.normal + np.radians(degrees) * waves
+    return msgspec.structs.replace(seen, normal=(normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(seen.normal.dtype))
+
+
+@pytest.mark.parametrize("bounced", [False, True])
+def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
+    """Where the photos show no bounces, those computed from the mesh still explain a little of what wrong normals cause.  They fit best
+    when they are weak, so a solve that kept them would make all reflectances ten times too small."""
+    lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
+    direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
+    shown = [one if bounced else msgspec.structs.replace(one, radiance=other.radiance) for one, other in zip(lit, direct, strict=True)]
+    blocks = [blocks_of_observations(tilted(one, 10 + i, 12.0), Noise(0.02, 0.02))[0] for i, one in enumerate(shown)]
+    solution = solved(blocks, OF_SHAPES, self_shadowing="on")
+    assert solution.interreflection.kept == bounced, solution.interreflection
+    assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
+
+
+def test_off_is_the_solve_of_the_same_observations_without_codes(lit):
+    quick = msgspec.structs.replace(QUICK, cells=30, observations=100, self_shadowing="on", tone="off")
+    one = solved(lit, quick, interreflection="off")
+    other = solved([room.without_bounces() for room in lit], quick)
+    assert not one.interreflection.kept and not other.interreflection.kept
+    np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
+
+
+def test_the_order_of_photos_flips_no_choice(lit):
+    quick = msgspec.structs.replace(QUICK, cells=24, observations=150)
+    one, other = (solved(order, quick) for order in (lit, lit[::-1]))
+    for name in ("shadows", "interreflection"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert a.kept == b.kept and a.margin == pytest.approx(b.margin, rel=0.05, abs=0.2)
+    assert [a.kept for a in one.tone] == [b.kept for b in other.tone[::-1]]
+    np.testing.assert_allclose(one.point.materials.vector(), other.point.materials.vector(), rtol=0.02, atol=0.002)
+
+
+def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(shaded):
+    rng = np.random.default_rng(0)
+    open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
+    directions = np.stack([fibonacci_sphere(96)])
+    wrong = [msgspec.structs.replace(b, visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8), directions=directions) for b in open_]
+    few = msgspec.structs.replace(QUICK, cells=24, observations=150, tone="off")
+    found = solved(wrong, few)
+    assert not found.shadows.kept and found.shadows.margin < AGAINST
+    assert solved(wrong, few, self_shadowing="on").shadows.kept
+    nothing = [msgspec.structs.replace(b, visibility=np.full((len(b), 96), 255, np.uint8), directions=directions) for b in open_]
+    assert solved(nothing, few).shadows.kept
+
+
+# ── tone curves ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def rooms(photos=1, size=12):
+    rng = np.random.default_rng(3)
+    exposures = [np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)]) for _ in range(3)]
+    return spheres([on_even_cells(drawn(30 + k, 60), e) for k, e in enumerate(exposures)], size=size, noise=0.05).blocks
+
+
+def through(data, *exponents):
+    """What cameras with tone curves make of it, one exponent a photo."""
+    shown = curve(data.radiance, np.array(exponents)[data.photo][:, None])
+    return msgspec.structs.replace(data, radiance=shown, precision=1 / np.hypot(0.05, 0.05 * shown))
+
+
+def exponents_of(solution):
+    return [np.exp(light.log_tone) for light in solution.point.lights]
+
+
+def error_of(solution):
+    found = solution.point.materials
+    return np.abs(found.diffuse * factor_between(found, MATERIALS) - MATERIALS.diffuse).max()
+
+
+@pytest.fixture(scope="module")
+def curved():
+    return [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
+
+
+@pytest.fixture(scope="module")
+def found(curved):
+    return solved(curved, MORE)
+
+
+def test_curves_are_found_and_spare_the_materials(curved, found):
+    without = solved(curved, MORE, tone="off")
+    np.testing.assert_allclose([float(e[0]) if len(e) else 1.0 for e in exponents_of(found)], (1.3, 0.8, 1.0), rtol=0.05)
+    assert all(len(e) == 0 for e in exponents_of(without))
+    assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
+
+
+def test_the_evidence_is_that_held_out_losses_fall(found):
+    assert [one.kept for one in found.tone][:2] == [True, True]
+    for one in found.tone:
+        assert one.kept == (one.margin > FOR and one.held_out_loss_without > (1 + CURVED_GAIN) * one.held_out_loss_with)
+
+
+def test_photos_of_one_light_have_a_curve_each():
+    blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2, size=14))]
+    np.testing.assert_allclose(exponents_of(solved(blocks, MORE))[0], (1.0, 1.3), rtol=0.05)
+
+
+def test_linear_photos_stay_linear_and_say_why():
+    solution = solved(rooms())
+    assert all(len(e) == 0 for e in exponents_of(solution))
+    assert [one.kept for one in solution.tone] == [False] * 3
+
+
+def test_a_curve_that_no_camera_has_is_not_believed():
+    """What else is wrong would be explained by an exponent at its bounds."""
+    blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
+    solution = solved(blocks, cells=40, observations=200)
+    assert len(exponents_of(solution)[0]) == 0
+    assert solution.tone[0].held_out_loss_with < 0.8 * solution.tone[0].held_out_loss_without and not solution.tone[0].kept
+
+
+def test_an_exponent_near_its_bounds_is_named():
+    blocks = rooms()[:2]
+    lights = [on_even_cells(np.zeros((3, 30)), log_tone=np.log([g])) for g in (1.2, 1.65)]
+    assert [("room1" in said, "1.6" in said) for said in unlikely_curves(blocks, lights)] == [(True, True)]
+
+
+# ── what is compared, and from where ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_nothing_is_decided_where_nothing_is_held_out(curved):
+    blocks = [block.with_none_held_out() for block in curved]
+    found = solved(blocks, cells=30, observations=100)
+    assert not any(one.kept for one in found.tone) and found.splitting == []
+
+
+def test_models_are_compared_on_few_observations_of_each_material(curved):
+    sample = sample_of(JointProblem(curved, OPERATOR), Choices(observations=50))
+    for block, whole in zip(sample.blocks, curved, strict=True):
+        assert 0 < len(block) <= 50 + 50 // 3 and set(np.unique(block.material)) == set(np.unique(whole.material)) and block.held_out.any()
+
+
+def test_few_materials_start_from_several_roughnesses_and_many_from_one():
+    problem = JointProblem(rooms(), OPERATOR)
+    assert [len(from_nothing(n).points(problem, 30)) for n in (3, 40)] == [1, 1]
+    only = JointProblem([block.take(block.material < 2) for block in problem.blocks], OPERATOR)
+    points = from_nothing(2).points(only, 30)
+    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and all(len(p.lights[0]) == len(even_cells(30)) for p in points)

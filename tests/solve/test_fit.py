@@ -1,0 +1,209 @@
+"""Materials and lights fitted together: found in lights drawn from the prior, and laws of the parts of a fit."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.solve.problems import MATERIALS, factor_between
+from factorlib.model.gauge import in_gauge
+from factorlib.model.loss import Loss
+from factorlib.model.materials import Materials
+from factorlib.model.noise import Noise
+from factorlib.model.point import Point
+from factorlib.model.problem import JointProblem
+from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
+from factorlib.solve.marginal import marginal
+from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS, DIFFUSE, LEVEL, TINT, MaterialPrior, unknowns_of
+from tests.solve.made import FEW, FREE, OPERATOR, PRIOR, START, begun, field, photographed, spheres
+
+WHOLE, QUICK, LIGHTS = Schedule(4, (14, 10)), Schedule(4, (8, 6)), Schedule(together=(0, 10, 10))
+
+
+def materials_in(problem, cells=FEW, start=START, schedule=WHOLE, free=FREE) -> Fit:
+    return fitted(problem, begun(problem, cells, start), PRIOR, schedule, free)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    problem, true = photographed(5, 3)
+    return problem, true, materials_in(problem)
+
+
+def test_materials_in_natural_lights(solved):
+    _, _, found = solved
+    factor = factor_between(found.point.materials, MATERIALS)
+    assert np.abs(found.point.materials.roughness - MATERIALS.roughness).max() < 0.1
+    whole = (found.point.materials.diffuse + found.point.materials.specular) * factor
+    assert np.abs(whole / (MATERIALS.diffuse + MATERIALS.specular) - 1).max() < 0.15
+
+
+def test_the_gauge_is_where_the_brightest_material_is_of_ordinary_brightness(solved):
+    """Lights say nothing of it; without the determinant by the light it would run away."""
+    problem, _, found = solved
+    bright = Materials(10 * START.diffuse, START.specular, START.roughness)
+    for one in (found, materials_in(problem, start=bright)):
+        reflectance = (one.point.materials.diffuse + one.point.materials.specular).mean(1)
+        assert abs(np.log(reflectance.max() / BRIGHTEST)) < 2 * BRIGHTNESS
+
+
+def test_a_fit_lowers_its_value(solved):
+    """The prior on k_d is about the start, so the value of a fit that goes on is another, by little."""
+    problem, _, found = solved
+    again = fitted(problem, found, PRIOR, Schedule(), FREE)
+    assert again.value == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
+    for step in (Schedule(together=(3,), estimate=False), Schedule(lights=3)):
+        assert fitted(problem, found, PRIOR, step, FREE).value <= again.value + 1e-9 * abs(again.value)
+
+
+def test_what_is_not_free_stays_to_the_last_bit_and_what_is_moves():
+    problem, _ = photographed(6, 1, cells=40, size=10)
+    free = np.zeros((3, 7), bool)
+    free[1, 6] = True
+    found = materials_in(problem, 40, schedule=Schedule(2, (4,)), free=free).point.materials
+    assert (found.rows() == START.rows()).reshape(3, 7)[~free].all() and found.roughness[1] != START.roughness[1]
+
+
+def test_what_starts_nil_is_found_too():
+    """By logarithms nothing would move it."""
+    problem, _ = photographed(8, 2, size=12)
+    nil = Materials(np.full((3, 3), 1e-5), np.full((3, 3), 0.1), np.full(3, 0.4))
+    nil.diffuse[0] = 0.5
+    found = materials_in(problem, start=nil).point.materials
+    assert (found.diffuse[1] / found.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
+
+
+def test_order_of_lights_changes_nothing():
+    problem, _ = photographed(7, 2, cells=40, size=10)
+    turned = JointProblem(problem.blocks[::-1], OPERATOR, Loss())
+    one, other = (materials_in(p, 40, schedule=QUICK).point.materials.vector() for p in (problem, turned))
+    assert np.allclose(one, other, rtol=1e-3, atol=1e-4)
+
+
+def test_gold_among_paints_is_not_taken_for_a_paint():
+    """Up to the factor per channel that is free."""
+    gold = Materials(np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]), np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]), MATERIALS.roughness)
+    problem, _ = photographed(10, 2, materials=gold)
+    found = materials_in(problem).point.materials
+    assert found.specular[2] * factor_between(found, gold) == pytest.approx(gold.specular[2], rel=0.15)
+
+
+def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
+    problem, _, found = solved
+    again = fitted(problem, found, PRIOR, LIGHTS, ~FREE)
+    assert np.array_equal(again.point.materials.vector(), found.point.materials.vector())
+    for one, how, light, after in zip(problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True):
+        alone = field(JointProblem([one], OPERATOR), light, found.point.materials, how.temperature)
+        deviation = np.sqrt(np.diag(np.linalg.inv(marginal(alone, materials_given=True).light_hessian))).reshape(3, -1)
+        assert np.mean(np.abs(after.log_radiance - light.log_radiance) < deviation) > 0.95
+
+
+def test_lights_from_all_show_what_the_others_alone_see(solved):
+    """Found from a half of the observations, given the true materials, lights explain the other half better afterwards."""
+    problem, _, found = solved
+    half = [msgspec.structs.replace(b, confidence=np.where(b.normal[:, 0] > 0, 0.9, 0.1)) for b in problem.blocks]
+    of_half = fitted(sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE, FREE)
+    others = msgspec.structs.replace(problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks])
+    after = fitted(problem, of_half, PRIOR, LIGHTS, ~FREE)
+    assert others.held_out_loss(after.point) < 0.5 * others.held_out_loss(of_half.point)
+
+
+def test_the_gauge_of_an_answer_shows_the_same(solved):
+    problem, _, found = solved
+    for one, other in zip(problem.radiance(in_gauge(found.point, problem.blocks)), problem.radiance(found.point), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+# ── hyperparameters ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_correlated_residuals_count_less():
+    one, rng = photographed(4, 1, cells=50, size=16)[0].blocks[0], np.random.default_rng(0)
+    independent = rng.normal(size=one.radiance.shape)
+    assert temperature(one, independent) == pytest.approx(1.0, abs=0.35)
+    assert temperature(one, np.ones_like(independent)) > 5
+    assert temperature(one, 0.1 * independent) == Schedule().least
+    assert temperature(one, 1e9 * np.ones_like(independent)) == temperature(one, 3 * np.ones_like(independent))  # outliers
+    assert 2 < temperature(one, 2 * independent) < 4
+
+
+def test_the_contrast_of_a_light_is_found(solved):
+    """Of one that has four times the variance the factor of the prior is larger."""
+    problem, true, found = solved
+    more = [light.with_log_radiance(2 * light.log_radiance) for light in true]
+    other = materials_in(spheres(more, size=16), schedule=Schedule(4, (8, 4, 4, 4)))
+    for one, larger in zip(found.hyperparameters, other.hyperparameters, strict=True):
+        assert 0.3 < one.factors[0] < 2.5 and larger.factors[0] > 1.5 * one.factors[0]
+        assert Schedule().least <= one.temperature < 3  # noise is less than the noise model says
+
+
+def test_a_start_has_hyperparameters_for_each_light():
+    problem, _ = photographed(4, 2, cells=40, size=8)
+    start = begun(problem, 40)
+    assert start.hyperparameters == [Hyperparameters()] * 2 and start.value == float("inf")
+    kept = [Hyperparameters(3.0), Hyperparameters(7.0)]
+    assert start_of(start.point, kept).hyperparameters == kept
+    assert fitted(problem, start_of(start.point, kept), PRIOR, Schedule(lights=1), FREE).hyperparameters == kept
+    assert fitted(problem, start_of(start.point, kept), PRIOR, Schedule(together=(1,), estimate=False), FREE).hyperparameters == kept
+
+
+# ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
+    one = photographed(9, 1, cells=40, size=10)[0].blocks[0]
+    one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
+    unsure = np.arange(len(one)) % 3 == 0
+    rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
+    (kept,) = sure_ones(JointProblem([rated], OPERATOR, Loss())).blocks
+    assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
+    noise = Noise(DARK * one.noise.absolute, one.noise.relative)
+    assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
+
+
+def test_what_is_alike_unsure_is_used():
+    """Legs of few pixels are all a material has: sure is what is as sure as the rest of the same material."""
+    one = photographed(9, 1, cells=40, size=10)[0].blocks[0]
+    rated = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
+    for given in (rated, one):
+        assert len(sure_ones(JointProblem([given], OPERATOR, Loss())).blocks[0]) == len(one)
+
+
+# ── the prior on materials ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_brightest_material_holds_the_gauge():
+    problem, _ = photographed(6, 1, cells=50, size=10)
+    lambertian = Materials(MATERIALS.diffuse, np.zeros((3, 3)), MATERIALS.roughness)
+    matt, theta = MaterialPrior(lambertian, problem.blocks), unknowns_of(lambertian)
+    brightest, level = int(MATERIALS.diffuse.sum(1).argmax()), float(MATERIALS.diffuse.sum(1).max() / 3)
+    for factor in (1.0, 2.0):
+        shifted = theta.copy()
+        shifted[brightest, :3] += np.log(factor)
+        expected = (np.log(factor * level / BRIGHTEST) / BRIGHTNESS) ** 2 + 3 * (np.log(factor) / DIFFUSE) ** 2
+        assert matt.at(shifted).value == pytest.approx(expected, rel=1e-3)
+    prior, theta, rng = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS), np.random.default_rng(0)
+    at, change = theta + 0.01 * rng.normal(size=theta.shape), rng.normal(size=theta.shape) * 1e-4
+    difference = (prior.at(at + change).value - prior.at(at - change).value) / 4
+    assert prior.at(at).gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-2)
+    assert np.linalg.eigvalsh(prior.at(at).hessian).min() > 0
+
+
+def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
+    """A dielectric costs nothing, twice its reflectance little, gold less than a few hundred observations say; a Lambertian material nothing."""
+
+    def costs(specular):
+        diffuse = max(BRIGHTEST - float(np.mean(specular)), 0.01)  # so that it is as bright as is expected
+        materials = Materials(np.full((1, 3), diffuse), np.array([specular]), np.array([0.3]))
+        return MaterialPrior(materials, []).at(unknowns_of(materials)).value
+
+    assert costs([0.05] * 3) == pytest.approx(0, abs=1e-12) and costs([0.0] * 3) == pytest.approx(0, abs=1e-3)
+    assert costs([0.1] * 3) == pytest.approx((np.log(2) / LEVEL) ** 2)
+    assert costs([0.05 * np.exp(0.1), 0.05, 0.05 * np.exp(-0.1)]) == pytest.approx(2 * (0.1 / TINT) ** 2)
+    assert 30 < costs([1, 0.8, 0.3]) < 60
+
+
+def test_a_point_of_other_materials_in_the_same_gauge_is_a_start():
+    """Of a fit that is given the truth nothing moves far."""
+    problem, true = photographed(11, 2, cells=60, size=12, noise=0.0)
+    found = fitted(problem, start_of(Point(MATERIALS, true)), PRIOR, QUICK, FREE).point.materials
+    assert np.abs(found.roughness - MATERIALS.roughness).max() < 0.05
