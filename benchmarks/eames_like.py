@@ -210,8 +210,10 @@ def paragraph(eames: Set, others: Sequence[Set]) -> str:
         return QUANTITIES[name].shown(eames.null(QUANTITIES[name]))
 
     def over(name: str) -> str:
-        """Mean over the other sets, and their range."""
+        """Mean over the other sets, and their range where there are several."""
         values = [one.value(QUANTITIES[name]) for one in others]
+        if len(values) == 1:
+            return QUANTITIES[name].shown(values[0])
         mean, low, high = (QUANTITIES[name].shown(v).removesuffix(QUANTITIES[name].unit) for v in (np.mean(values), min(values), max(values)))
         return f"{mean} ({low} to {high}){QUANTITIES[name].unit}"
 
@@ -219,14 +221,13 @@ def paragraph(eames: Set, others: Sequence[Set]) -> str:
     return (
         "On `data/eames` (`python -m benchmarks.eames_like`, one run), with poses searched, a warped mesh, shadows and interreflections, it is far\n"
         "from that. Surfaces light each other ([docs/light-prior.md](docs/light-prior.md) says how such sets are measured). In parts of the truth's\n"
-        "RMS, a Lambertian sphere in the recovered\n"
-        f"lights is wrong by {of('lambertian')}, a glossy one by {of('glossy')} and a mirror by {of('mirror')} (a constant light: {null('lambertian')},\n"
+        f"RMS, a Lambertian sphere in the recovered lights is wrong by {of('lambertian')}, a glossy one by {of('glossy')} and a mirror by {of('mirror')} (a constant light: {null('lambertian')},\n"
         f"{null('glossy')} and {null('mirror')}); balls of the recovered materials in them score {of('balls')} dB tone-mapped (one factor a channel and ball;\n"
         f"the grey ball {null('balls')} dB), in the true light {of('true light')} dB. Roughness is wrong by {of('roughness')} on average (a grey guess:\n"
-        f"{null('roughness')}), specular by {of('specular')} ({null('specular')}), diffuse by {of('diffuse')}. Settings were chosen on this set and on others made\n"
-        f"alike. On {len(others)} that were not used for this, roughness is wrong by {over('roughness')} on average, specular by {over('specular')},\n"
+        f"{null('roughness')}), specular by {of('specular')} ({null('specular')}), diffuse by {of('diffuse')}. Settings were chosen on this set.\n"
+        f"On {'a set' if len(others) == 1 else f'{len(others)} sets'} made alike that no setting was chosen on, roughness is wrong by {over('roughness')} on average, specular by {over('specular')},\n"
         f"diffuse by {over('diffuse')}; a glossy sphere in the recovered lights by {over('glossy')}, and balls score {over('balls')} dB (the grey\n"
-        f"ball {grey} dB). Every material in every light of a set, as balls, scores {over('relit')}."
+        f"ball {grey} dB). Every material in every light of a set, as balls, scores {over('relit')} dB."
     )
 
 
