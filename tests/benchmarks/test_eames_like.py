@@ -60,8 +60,10 @@ def test_the_mean_is_over_sets_that_no_setting_was_chosen_on(deviations):
 
 def test_readme_says_what_the_set_has_and_the_range_of_the_others():
     text = paragraph(results("data/eames", 0.5), [results("1", 0.1), results("2", 0.3)])
-    assert "specular by 50 % (100 %)" in text and "On 2 that were not used for this" in text
+    assert "specular by 50 % (100 %)" in text and "On 2 sets made alike that no setting was chosen on" in text
     assert "diffuse by 20 (10 to 30) %" in text and "roughness is wrong by .200 (.100 to .300)" in text
+    one = paragraph(results("data/eames", 0.5), [results("1", 0.1)])
+    assert "On a set made alike" in one and "diffuse by 10 %" in one and " to " not in one
 
 
 def test_a_number_that_is_missing_is_named():
