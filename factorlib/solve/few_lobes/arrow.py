@@ -22,10 +22,10 @@ from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.model.point import Point
+from factorlib.solve.descent import damped, masked
 from factorlib.solve.few_lobes.bounds import Bounds, light_at_bound
 from factorlib.solve.few_lobes.normal_equations import NormalEquations
 
-FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
 DEFINITE = 1e-9  # damping that makes a light's block definite where the step itself is not damped
 
 
@@ -116,18 +116,3 @@ class ArrowSystem(msgspec.Struct, frozen=True):
 
 def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "k l"], free: Bool[np.ndarray, " l"]) -> Eliminated:
     return Eliminated(cho_factor(masked(light, free), check_finite=False), cross * free)
-
-
-def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
-    """The matrix with its diagonal 1 + damping times as large, and positive."""
-    diagonal = np.diag(hessian)
-    floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
-    return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
-
-
-def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """The matrix with rows and columns that are not free replaced by those of the identity, in the scale of the rest."""
-    scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
-    masked = matrix * np.outer(free, free)
-    masked[~free, ~free] = scale
-    return masked

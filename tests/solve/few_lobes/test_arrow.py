@@ -10,7 +10,8 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes.arrow import DEFINITE, FLOOR
+from factorlib.solve.descent import FLOOR
+from factorlib.solve.few_lobes.arrow import DEFINITE
 from factorlib.solve.few_lobes.bounds import MOST_S, MOST_TURN, MOST_WIDTHS, Bounds, light_at_bound, materials_at_bound
 from factorlib.solve.few_lobes.iterate import evaluate
 from factorlib.solve.few_lobes.jacobian import fit_loss, fitted, linearise
