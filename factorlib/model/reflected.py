@@ -25,7 +25,7 @@ KEPT = 6  # nodes of a material whose responses stay in memory
 
 
 class Reflected(NamedTuple):
-    """Of the n observations of one material and p lobes of weight one: responses D and S [n, p], and ∂S/∂roughness; float32."""
+    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness; float32."""
 
     diffuse: Float[np.ndarray, "n p"]
     specular: Float[np.ndarray, "n p"]
