@@ -50,7 +50,7 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> Marginal:
             """Of one illumination."""
             clusters = clusters_of(one[0].block) if with_scores else None
-            return marginal(field_of(*one, self.prior), clusters, materials_given=not with_scores)
+            return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=not with_scores)
 
         illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))

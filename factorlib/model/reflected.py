@@ -33,10 +33,13 @@ class Reflected(NamedTuple):
 
 
 class Reflections:
-    """What a block's observations reflect of some lobes, material by material; values at nodes are kept."""
+    """What a block's observations reflect of some lobes, material by material; values at nodes are kept.
 
-    def __init__(self, block: Block, lobes: UnitLobes, operator: Operator):
-        self.block, self.operator, self.lobes = block, operator, lobes
+    materials_given: roughness does not change, so it is the only node, and ∂S/∂roughness, for which nobody asks, is nil
+    """
+
+    def __init__(self, block: Block, lobes: UnitLobes, operator: Operator, materials_given: bool = False):
+        self.block, self.operator, self.lobes, self.materials_given = block, operator, lobes, materials_given
         self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= WIDE else NODES
         self._specular: dict[tuple[int, int], np.ndarray] = {}
         self._diffuse: dict[int, np.ndarray] = {}
@@ -48,6 +51,11 @@ class Reflections:
 
     def at(self, m: int, roughness: float) -> Reflected:
         """The responses of material m, were its roughness so."""
+        if self.materials_given:
+            if (m, 0) not in self._specular:
+                self._specular[m, 0] = self._in_chunks(m, self.lobes, roughness)
+            specular = self._specular[m, 0]
+            return Reflected(self._diffuse_of(m), specular, np.broadcast_to(np.float32(0), specular.shape))
         first = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
         nodes = range(first, first + DEGREE + 1)
         share, slope = lagrange(np.log(self.nodes[list(nodes)]), float(np.log(roughness)))

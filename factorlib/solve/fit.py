@@ -96,7 +96,12 @@ def fitted(
     materials = above_zero(start.point.materials, free)
     point = Point(materials, start.point.lights)
     descent = Descent(MaterialPrior(materials, problem.blocks), problem.spread, report)
-    fields = list(problem.spread(lambda one: field_of(*one, prior), list(zip(problem.illuminations(point), start.hyperparameters, strict=True))))
+    given = not free.any()
+    fields = list(
+        problem.spread(
+            lambda one: field_of(*one, prior, given), list(zip(problem.illuminations(point), start.hyperparameters, strict=True))
+        )
+    )
     state, hyperparameters = descent.run(fields, unknowns_of(materials), np.zeros_like(free), schedule.lights), start.hyperparameters
     for number, iterations in enumerate(schedule.together):
         fields = state.fields
@@ -114,9 +119,9 @@ def _point_of(state: State, start: Materials, free: Bool[np.ndarray, "m 7"]) -> 
     return Point(Materials(rows[:, :3], rows[:, 3:6], rows[:, 6]), [field.illumination.light for field in state.fields])
 
 
-def field_of(illumination: Illumination, one: Hyperparameters, prior: LightPrior) -> Field:
+def field_of(illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False) -> Field:
     """The illumination with its table, and how much it and the prior count."""
-    table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator)
+    table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
     precision, log_determinant = prior.precision(illumination.light.axis, one.factors)
     return Field(msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST)
 
