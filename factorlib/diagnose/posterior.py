@@ -1,13 +1,12 @@
 """Standard errors of materials and lights of the joint solve (`factorlib.solve.solve`).
 
-Materials   The information is the Schur complement of the marginal likelihood's system, by reflectances instead of their logarithms, of
-            which a nil reflectance would seem to be known for sure.  As in `factorlib.diagnose.uncertainty` its
-            inverse and two sandwiches, over clusters of mirror directions and over whole lights, are compared, and the largest counts.
-            The prior on k_s is left out: standard errors say what the observations alone determine.
-            What the model itself has wrong, mostly the mesh, more observations do not mend: MODEL_ERROR is added in quadrature, in
-            proportion to the residuals up to those of the noise model.
+Materials   The information is the Schur complement of φ's system (`factorlib.solve.marginal`): what the observations say once each light has
+            taken up its share.  It is taken by reflectances, for by their logarithms a nil reflectance would look exactly known.  As in
+            `factorlib.diagnose.uncertainty` its inverse and two sandwiches, over clusters of mirror directions and over whole lights, are
+            compared, and the largest counts.  The prior on materials is left out.  More observations do not remove errors of the model
+            itself, mostly of the mesh: MODEL_ERROR is added in quadrature, in proportion to the residuals up to those of the noise model.
 Lights      Given the materials, log radiance has covariance Σ = H⁻¹ (equation (1) of `factorlib.solve.marginal`).  A map's radiance in
-            direction d is Σ_p φ_p(d) w_p with w = PEAK exp(u), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation
+            direction d is Σ_p φ_p(d) w_p with w_p = peak_p exp(u_p), so its variance is gᵀ Σ g with g_p = φ_p(d) w_p.  Where no observation
             tells anything, Σ is the prior's covariance.
 """
 
@@ -45,12 +44,12 @@ class Posterior:
         self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
 
     def systems(self, with_scores: bool) -> list[Marginal]:
-        """Of each illumination; with_scores: of clusters of observations, too; without, materials are given."""
+        """φ's system of each illumination; with_scores: of clusters of observations, too."""
 
         def system(one: tuple[Illumination, Hyperparameters]) -> Marginal:
             """Of one illumination."""
             clusters = clusters_of(one[0].block) if with_scores else None
-            return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=not with_scores)
+            return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
 
         illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
@@ -88,7 +87,7 @@ class Posterior:
             for c in range(3):
                 own, slope = slice(c * p, (c + 1) * p), overlap * light.weight[:, c]
                 errors[:, c] = np.sqrt(np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0))
-            mean = light.energy.sum(0) / 2  # over 4π, energies being over 2π
+            mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
             maps[block.name] = np.minimum(errors / mean, LARGEST).reshape(ROWS, 2 * ROWS, 3)
         return maps
 

@@ -1,6 +1,6 @@
 """One illumination of the joint problem at a point: what its photos show, what the model says they should, and all derivatives.
 
-    linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),       w = PEAK exp(u)
+    linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),       w_p = peak_p exp(u_p)
     predicted  y_ic = τ_i(ℓ_ic), τ the photo's tone curve
     residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 

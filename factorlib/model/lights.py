@@ -1,13 +1,14 @@
 """A light: log radiance on cells of the sphere, and the exposures and tone curves of its photos.
 
-A cell is a lobe w·exp(λ(ω·z − 1)), half as wide as its neighbours are apart, so that equal weights make a nearly constant light:
+A cell is a lobe w·exp(λ(ω·z − 1)).  Its width 1/√λ is half the distance between neighbouring cells, so that equal weights make a nearly
+constant light:
 
     λ = 1 / (WIDTH · spacing)²,      w = peak · exp(u),      Σ_q peak_q exp(λ_q(z_p·z_q − 1)) ≈ 1                    (1)
 
 With n cells on the sphere the spacing is √(4π/n), and n/(2λ) = 2π WIDTH² of them overlap in any direction, so that peak = PEAK =
 1/(2π WIDTH²) for n of any size; where larger cells meet smaller ones it differs.  So u is the log radiance of a cell of any size.  A cell
-splits into about four: those of the 4n even cells that lie nearer to it than to others, distances counted in spacings.  Neighbours that
-split thus fit together, and a light with cells split is as it was but for its blur.
+splits into about four: those of the 4n even cells that lie nearer to it than to others, distances counted in spacings.  So neighbours
+that split leave no gaps, and splitting changes a light only by what the larger cells had blurred.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from factorlib.light.lobes import lobe_integral
 
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
-SCALINGS = 5  # of the cells' peaks: with five, split cells add up to a constant to 3 % (RMS), and no more come nearer than 2.7 %
+SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more of them reach 2.7 % at best
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 
 
@@ -64,6 +65,11 @@ class Light(msgspec.Struct, frozen=True):
         return np.exp(self.log_sharpness)
 
     @property
+    def spacing(self) -> Float[np.ndarray, " p"]:
+        """Radians between a cell and its neighbours: the first of (1)."""
+        return 1 / (WIDTH * np.sqrt(self.sharpness))
+
+    @property
     def unit_lobes(self) -> UnitLobes:
         """The lobes without their weights."""
         return UnitLobes(self.axis, self.sharpness)
@@ -75,7 +81,7 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def peaks(self) -> Float[np.ndarray, " p"]:
-        """Each cell's weight where radiance is 1: the last of (1), by damped scaling of the cells."""
+        """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap)."""
         overlap = np.exp(self.sharpness * (self.axis @ self.axis.T - 1))
         peaks = np.full(len(self), PEAK)
         for _ in range(SCALINGS):

@@ -4,11 +4,12 @@ With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) 
 
     (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                (1)
 
-where d_i is the gradient of the determinant by the light, which moves materials but, in Laplace's approximation, not the light.  There are
+where d_i is the gradient of the determinant by the light.  It enters the step of the materials; the light's own step minimises φ.  There are
 7 unknowns a material.  A light's C has rows for the materials that it shows alone, so that cost grows with those few.  Damping
 multiplies the diagonal, so that a step does not depend on the units of an unknown.
 
-What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials.
+What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials; where materials are
+given, φ.
 """
 
 from __future__ import annotations
@@ -119,10 +120,10 @@ def stepped(
 def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     """The light after a step of its unknowns, each within its range and changed by no more than is sound."""
     cells, exposures, tones = np.split(step, [3 * len(light), 3 * len(light) + len(light.log_exposure) - 1])
-    u = light.log_radiance + cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE)
+    brighter = np.exp(cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).T)
     exposures = np.concatenate([[0.0], exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)])
     tone = np.clip(light.log_tone + tones.clip(-MOST_TONE, MOST_TONE), *np.log(TONE))
-    return msgspec.structs.replace(light.with_log_radiance(u), log_exposure=light.log_exposure + exposures, log_tone=tone)
+    return msgspec.structs.replace(light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone)
 
 
 def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:

@@ -1,4 +1,4 @@
-"""How every choice of the model is made: by observations that no candidate was fitted to.
+"""How choices of the model are made: by observations that no candidate was fitted to.
 
 Two models are fitted to the same observations, each for itself.  Held-out observations are those of whole cells of mirror directions
 (`factorlib.model.clusters`).  With a_i and b_i the mean robust losses of light i without and with the richer part, and n_i its held-out
@@ -25,9 +25,9 @@ from factorlib.model.clusters import clusters_of
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 
-LEAST_LOSS = 1e-4  # in σ² of the noise model: what both candidates explain to this counts as equal
-# Standard errors.  What is there anyway goes only against evidence, what is further needs it; smaller cells have the same prior as larger
-# ones, so they need less of it.
+LEAST_LOSS = 1e-4  # in σ² of the noise model, added to every loss: two losses far below it count as equal
+# Thresholds, in standard errors.  Shadows go only if the evidence is clearly against them; bounces and tone curves need clear evidence;
+# smaller cells obey the same prior as larger ones, so one standard error is enough for them.
 AGAINST, FOR, FINER = -2.0, 2.0, 1.0
 
 

@@ -1,15 +1,14 @@
 """Materials and lights fitted together, by marginal likelihood, and how much each light's observations and prior count.
 
 If residuals were independent, the sum of them over a cluster of n would have a variance of n σ².  It is larger, for residuals are alike (the
-design effect of L. Kish, Survey Sampling, 1965) and larger than the noise model says.  The factor is the temperature T, by which squared
+design effect of L. Kish, Survey Sampling, 1965), and larger than the noise model says.  The factor is the temperature T, by which squared
 residuals are divided:
 
     T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`     k: clusters of nearby mirror directions;  r: in σ, clipped at 3   (1)
 
-`least` is 1 while materials are fitted: cells are never quite fine enough, and with less noise than the model says materials would make up
-for that.  Given the materials, lights may be as exact as the residuals are.
+`least` is 1 while materials are fitted: cells are always a little too coarse, and were T below 1, materials would absorb that error.  Given the materials, lights may be as exact as the residuals are.
 
-Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew after each descent.  So are the factors by
+Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew before each descent.  So are the factors by
 which the light's contrast and colour differ from those of a typical light (equation (4) of `factorlib.light.prior`).
 
 Materials are fitted to the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
@@ -69,7 +68,7 @@ class Schedule(msgspec.Struct, frozen=True):
 
     lights     of the lights alone, materials given, before all else
     together   of materials and lights; hyperparameters are estimated anew before each of these descents but the first
-    estimate   whether they are estimated before the first one too: after a splitting, residuals are those of the splitting
+    estimate   whether they are estimated before the first one too: right after a splitting, residuals show the splitting, not the noise
     least      the least temperature of (1)
     """
 
@@ -173,6 +172,11 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
         typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
         result[rows] = block.confidence[rows] >= SURE * typical
     return result
+
+
+def all_free(fit: Fit) -> Bool[np.ndarray, "m 7"]:
+    """Every unknown of the materials."""
+    return np.ones((len(fit.point.materials), 7), bool)
 
 
 def start_of(point: Point, hyperparameters: Sequence[Hyperparameters] | None = None) -> Fit:

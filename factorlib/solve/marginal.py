@@ -10,7 +10,7 @@ and with the light integrated out (Laplace's approximation about the minimising 
 
     φ(u; θ) + log det H − log det Q,        H = JᵀJ/T + Q,     J = ∂r/∂u                                            (1)
 
-up to a constant.  Without the determinant, light and materials are ambiguous in a way that always favours the light of least contrast and
+up to a constant.  In J, rows are weighted by the robust loss, and those of clipped channels that are bright enough are nil.  Without the determinant, light and materials are ambiguous in a way that always favours the light of least contrast and
 the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009, "Understanding and evaluating blind
 deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/∂θ and ∂J/∂u are known exactly, and with Σ = H⁻¹
 
@@ -18,7 +18,7 @@ deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/
 
 The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.solve.descent`).  Left out, it would
 push all reflectances down: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian Σ_i ∂J_i Σ ∂J_iᵀ of the first
-only steers steps, so every `SPARSE`-th row stands for its neighbours.
+steers the steps of a descent and nothing else, so every `SPARSE`-th row stands for its neighbours.
 
 Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.  Exposures and tone exponents belong to the light's block
 but are not integrated out: they have wide Gaussians about 0.
@@ -57,7 +57,7 @@ class Field(msgspec.Struct, frozen=True):
 
 
 class Marginal(NamedTuple):
-    """The value of (1), the loss Σ ρ(r) in it, and the Gauss–Newton system of it: half the gradient and half the Hessian.
+    """The value of (1), or of φ where materials are given, the loss Σ ρ(r) in it, and the Gauss–Newton system of it: half the gradient and half the Hessian.
 
     places   numbers of the k unknowns of the materials that the block shows, ascending;  the light has l unknowns, of which 3p are u
     determinant_by_light   the second of (2)
@@ -79,8 +79,9 @@ class Marginal(NamedTuple):
 def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> Marginal:
     """The system of one illumination.
 
-    clusters: number of each observation's cluster, from 0, for `Marginal.scores`;  materials_given: only the light is asked for, and
-    equation (2), which takes most of the time, is left out of the gradient and the Hessian by materials
+    clusters: number of each observation's cluster, from 0, for `Marginal.scores`
+    materials_given: the value is φ alone, which is what the light minimises, and no derivative of the determinants, which take most of
+    the time, is in the system
     """
     one, T = field.illumination, field.temperature
     shown, light, p = one.shown(), one.light, len(one.light)
@@ -107,11 +108,13 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
             L[own, photos] += towards.T
         if scores is not None:
             _add_scores(scores, clusters[part.rows], part, J, at, slice(k + own.start, k + own.stop), k + 3 * p)
+    loss, by_light = float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum()), np.zeros(size)
+    value += loss / T
+    if materials_given:
+        return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
     covariance, log_determinant = positive_definite_inverse(L[: 3 * p, : 3 * p])
-    loss = float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum())
-    value += loss / T + log_determinant - field.log_determinant
-    by_light = np.zeros(size)
-    for part in () if materials_given else parts:
+    value += log_determinant - field.log_determinant
+    for part in parts:
         own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
         gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
         g_m[at] += gradient

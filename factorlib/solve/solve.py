@@ -4,7 +4,7 @@
     materials   materials and lights are fitted together, to observations whose normals are sure (`factorlib.solve.fit`)
     splitting   the cells that hold most of each light's energy split in four, while held-out observations gain: what is sharper than a cell
                 looks as if materials were smoother.  Suns and lamps are cells split deep
-    lights      given the materials, lights are fitted to all observations
+    lights      given the materials, lights are fitted to observations of any confidence
 
 Every part is a function of the one before it, and the journal keeps what is done.
 """
@@ -26,7 +26,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.choices import FEW, STARTS, TRIAL_CELLS, Curves, Effects, curves_chosen, effects_chosen
 from factorlib.solve.evidence import FINER, Evidence, compare, losses_of
-from factorlib.solve.fit import Fit, Schedule, fitted, sure_ones
+from factorlib.solve.fit import Fit, Schedule, all_free, fitted, sure_ones
 from factorlib.solve.history import Event, Report, Solution, unreported
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
@@ -37,8 +37,8 @@ MATERIALS = Schedule(lights=4, together=(10, 8))
 AFTER_SPLITTING = Schedule(lights=2, together=(6, 4), estimate=False)
 LIGHTS = Schedule(together=(0, 8, 6), least=0.1)
 SPLIT = 24  # cells of a light that split at once
-WORTH = 0.05  # of the held-out loss: after a splitting that gained 3 %, two more gained 3.6 and 1 % on data/eames, materials no better
-SMALLEST = 0.5  # degrees: no cell splits whose spacing is less than twice this
+WORTH = 0.05  # of the held-out loss; after a splitting that gained 3 %, two more gained 3.6 and 1 % on data/eames, materials no better
+SMALLEST = 0.5  # degrees between cells: the sun's width.  No cell splits that is less than twice as far from its neighbours
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -117,8 +117,8 @@ def _lights(problem: JointProblem, fit: Fit, prior: LightPrior, told: Told) -> F
 
 
 def split_while_gaining(problem: JointProblem, fit: Fit, run: Run, told: Told) -> Split:
-    """Cells split as long as held-out observations are explained better, by the standard of `factorlib.solve.evidence`, and the last
-    splitting was worth its time."""
+    """Splitting after splitting, until there were `Choices.splittings`.  One that does not explain held-out observations better by more than
+    FINER standard errors is undone and the last; one that lowers their loss by less than WORTH is kept and the last."""
     evidence, before = [], losses_of(problem, fit.point)
     for number in range(0 if problem.none_held_out else run.choices.splittings):
         lights = [light.split(brightest(light)) for light in fit.point.lights]
@@ -136,8 +136,8 @@ def split_while_gaining(problem: JointProblem, fit: Fit, run: Run, told: Told) -
 
 
 def brightest(light: Light) -> Bool[np.ndarray, " p"]:
-    """The `SPLIT` cells that hold most energy, without those that are as small as any may be."""
-    spacing = np.degrees(2 / np.sqrt(light.sharpness))
+    """The `SPLIT` cells that hold most energy, of those whose parts are no smaller than `SMALLEST`."""
+    spacing = np.degrees(light.spacing)
     energy = np.where(spacing > 2 * SMALLEST, light.energy.sum(1), 0.0)
     which = np.zeros(len(light), bool)
     which[np.argsort(-energy, kind="stable")[:SPLIT]] = True
@@ -150,11 +150,6 @@ def on_cells(light: Light, count: int) -> Light:
     radiance = Lobes(light.axis, light.sharpness, light.weight).radiance(cells.axis)
     lobes = msgspec.structs.replace(light, axis=cells.axis, log_sharpness=np.log(cells.sharpness), weight=radiance)
     return lobes.with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
-
-
-def all_free(fit: Fit) -> Bool[np.ndarray, "m 7"]:
-    """Every unknown of the materials."""
-    return np.ones((len(fit.point.materials), 7), bool)
 
 
 class Happened(msgspec.Struct, frozen=True):

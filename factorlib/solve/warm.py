@@ -95,7 +95,7 @@ def _light(
     tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
     light = Light(
         lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
-        np.log(np.clip(lobes.sharpness, *SHARPNESS)),
+        np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
         np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
