@@ -4,7 +4,7 @@
     point         Point: the unknowns, which are materials and lights
     illumination  one illumination at a point: radiance, residuals, and their derivatives by all unknowns
     lights        a light: log radiance on cells of the sphere, which may split
-    responses     what observations reflect of lobes of weight one; the only caller of the reflection operator;  reflected: tabulated
+    responses     what observations reflect of lobes of weight one; the main solver's only caller of the reflection operator;  reflected: tabulated
     observed      observations, grouped by illumination, as blocks
 
 `factorlib.solve` finds the best point.

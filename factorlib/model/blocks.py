@@ -60,7 +60,7 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
     def sampled(self, count: int, seed: int) -> Block:
-        """At most `count` fitted and `count`/3 held-out observations, each material with its share, order kept."""
+        """At most `count` fitted and `count`/3 held-out observations, drawn at random, order kept."""
         random = np.random.default_rng(seed)
         kept = [
             random.permutation(rows)[:most]

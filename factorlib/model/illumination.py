@@ -5,7 +5,8 @@
     residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 
 D and S are the responses of `factorlib.model.responses`, e is the photo's exposure, G what other surfaces send
-(`factorlib.model.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one and the same sum.
+(`factorlib.model.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one and the same sum (few lobes have
+a Jacobian of their own).
 
 Unknowns: log k_d, log k_s (RGB each) and roughness of a material; u of every cell and channel; log exposures and log tone exponents.  A
 channel's residuals depend on the cells of that channel alone, so the Jacobian is a dense block a channel.
@@ -139,7 +140,7 @@ class Illumination(msgspec.Struct, frozen=True):
         return np.stack([scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)])
 
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
-        """Residuals and derivatives at `shown`, which is that of this illumination with its table; held-out observations have weight 0."""
+        """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
         block, light, materials = self.block, self.light, self.materials
         residual = block.residuals(shown.radiance)
         counts = ~block.held_out[:, None] & ~(block.clipped & (residual >= 0))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -45,12 +43,6 @@ class Materials(msgspec.Struct, frozen=True):
     def sharpest(self) -> float:
         """The largest sharpness that can be resolved: reflections of sharper lobes look the same."""
         return sharpest_resolved(self.blur)
-
-    def replaced(self, other: Materials, which: Sequence[int]) -> Materials:
-        """With the materials of numbers `which` as they are in `other`."""
-        rows = self.rows()
-        rows[list(which)] = other.rows()[list(which)]
-        return Materials.of_vector(rows.reshape(-1))
 
     def lambertian(self, m: int) -> Materials:
         """With material m Lambertian: its specular reflectance is added to its diffuse one."""

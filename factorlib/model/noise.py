@@ -10,7 +10,7 @@ from jaxtyping import Float
 class Noise(msgspec.Struct, frozen=True):
     """σ² = absolute² + (relative · radiance)², in units of a block's mean radiance.
 
-    The relative part stands for errors that grow with brightness: of a photo's tone curve, of normals, and of too few lobes.
+    The relative part stands for errors that grow with brightness: of a photo's tone curve, of normals, and of too coarse cells.
     """
 
     absolute: float = 0.05

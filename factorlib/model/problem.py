@@ -3,7 +3,7 @@
     problem = JointProblem(blocks, operator, loss, spread)      point = Point(materials, lights)
     problem.radiance(point)   .residuals(point)   .held_out_loss(point)
 
-Every observation depends on one material (7 unknowns) and one light (3 unknowns a cell).  So questions are answered illumination by
+Every observation depends on one material (7 unknowns) and one light (3 unknowns a cell, exposures, tone curves).  So questions are answered illumination by
 illumination (`factorlib.model.illumination`), and `spread` may do that on several workers.
 """
 

@@ -1,4 +1,4 @@
-"""What rows of observations reflect of lobes of weight one: the only place that calls the reflection operator.
+"""What rows of observations reflect of lobes of weight one: where the main solver calls the reflection operator.
 
     D_ip   diffuse response of observation i to lobe p, for k_d = 1      both with shadows (shadowing)
     S_ip   specular response, for k_s = 1

@@ -1,6 +1,6 @@
 """The joint problem solved: one reflectance per material and one light per illumination, from all photos at once.
 
-Photometric bundle adjustment.  Every observation touches one material (7 unknowns) and one illumination (3 a cell), so the normal equations
+Photometric bundle adjustment.  Every observation touches one material (7 unknowns) and one illumination (3 a cell, and the exposures and tone curves of its photos), so the normal equations
 have an arrow shape and the illuminations are eliminated one by one (Schur).
 
     solve       the solver: choices, materials, splitting, lights
@@ -12,5 +12,5 @@ have an arrow shape and the illuminations are eliminated one by one (Schur).
     few_lobes   another solver, for exact scenes: lights are few lobes with free axes;  it decides nothing for the first
     paper       the paper's solver, the baseline
 
-What photos should show, and all derivatives, is in `factorlib.model`.
+What photos should show, and the main solver's derivatives, are in `factorlib.model`.
 """

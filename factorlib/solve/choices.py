@@ -65,7 +65,7 @@ def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
 def effects_chosen(
     problem: JointProblem, starts: list[Point], prior: LightPrior, choices: Choices, report: Report
 ) -> Effects:
-    """Shadows and bounces; problem: sure observations;  starts: of which the best counts."""
+    """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
     sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
     unjudged = problem.none_held_out  # then what is there anyway stays, and nothing further is added
     shadows = {"on": hidden, "off": False, "auto": hidden if unjudged or not hidden else None}[choices.self_shadowing]

@@ -1,4 +1,4 @@
-"""A run of a solver: what it reports, what it ends with, and the journal from which a stopped run goes on."""
+"""What a run of a solver reports, and what it ends with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from factorlib.solve.fit import Fit
 
 
 class Event(msgspec.Struct, frozen=True):
-    """One accepted point: `loss` per fitted channel value, whitened (1 = explained to the noise model)."""
+    """One point that was tried: `loss` per fitted channel value, whitened (1 = explained to the noise model).
+
+    The last event of a part has iteration −1 and says its held-out loss, which is not a number in all others."""
 
     round: int
     phase: str
@@ -27,7 +29,7 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Snapshot = Callable[[Event, Point], None]  # called with every accepted point
+Snapshot = Callable[[Event, Point], None]  # called with every point that is tried
 
 
 def unreported(event: Event) -> None:
@@ -41,7 +43,7 @@ def unwatched(event: Event, point: Point) -> None:
 class Solution(msgspec.Struct, frozen=True):
     """The answer of a solver: a point, and what was decided of the model.
 
-    history     every accepted point on the way;  loss: the loss function that was lowered last
+    history     every point that was tried;  loss: the loss function that judges held-out observations
     lambertian  materials without specular part
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
     specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried

@@ -15,7 +15,9 @@ k_d + k_s, is expected to be of ordinary brightness:
 
     (log b − log BRIGHTEST)²/BRIGHTNESS²                                                                             (2)
 
-which is .5 to .95 within two standard deviations.  The tint is settled by the prior on lights, whose mean is grey.
+which is .5 to .95 within two standard deviations.  The tint is settled by the prior on lights, whose mean is grey.  A very wide Gaussian about
+the start keeps log k_d and roughness finite where observations say nothing.  Where no bounces fix the scale, the answer is brought to the gauge
+of `factorlib.model.gauge` afterwards.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Where a solve starts: reflectances and exposures from mean radiances, constant lights.
+"""Where a solve starts: reflectances from median radiances, exposures from mean ones, constant lights.
 
-The mean radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose logarithm is
+The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose logarithm is
 fitted as a sum by least squares.
 """
 
@@ -25,13 +25,13 @@ LEAST_RADIANCE = 1e-6  # of a block's mean
 def starting_point(
     blocks: Sequence[Block], count: int, cells: int, roughness: float = ROUGHNESS, specular_share: float = SPECULAR_SHARE
 ) -> Point:
-    """Materials 0 … `count`−1 whose diffuse part explains mean radiances, and one constant light of `cells` cells a block."""
+    """Materials 0 … `count`−1 whose diffuse part explains median radiances, and one constant light of `cells` cells a block."""
     materials = starting_materials(blocks, count, specular_share, roughness)
     return Point(materials, [constant_light(block, materials, cells) for block in blocks])
 
 
 def starting_materials(blocks: Sequence[Block], count: int, specular_share: float, roughness: float) -> Materials:
-    """Materials whose diffuse part explains the mean radiances and whose specular part is grey."""
+    """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - specular_share), 10 * LEAST_REFLECTANCE)
     specular = np.maximum(np.full((count, 3), specular_share * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)

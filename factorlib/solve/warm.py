@@ -39,7 +39,7 @@ def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
 
 
 def with_decided(choices: Choices, earlier: Earlier) -> Choices:
-    """The choices, with shadows and bounces as they were decided before, where both were tried then."""
+    """The choices, with shadows and bounces as they were decided before, where the two had been compared."""
     for name in ("self_shadowing", "interreflection"):
         if getattr(choices, name) == "auto" and getattr(earlier, name):
             choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
