@@ -17,7 +17,9 @@ from factorlib.reading import check_plain, reading
 
 _STRETCH = {2: 85, 4: 17}  # what 1 becomes when grey of so many bits is stretched to 8
 _GREY, _PALETTE = 0, 3  # PNG colour types
-Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; here a mask is as large as its photo, whose size has its own limit
+Image.MAX_IMAGE_PIXELS = (
+    None  # Pillow warns at 89 megapixels; here a mask is as large as its photo, whose size has its own limit
+)
 
 
 def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
@@ -48,12 +50,9 @@ def _one_channel(values: np.ndarray, path: str | Path, key: str) -> np.ndarray:
     colours, alpha = (values[..., :-1], values[..., -1]) if values.shape[-1] in (2, 4) else (values, None)
     if (colours != colours[..., :1]).any():
         colour = colours.reshape(-1, 3)[(colours != colours[..., :1]).any(axis=-1).ravel()][0]
-        raise InputError(
-            f"is a colour picture (one pixel is {tuple(int(c) for c in colour)})",
-            file=path,
-            key=key,
-            cure="save labels in one channel: 0 background, k for the k-th material, 255 leave out",
-        )
+        fault = f"is a colour picture (one pixel is {tuple(int(c) for c in colour)})"
+        cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
+        raise InputError(fault, file=path, key=key, cure=cure)
     if alpha is not None and (alpha != np.iinfo(alpha.dtype).max).any():
         raise InputError("has transparent pixels", file=path, key=key, cure="save it without alpha: 0 is background")
     return colours[..., 0]
