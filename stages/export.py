@@ -25,7 +25,7 @@ from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
 from factorlib.export.usd import SUFFIX, write_usd_mesh, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
-from factorlib.images.hdr import write_hdr
+from factorlib.images.write import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import submesh, write_ply

@@ -16,8 +16,7 @@ from jaxtyping import Bool, UInt8, UInt16
 
 from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
-from factorlib.labels.png import read_inside, read_values
-from factorlib.labels.size import check_size
+from factorlib.labels.png import check_size, read_inside, read_values
 
 LEFT_OUT = 255
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused

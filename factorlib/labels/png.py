@@ -5,6 +5,7 @@ Pillow, for it alone keeps the indices; grey of 2 or 4 bits, which it stretches 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from jaxtyping import Bool, UInt16
 from PIL import Image
 
 from factorlib.errors import InputError
-from factorlib.labels.size import check_size
 from factorlib.reading import check_plain, reading
 
 _STRETCH = {2: 85, 4: 17}  # what 1 becomes when grey of so many bits is stretched to 8
@@ -44,6 +44,17 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
     """A mask of one object or material: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
     values = read_values(path, key, size)
     return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
+
+
+def check_size(found: Sequence[int], size: Sequence[int], path: str | Path, key: str) -> None:
+    """Both (height, width); InputError unless they are the same, which says so if the mask lies on its side."""
+    if tuple(found) == tuple(size):
+        return
+    cure = "save the mask with the photo's own pixels"
+    if tuple(found) == tuple(size)[::-1]:
+        cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
+    message = f"the mask is {found[1]} × {found[0]} pixels, the photo {size[1]} × {size[0]}"
+    raise InputError(message, file=path, key=key, cure=cure)
 
 
 def _one_channel(values: np.ndarray, path: str | Path, key: str) -> np.ndarray:
