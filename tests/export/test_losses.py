@@ -6,7 +6,6 @@ import torch
 
 from factorlib.export import loss, viewers
 from factorlib.export.viewers import MODELS, Angles, distribution
-from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.brdf import ggx, specular

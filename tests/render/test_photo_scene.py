@@ -85,6 +85,13 @@ def test_a_larger_picture_shows_the_same(scene):
     assert differ(traced_photo(scene, 256), large.reshape(40, 2, 48, 2, 4).mean(axis=(1, 3))) < 0.03
 
 
+def test_a_ball_fills_its_picture():
+    picture = lit_ball(lobes(), MATERIALS["grey"], 32, 16)
+    inside = picture[..., 3] > 0.99
+    assert inside.mean() == pytest.approx(np.pi / 4, abs=0.06)
+    assert inside[16, 1] and inside[1, 16] and not inside[0, 0]
+
+
 def test_a_box_stands_on_its_largest_side_that_looks_down():
     tilted = rotation_of_vector(np.radians(25) * np.array([1.0, 0, 0]))
     plane = resting_plane(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))

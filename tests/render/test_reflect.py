@@ -11,7 +11,6 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render import reflect
 from factorlib.render.reflect import Reflector, Shadows
 from factorlib.results.materials import Reflectance
 
