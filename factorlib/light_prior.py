@@ -36,9 +36,8 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
             raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
         here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not here:
-            raise InputError(
-                "no .hdr or .exr in this folder", file=folder, cure="name a folder of lat-long maps; folders within it count by themselves"
-            )
+            cure = "name a folder of lat-long maps; folders within it count by themselves"
+            raise InputError("no .hdr or .exr in this folder", file=folder, cure=cure)
         found += here
     return found
 
@@ -53,12 +52,18 @@ def means_of(path: Path, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
         raise InputError(str(error), file=path, cure="a map of 64 rows or more will do") from None
 
 
-def prior_of(paths: Sequence[Path], count: int | None = None, bar: Progress | None = None, scored: bool = True) -> LightPrior:
+def prior_of(
+    paths: Sequence[Path], count: int | None = None, bar: Progress | None = None, scored: bool = True
+) -> LightPrior:
     """The prior of the maps in some files; with two or more, where `scored`, also its leave-one-out scores, which take most of the time."""
     cells, bar = fibonacci_sphere(count or CELLS), bar or Progress(disable=True)
     means = np.stack([means_of(path, cells) for path in bar.track(paths, description="reading")])
     logs, task = log_cells(means), bar.add_task("leaving one out", total=len(paths))
-    scores = leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done)) if scored and len(paths) > 1 else None
+    scores = (
+        leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done))
+        if scored and len(paths) > 1
+        else None
+    )
     sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
 
@@ -76,9 +81,12 @@ def summary(prior: LightPrior) -> str:
 
 def main(
     folders: Annotated[
-        list[Path], typer.Argument(help="Folders of lat-long maps; folders within them count by themselves.", metavar="FOLDER…")
+        list[Path],
+        typer.Argument(help="Folders of lat-long maps; folders within them count by themselves.", metavar="FOLDER…"),
     ],
-    out: Annotated[Path | None, typer.Option(help="File to write the table to; without it the table is printed.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write the table to; without it the table is printed.")
+    ] = None,
 ) -> None:
     """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders."""
     try:

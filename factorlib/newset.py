@@ -59,9 +59,13 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         draft = Path(folder) / target.name
         _copied(photos, draft / "photos", found.photos.values())
         if masks is not None:
-            _copied(masks, draft / "masks", [path for path in masks.rglob("*") if path.suffix.lower() in (".png", ".json")])
+            _copied(
+                masks, draft / "masks", [path for path in masks.rglob("*") if path.suffix.lower() in (".png", ".json")]
+            )
         if meshes is not None:
-            _copied(meshes, draft / "meshes", [path for path in meshes.rglob("*") if path.is_file()])  # with .mtl, buffers
+            _copied(
+                meshes, draft / "meshes", [path for path in meshes.rglob("*") if path.is_file()]
+            )  # with .mtl, buffers
         write_text(draft / "dataset.yaml", yaml_text(found, photos, meshes))
         draft.rename(target)
     return found.missing
@@ -71,13 +75,18 @@ def look(photos: Path, masks: Path | None, meshes: Path | None) -> Found:
     """What the files in the folders say."""
     pictures = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
     if not pictures:
-        raise InputError(f"there are no photos ({', '.join(IMAGES[:6])}, …) in it", file=photos, key="PHOTOS", cure="name their folder")
+        fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
+        raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
     found = Found(pictures, {}, {}, [], {}, {}, [])
     if masks is not None:
         _look_at_masks(masks, found)
     if meshes is not None:
         _look_at_meshes(meshes, found)
-    found.missing += [f"photo {name}: no mask called {name}.png or {name}_<material>.png" for name in pictures if name not in found.masks]
+    found.missing += [
+        f"photo {name}: no mask called {name}.png or {name}_<material>.png"
+        for name in pictures
+        if name not in found.masks
+    ]
     taken = [name for name in pictures if name in RESERVED_PHOTOS]
     found.missing += [f"photo {name}: write another `name`: a file of the results is called {name}" for name in taken]
     if not found.meshes:
@@ -103,14 +112,18 @@ def _look_at_masks(folder: Path, found: Found) -> None:
     labels = 0
     for photo in found.photos if not coco else ():
         whole = [path for path in files if path.parent == folder and _name(path) == photo]
-        mine = [path for path in files if _name(path) not in found.photos]  # kitchen_2.png is the photo kitchen_2's, if there is one
+        mine = [
+            path for path in files if _name(path) not in found.photos
+        ]  # kitchen_2.png is the photo kitchen_2's, if there is one
         each = {name: path for path in mine if (name := _material(path, photo, folder))}
         if whole:
             values = np.unique(read_values(whole[0], photo))
             labels = max([labels, *(int(value) for value in values if value <= MAX_MATERIALS)])
             if set(values.tolist()) <= {0, LEFT_OUT}:
                 cure = f"the mask of one material is called {photo}_<material>.png"
-                found.missing.append(f"photo {photo}: {whole[0].name} has no label, for {LEFT_OUT} means left out; {cure}")
+                found.missing.append(
+                    f"photo {photo}: {whole[0].name} has no label, for {LEFT_OUT} means left out; {cure}"
+                )
             found.masks[photo] = f"masks/{whole[0].relative_to(folder)}"
             found.silhouettes[photo] = _written(each, folder)
         elif each:
@@ -142,10 +155,14 @@ def _categories(path: Path) -> list[Category]:
 
 def _look_at_meshes(folder: Path, found: Found) -> None:
     found.meshes = _by_name(_files(folder, MESHES, "MESHES", deep=True), "MESHES")
-    found.parts = {name: list(dict.fromkeys(names[0] for names in read_parts(path))) for name, path in found.meshes.items()}
+    found.parts = {
+        name: list(dict.fromkeys(names[0] for names in read_parts(path))) for name, path in found.meshes.items()
+    }
     for name, parts in found.parts.items():
         if len(found.materials) != 1 and (open_ := [part for part in parts if part not in found.materials]):
-            found.missing.append(f"mesh {name}: write which material {', '.join(open_)} {'is' if len(open_) == 1 else 'are'} made of")
+            found.missing.append(
+                f"mesh {name}: write which material {', '.join(open_)} {'is' if len(open_) == 1 else 'are'} made of"
+            )
     for photo in found.photos if len(found.meshes) > 1 else ():
         if not objects_of(photo, found):
             found.missing.append(f"photo {photo}: write which of the meshes it shows")
@@ -167,7 +184,11 @@ def _is_word_of(name: str, text: str) -> bool:
 def _files(folder: Path, suffixes: tuple[str, ...], key: str, deep: bool = False) -> list[Path]:
     if not folder.is_dir():
         raise InputError("there is no such folder", file=folder, key=key, cure="name one")
-    return sorted(path for path in (folder.rglob("*") if deep else folder.iterdir()) if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(
+        path
+        for path in (folder.rglob("*") if deep else folder.iterdir())
+        if path.suffix.lower() in suffixes and path.is_file()
+    )
 
 
 def _by_name(files: list[Path], key: str) -> dict[str, Path]:
@@ -215,7 +236,10 @@ def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
             lines.append(f"    material: {_quoted(found.materials[0])}")
         else:
             lines.append("    parts:    # part of the mesh: material")
-            lines += [f"      {_quoted(part)}: {_quoted(part if part in found.materials else UNKNOWN)}" for part in found.parts[name]]
+            lines += [
+                f"      {_quoted(part)}: {_quoted(part if part in found.materials else UNKNOWN)}"
+                for part in found.parts[name]
+            ]
     lines.append("photos:")
     for name, path in found.photos.items():
         lines += [f"  - name: {_quoted(name)}", f"    image: {_quoted(f'photos/{path.relative_to(photos)}')}"]
@@ -223,14 +247,21 @@ def yaml_text(found: Found, photos: Path, meshes: Path | None) -> str:
         if isinstance(masks, str):
             lines.append(f"    masks: {_quoted(masks)}")
         else:
-            lines += ["    masks:", *(f"      {_quoted(material)}: {_quoted(file)}" for material, file in masks.items())]
+            lines += [
+                "    masks:",
+                *(f"      {_quoted(material)}: {_quoted(file)}" for material, file in masks.items()),
+            ]
         objects = objects_of(name, found) or ([UNKNOWN] if found.meshes else [])
         remark = "    # of each: the mesh; another material for a part by `materials: {part: material}`"
         lines.append(f"    objects:{remark}" if objects else "    objects: []")
         silhouettes = found.silhouettes.get(name, {}) if objects else {}
         for each, mask in silhouettes.items():
             mesh = objects[0] if len(objects) == 1 else UNKNOWN
-            lines += [f"      - name: {_quoted(each)}", f"        mesh: {_quoted(mesh)}", f"        mask: {_quoted(mask)}"]
+            lines += [
+                f"      - name: {_quoted(each)}",
+                f"        mesh: {_quoted(mesh)}",
+                f"        mask: {_quoted(mask)}",
+            ]
         for mesh in objects if not silhouettes else ():
             lines += [f"      - name: {_quoted(mesh)}", f"        mesh: {_quoted(mesh)}"]
     return "\n".join(lines) + "\n"

@@ -17,13 +17,13 @@ from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset, ObjectEntry, PhotoEntry
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
+from factorlib.images.palette import nearest_tags, rgb_of
 from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import picture, png_bytes
 from factorlib.images.transfer import srgb_decode
 from factorlib.labels import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
-from factorlib.report.tags import nearest_tags
 from factorlib.wholefile import write_bytes
 
 SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18  # pixels of a photo's longer side, of a mesh, between pictures, and of a line of text
@@ -92,7 +92,7 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
     pixels, labels = (np.concatenate(parts) for parts in zip(*((i.reshape(-1, 3), p.label.ravel()) for i, p in pictures), strict=True))
     mean = [pixels[labels == k].mean(axis=0) / 255 if (labels == k).any() else np.full(3, 0.5) for k in range(1, len(names) + 1)]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
-    return np.array([PAPER, *(tuple(int(tags[name][i : i + 2], 16) for i in (1, 3, 5)) for name in names)], np.uint8)
+    return np.array([PAPER, *(rgb_of(tags[name]) for name in names)], np.uint8)
 
 
 def _legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:

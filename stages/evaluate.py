@@ -18,7 +18,6 @@ from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.materials import compare_materials
-from factorlib.evaluate.metrics import SECTIONS, reasons_of
 from factorlib.evaluate.relighting import compare_relighting
 from factorlib.evaluate.relit_set import compare_relit_set
 from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
@@ -32,6 +31,16 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 
 log = logging.getLogger("factorlib.evaluate")
+NO_TRUTH = "the dataset names no truth"
+SECTIONS = ("materials", "relighting", "relit_set", "light", "normals", "poses")
+MISSING = {
+    "materials": "the truth says nothing about materials that were seen",
+    "relighting": "the truth lacks materials or lights",
+    "relit_set": "the truth lacks materials or lights",
+    "light": "the truth names no illumination of this set",
+    "normals": "the truth has no normals for these photos",
+    "poses": "the truth has no poses of these objects",
+}
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,12 +67,28 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(3, 3)
 
 
+def reasons_of(sections: dict[str, object], has_truth: bool) -> dict[str, str]:
+    """Why each section that is None is.
+
+    >>> reasons_of({"materials": None, "relighting": 1, "relit_set": 1, "light": 1, "normals": 1, "poses": 1}, False)
+    {'materials': 'the dataset names no truth'}
+    """
+    return {name: MISSING[name] if has_truth else NO_TRUTH for name in SECTIONS if not sections[name]}
+
+
 def _against_truth(
-    inputs: Inputs, out: Path, truth: TruthFile, lights: dict[str, LightSlice], seen: dict[str, list[str]], component: dict[str, int]
+    inputs: Inputs,
+    out: Path,
+    truth: TruthFile,
+    lights: dict[str, LightSlice],
+    seen: dict[str, list[str]],
+    component: dict[str, int],
 ) -> dict:
     materials = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
     estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the gauge of the exported lights
-    true_lights = {n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()}
+    true_lights = {
+        n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()
+    }
     paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
     found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
     _write_lights(inputs, out, truth, found_lights, true_lights)
@@ -81,7 +106,9 @@ def _write_lights(inputs: Inputs, out: Path, truth: TruthFile, found: dict[str, 
     for name in found:
         for kind in ("illumination", "spheres"):
             (out / kind).mkdir(exist_ok=True)
-        write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(truth.illumination[name])), LAT_LONG)
+        write_rgb_exr(
+            out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(truth.illumination[name])), LAT_LONG
+        )
         for which, light in (("truth", true[name]), ("estimate", found[name])):
             write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
 

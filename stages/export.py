@@ -25,12 +25,11 @@ from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
 from factorlib.export.usd import SUFFIX, write_usd_mesh, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
-from factorlib.images.hdr import write_hdr
+from factorlib.images.write import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.meshes.once import MeshesOnce
 from factorlib.meshes.ply import submesh, write_ply
-from factorlib.meshes.read import CREASE_DEG
+from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.results.exposures import read_exposures, write_exposures
 from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, read_materials, reflectances, write_materials

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.images.animation import write_gif
 from factorlib.images.exr import write_rgb_exr
 from factorlib.images.picture import picture, write_png
+from factorlib.images.write import write_gif
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file, recipe_of

@@ -93,21 +93,25 @@ def _check_name(key: str, name: str, refuse: Refusal) -> None:
     if not NAME.fullmatch(name):
         refuse(key, f"{name!r} is not a name", "names are made of A-Z a-z 0-9 _ and -, for they name files")
     if len(name) > LONGEST_NAME:
-        refuse(key, f"the name {name[:20]}… has {len(name)} characters", f"names have at most {LONGEST_NAME}, for they name files")
+        fault = f"the name {name[:20]}… has {len(name)} characters"
+        refuse(key, fault, f"names have at most {LONGEST_NAME}, for they name files")
 
 
 def check_known(key: str, name: str, known: Iterable[str], kind: str, refuse: Refusal) -> None:
     """Refuse a name that is not among `known`, and suggest the nearest one."""
     known = list(known)
     if name not in known:
-        refuse(key, f"unknown {kind} {name!r}", did_you_mean(name, known) if known else f"the dataset has no {kind} here")
+        refuse(
+            key, f"unknown {kind} {name!r}", did_you_mean(name, known) if known else f"the dataset has no {kind} here"
+        )
 
 
 def _check_unique(key: str, names: Iterable[str], kind: str, refuse: Refusal) -> None:
     first: dict[str, int] = {}
     for index, name in enumerate(names):
         if name in first:
-            refuse(f"{key}[{index}].name", f"duplicate {kind} name {name!r}", f"{key}[{first[name]}] has it already: rename one")
+            fault = f"duplicate {kind} name {name!r}"
+            refuse(f"{key}[{index}].name", fault, f"{key}[{first[name]}] has it already: rename one")
         first[name] = index
 
 
@@ -117,7 +121,8 @@ def _check_materials(materials: list[str], refuse: Refusal) -> None:
     for index, name in enumerate(materials):
         _check_name(f"materials[{index}]", name, refuse)
         if name in materials[:index]:
-            refuse(f"materials[{index}]", f"material {name!r} is named twice", "label k is the k-th material: name each once")
+            fault = f"material {name!r} is named twice"
+            refuse(f"materials[{index}]", fault, "label k is the k-th material: name each once")
 
 
 def _check_mesh(name: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
@@ -125,7 +130,9 @@ def _check_mesh(name: str, mesh: MeshEntry, materials: list[str], refuse: Refusa
     _check_name(key, name, refuse)
     check_path(f"{key}.file", mesh.file, MESHES, refuse)
     if mesh.parts and mesh.material is not None:
-        refuse(key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one")
+        refuse(
+            key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
+        )
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
     if mesh.material is not None:
@@ -139,14 +146,17 @@ def _check_part(key: str, part: str, mesh: MeshEntry, refuse: Refusal) -> None:
     """A file of one part has no other; which parts the others have, only reading them shows."""
     file = Path(mesh.file)
     if file.suffix.lower() in ONE_PART and part != file.stem:
-        refuse(key, f"{file.name} has no part {part!r}", f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
+        fault = f"{file.name} has no part {part!r}"
+        refuse(key, fault, f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
 
 
 def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
     if not any(ground.normal):
-        refuse(f"{key}.normal", "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
+        fault = "a normal of length 0"
+        refuse(f"{key}.normal", fault, "write the direction that points up from the ground, in the camera's axes")
     if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
-        refuse(f"{key}.normal", "it points away from the camera, or the camera lies in the plane", "turn its sign: it points toward the objects")
+        fault = "it points away from the camera, or the camera lies in the plane"
+        refuse(f"{key}.normal", fault, "turn its sign: it points toward the objects")
     for value in ground.diffuse or ():
         check_share(f"{key}.diffuse", value, refuse)
 
@@ -170,7 +180,8 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
         check_centre(f"{key}.camera.principal_point", photo.camera.principal_point, refuse)
     _check_masks(f"{key}.masks", photo, spec.materials, refuse)
     if not photo.objects:
-        refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", "add {name: …, mesh: …}: a mesh gives its pixels their normals")
+        fault = f"photo {photo.name!r} has no objects"
+        refuse(f"{key}.objects", fault, "add {name: …, mesh: …}: a mesh gives its pixels their normals")
     _check_unique(f"{key}.objects", (obj.name for obj in photo.objects), "object", refuse)
     for index, obj in enumerate(photo.objects):
         _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
@@ -206,7 +217,8 @@ def _check_object(key: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal
 def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
     """Enough of them, of different places, and not all on a line, about which the object could turn."""
     if obj.pose is not None:
-        refuse(key, "has both a pose and keypoints", "keep one: a pose is used as it is, keypoints are where the search begins")
+        fault = "has both a pose and keypoints"
+        refuse(key, fault, "keep one: a pose is used as it is, keypoints are where the search begins")
     if len(obj.keypoints) < LEAST_KEYPOINTS:
         cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
         refuse(key, f"{len(obj.keypoints)} keypoints do not settle a pose", cure)
@@ -226,7 +238,8 @@ def _check_spread(key: str, name: str, places: list[tuple[float, ...]], refuse: 
     along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
     off = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
     if max(off) < LEAST_OFF_LINE * math.hypot(*longest):
-        refuse(key, f"every {name} lies on one line", "name places in different directions: about a line the object could turn")
+        fault = f"every {name} lies on one line"
+        refuse(key, fault, "name places in different directions: about a line the object could turn")
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
@@ -241,7 +254,11 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
         check_folder(f"cameras.{kind}", path, refuse)
     for key in ("world_from_object", "world_from_camera") if kind == "bop" else ("obj_ids", "mesh_unit_mm"):
         if getattr(source, key) != getattr(CameraSource(), key):
-            cure = "a BOP scene gives poses by obj_ids" if kind == "bop" else "for this source, world_from_object gives poses"
+            cure = (
+                "a BOP scene gives poses by obj_ids"
+                if kind == "bop"
+                else "for this source, world_from_object gives poses"
+            )
             refuse(f"cameras.{key}", f"does not go with {kind}", f"leave it out: {cure}")
     for name in source.images:
         check_known(f"cameras.images.{name}", name, [photo.name for photo in spec.photos], "photo", refuse)

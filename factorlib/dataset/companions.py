@@ -25,7 +25,9 @@ def companions_of_mesh(path: str, key: str, refuse: Refusal) -> list[str]:
     """
     suffix, file = Path(path).suffix.lower(), refuse.folder / path
     if suffix == ".obj":
-        near = [near for near in _beside(path, _mtllibs(file, key), key, refuse) if os.path.isfile(refuse.folder / near)]
+        near = [
+            near for near in _beside(path, _mtllibs(file, key), key, refuse) if os.path.isfile(refuse.folder / near)
+        ]
         return _plain(near, "an .mtl", key, refuse)
     if suffix in (".gltf", ".glb"):
         near = _beside(path, _buffers(file, key, refuse), key, refuse)
@@ -61,7 +63,8 @@ def _beside(path: str, named: list[str], key: str, refuse: Refusal) -> list[str]
         try:
             path_inside(refuse.folder, companion)
         except ValueError as error:
-            refuse(key, f"{Path(path).name} names {companion[:80]!r}, which {_within(error)}", "copy that file beside the mesh")
+            fault = f"{Path(path).name} names {companion[:80]!r}, which {_within(error)}"
+            refuse(key, fault, "copy that file beside the mesh")
     return near
 
 

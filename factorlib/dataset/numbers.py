@@ -24,7 +24,8 @@ def check_numbers(value: Any, refuse: Refusal) -> None:
         if not math.isfinite(number):
             refuse(key, f"{number} is not a finite number", "give a number, or leave the key out")
         if abs(number) > LARGEST:
-            refuse(key, f"{number:.3g} is larger than anything that is measured here", f"give less than {LARGEST:g}, in another unit if need be")
+            fault = f"{number:.3g} is larger than anything that is measured here"
+            refuse(key, fault, f"give less than {LARGEST:g}, in another unit if need be")
 
 
 def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
@@ -49,14 +50,19 @@ def check_focal(key: str, focal: float, refuse: Refusal) -> None:
     if focal <= 0:
         refuse(key, f"a focal length of {focal}", "give pixels, more than 0, or leave it out")
     if not FOCAL_PX[0] <= focal <= FOCAL_PX[1]:
-        refuse(key, f"a focal length of {focal:g} px", f"give pixels, from {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g}, or leave it out")
+        fault = f"a focal length of {focal:g} px"
+        refuse(key, fault, f"give pixels, from {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g}, or leave it out")
 
 
 def check_centre(key: str, centre: Sequence[float], refuse: Refusal) -> None:
     """A principal point, pixels."""
     if not max(map(abs, centre)) <= CENTRE_PX:
         found = f"a principal point at ({centre[0]:g}, {centre[1]:g})"
-        refuse(key, found, f"it is in pixels from the photo's upper left corner, at most {CENTRE_PX:g} away; without the key it is the middle")
+        refuse(
+            key,
+            found,
+            f"it is in pixels from the photo's upper left corner, at most {CENTRE_PX:g} away; without the key it is the middle",
+        )
 
 
 def check_unit(key: str, number: float, refuse: Refusal) -> None:
@@ -70,7 +76,9 @@ def check_unit(key: str, number: float, refuse: Refusal) -> None:
 def check_share(key: str, number: float, refuse: Refusal) -> None:
     """A reflectance or a roughness."""
     if not 0 <= number <= 1:
-        refuse(key, f"{number:g} is not between 0 and 1", "reflectance (linear, not 0 to 255) and roughness are fractions")
+        refuse(
+            key, f"{number:g} is not between 0 and 1", "reflectance (linear, not 0 to 255) and roughness are fractions"
+        )
 
 
 def check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
@@ -78,10 +86,10 @@ def check_rotation(key: str, rows: tuple, refuse: Refusal) -> None:
     gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
     worst = max(abs(entry) for row in gram for entry in row)
     if not worst <= ROTATION_TOLERANCE:
-        refuse(key, f"not a rotation: RᵀR differs from 1 by {worst:.3g}", "its columns must be unit vectors at right angles (no scale)")
+        fault = f"not a rotation: RᵀR differs from 1 by {worst:.3g}"
+        refuse(key, fault, "its columns must be unit vectors at right angles (no scale)")
     a, b, c = rows
     determinant = sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3))
     if determinant < 0:
-        refuse(
-            key, "not a rotation but a reflection (determinant −1)", "one axis is flipped: the camera frame is x right, y down, z forward"
-        )
+        fault = "not a rotation but a reflection (determinant −1)"
+        refuse(key, fault, "one axis is flipped: the camera frame is x right, y down, z forward")

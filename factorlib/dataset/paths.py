@@ -83,7 +83,8 @@ def _inside(key: str, path: str, refuse: Refusal, kind: str) -> Path:
         return target
     except ValueError as error:
         shown = path if len(path) <= 80 else f"{path[:80]}…"
-        refuse(key, f"{shown!r} {error}", f"copy the {kind} into {refuse.folder.resolve()} and name it relative to that folder")
+        fault = f"{shown!r} {error}"
+        refuse(key, fault, f"copy the {kind} into {refuse.folder.resolve()} and name it relative to that folder")
 
 
 def _is_plain(target: Path) -> bool:

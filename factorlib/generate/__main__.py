@@ -16,7 +16,9 @@ from factorlib.errors import InputError
 from factorlib.wholefile import sync_tree
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
-Seed = Annotated[int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")]
+Seed = Annotated[
+    int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")
+]
 Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
 
@@ -34,15 +36,24 @@ def eames(
     seed: Seed = 0,
     out: Out = None,
     lights: Lights = None,
-    exact: Annotated[bool, typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")] = False,
-    distant: Annotated[bool, typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")] = False,
-    direct: Annotated[bool, typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")] = False,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")
+    ] = False,
+    distant: Annotated[
+        bool, typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")
+    ] = False,
+    direct: Annotated[
+        bool, typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
+    ] = False,
 ) -> None:
     """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
     from factorlib.generate import eames as set_
 
     if (exact or distant or direct) and out is None:
-        typer.echo("error: data/eames is the set without --exact, --distant and --direct\n  name another folder by --out", err=True)
+        typer.echo(
+            "error: data/eames is the set without --exact, --distant and --direct\n  name another folder by --out",
+            err=True,
+        )
         raise typer.Exit(2)
     parameters = set_.Parameters(exact=exact, distant=distant, direct=direct)
     _write(set_, out or Path("data/eames"), seed, lights, parameters)
@@ -80,9 +91,8 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
 
 def _check_replaceable(out: Path) -> None:
     if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
-        raise InputError(
-            "this folder holds something else than a data set", file=out, cure="name an empty folder, or a data set to replace"
-        )
+        fault = "this folder holds something else than a data set"
+        raise InputError(fault, file=out, cure="name an empty folder, or a data set to replace")
 
 
 if __name__ == "__main__":

@@ -38,7 +38,9 @@ def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
     >>> exposure_of_exif({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
     0.25
     """
-    time, aperture, iso = (_positive(exif.get(name)) for name in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity"))
+    time, aperture, iso = (
+        positive(exif.get(name)) for name in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity")
+    )
     if time is None or aperture is None or iso is None or iso == ISO_UNSAID:
         return None
     exposure = time * iso / aperture**2
@@ -104,5 +106,6 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _positive(value: Any) -> float | None:
+def positive(value: Any) -> float | None:
+    """The value of a tag as a number, None where it is none, or not more than 0."""
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None

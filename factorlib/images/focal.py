@@ -17,6 +17,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from factorlib.images.exif import positive
+
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
 FRAMES = (3 / 2, 4 / 3, 16 / 9)  # long side / short side of whole frames
 SAME_SHAPE = 0.02  # relative tolerance of proportions: cameras trim some pixels
@@ -40,14 +42,14 @@ def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str
 
 
 def _of_film(exif: Mapping[str, Any], width: int, height: int) -> float | None:
-    film = _positive(exif.get("Exif:FocalLengthIn35mmFilm"))
+    film = positive(exif.get("Exif:FocalLengthIn35mmFilm"))
     return film and film / FILM_DIAGONAL * math.hypot(width, height)
 
 
 def _of_focal_plane(exif: Mapping[str, Any], width: int) -> float | None:
-    focal = _positive(exif.get("Exif:FocalLength"))
-    density = _positive(exif.get("Exif:FocalPlaneXResolution"))
-    taken = _positive(exif.get("Exif:PixelXDimension"))
+    focal = positive(exif.get("Exif:FocalLength"))
+    density = positive(exif.get("Exif:FocalPlaneXResolution"))
+    taken = positive(exif.get("Exif:PixelXDimension"))
     unit = UNIT_MM.get(exif.get("Exif:FocalPlaneResolutionUnit", 2))
     if not (focal and density and taken and unit):
         return None
@@ -56,7 +58,7 @@ def _of_focal_plane(exif: Mapping[str, Any], width: int) -> float | None:
 
 def _is_cropped(exif: Mapping[str, Any], width: int, height: int) -> bool:
     shape = _proportion(width, height)
-    taken = [_positive(exif.get(f"Exif:Pixel{axis}Dimension")) for axis in "XY"]
+    taken = [positive(exif.get(f"Exif:Pixel{axis}Dimension")) for axis in "XY"]
     if all(taken) and not _same(shape, _proportion(*taken)):
         return True
     return not any(_same(shape, frame) for frame in FRAMES)
@@ -68,7 +70,3 @@ def _proportion(a: float | int, b: float | int) -> float:
 
 def _same(a: float, b: float) -> bool:
     return abs(a / b - 1) <= SAME_SHAPE
-
-
-def _positive(value: Any) -> float | None:
-    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None

@@ -30,4 +30,5 @@ def check_values(path: str | Path, most_megapixels: float, key: str | None = Non
     source.close()
     if millions > CHANNELS * most_megapixels:
         found = f"has {spec.width} × {spec.height} pixels of {spec.nchannels} channels, {millions:,.0f} million values"
-        raise InputError(found, file=path, key=key, cure=f"make it smaller, or leave channels out: at most {CHANNELS * most_megapixels:,.0f} million are read")
+        cure = f"make it smaller, or leave channels out: at most {CHANNELS * most_megapixels:,.0f} million are read"
+        raise InputError(found, file=path, key=key, cure=cure)

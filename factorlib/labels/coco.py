@@ -120,7 +120,9 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
         cure = did_you_mean(base, [_base(e.file_name) for e in coco.images])
         raise InputError(f"has no image {base!r}", file=path, key="images", cure=cure)
     if len(found) > 1:
-        raise InputError(f"has {len(found)} images {base!r}", file=path, key="images", cure=f"keep one, or name it {image!r} in full")
+        raise InputError(
+            f"has {len(found)} images {base!r}", file=path, key="images", cure=f"keep one, or name it {image!r} in full"
+        )
     return found[0]
 
 
@@ -131,7 +133,8 @@ def _base(file_name: str) -> str:
 def _material(annotation: Annotation, names: dict, materials: list[str], path: str | Path, key: str) -> str:
     name = names.get(annotation.category_id)
     if name is None:
-        raise InputError(f"category_id {annotation.category_id!r} is not in categories", file=path, key=key, cure="export the file again")
+        fault = f"category_id {annotation.category_id!r} is not in categories"
+        raise InputError(fault, file=path, key=key, cure="export the file again")
     if name not in materials:
         cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
         raise InputError(f"category {name!r} is no material", file=path, key=key, cure=cure)
@@ -143,7 +146,9 @@ def _counts(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     with reading("a COCO segmentation", path, key, CURE):
         segmentation = msgspec.json.decode(text, type=list[list[float]] | Rle | None)
     if not segmentation:
-        raise InputError("is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it")
+        raise InputError(
+            "is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it"
+        )
     if not isinstance(segmentation, Rle):
         return _filled(segmentation, shape, path, key)
     if tuple(segmentation.size) != shape:
@@ -159,7 +164,8 @@ def _filled(polygons: list[list[float]], shape: tuple[int, int], path: str | Pat
         corners = _corners(polygon, shape, path, f"{key}[{index}]")
         longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
         if longer > LONGEST * (height + width):
-            raise InputError(f"its outline is {longer:.3g} pixels long", file=path, key=f"{key}[{index}]", cure="draw it again, with fewer corners")
+            fault = f"its outline is {longer:.3g} pixels long"
+            raise InputError(fault, file=path, key=f"{key}[{index}]", cure="draw it again, with fewer corners")
         clipped.append(corners.ravel().tolist())
         length += longer
     return [each["counts"].decode("ascii") for each in pycocomask.frPyObjects(clipped, height, width)], length
@@ -173,7 +179,10 @@ def _corners(polygon: list[float], shape: tuple[int, int], path: str | Path, key
         raise InputError(found, file=path, key=key, cure=cure)
     corners = np.reshape(polygon, (-1, 2))
     if (corners < -OVERSHOOT).any() or (corners > np.array([width, height]) + OVERSHOOT).any():
-        found, cure = f"leaves the image of {_wh(shape)} pixels", "was it drawn at another size? cut it at the image's edge"
+        found, cure = (
+            f"leaves the image of {_wh(shape)} pixels",
+            "was it drawn at another size? cut it at the image's edge",
+        )
         raise InputError(found, file=path, key=key, cure=cure)
     return np.clip(corners, 0, [width, height])
 

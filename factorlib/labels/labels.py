@@ -16,8 +16,7 @@ from jaxtyping import Bool, UInt8, UInt16
 
 from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
-from factorlib.labels.png import read_inside, read_values
-from factorlib.labels.size import check_size
+from factorlib.labels.png import check_size, read_inside, read_values
 
 LEFT_OUT = 255
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
@@ -32,7 +31,12 @@ class Labels(msgspec.Struct, frozen=True):
 
 
 def read_labels(
-    masks: str | Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], image: str, key: str = "masks"
+    masks: str | Mapping[str, str],
+    file: Callable[[str], Path],
+    materials: list[str],
+    size: tuple[int, int],
+    image: str,
+    key: str = "masks",
 ) -> Labels:
     """The labels of one photo.
 
@@ -48,9 +52,8 @@ def read_labels(
         labels = _of_values(read_values(file(masks), key, size), file(masks), materials, key)
     if not labels.label.any():
         where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
-        raise InputError(
-            "the mask is empty: no pixel has a material", file=where, key=key, cure="paint at least one material, or drop the photo"
-        )
+        fault = "the mask is empty: no pixel has a material"
+        raise InputError(fault, file=where, key=key, cure="paint at least one material, or drop the photo")
     return labels
 
 
@@ -65,12 +68,15 @@ def read_objects(
         where = f"{key}[{index}].mask"
         inside = read_inside(file(path), where, size)
         if not inside.any():
-            raise InputError(f"the mask of object {name!r} is empty", file=file(path), key=where, cure="paint it, or leave the key out")
+            fault = f"the mask of object {name!r} is empty"
+            raise InputError(fault, file=file(path), key=where, cure="paint it, or leave the key out")
         if objects[inside].any():
             other = int(objects[inside & (objects > 0)][0]) - 1
             count = int((objects[inside] == other + 1).sum())
             found = f"objects {masks[other][0]!r} and {name!r} share {count} pixels"
-            raise InputError(found, file=file(path), key=where, cure="a pixel shows one object: erase it from the one behind")
+            raise InputError(
+                found, file=file(path), key=where, cure="a pixel shows one object: erase it from the one behind"
+            )
         objects[inside] = index + 1
     return objects
 
@@ -83,14 +89,15 @@ def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[st
     for value, count in zip(found.tolist(), counts.tolist()):
         if value > len(materials) and value != LEFT_OUT:
             known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
-            raise InputError(
-                f"unknown label {value} ({count} pixels)", file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out"
-            )
+            fault = f"unknown label {value} ({count} pixels)"
+            raise InputError(fault, file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out")
     left_out = values == LEFT_OUT
     return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
 
 
-def _of_materials(masks: Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], key: str) -> Labels:
+def _of_materials(
+    masks: Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], key: str
+) -> Labels:
     inside = {}
     for material in sorted(masks, key=materials.index):
         inside[material] = read_inside(file(masks[material]), f"{key}.{material}", size)
@@ -105,7 +112,11 @@ def _of_coco(path: Path, materials: list[str], size: tuple[int, int], image: str
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray], materials: list[str], size: tuple[int, int], where: Mapping[str, tuple[Path, str]], edge: int
+    inside: Mapping[str, np.ndarray],
+    materials: list[str],
+    size: tuple[int, int],
+    where: Mapping[str, tuple[Path, str]],
+    edge: int,
 ) -> Labels:
     """One map of several masks; what two of them claim is refused where it is wider than `edge` pixels, else left out."""
     label, left_out = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=bool)

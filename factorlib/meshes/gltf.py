@@ -147,7 +147,9 @@ class Buffers:
             said = self.header.buffers[index]
             content = self._content(said.uri)
             if len(content) < said.byteLength:
-                raise InputError(f"buffer {index} has {len(content)} of {said.byteLength} bytes", file=self.path, cure=CURE)
+                raise InputError(
+                    f"buffer {index} has {len(content)} of {said.byteLength} bytes", file=self.path, cure=CURE
+                )
             self._read[index], self.left = content, self.left - len(content)
         return self._read[index]
 
@@ -176,8 +178,12 @@ class Buffers:
         values = self._plain(accessor, width)
         if accessor.sparse is not None and accessor.sparse.count:
             sparse, values = accessor.sparse, values.copy()
-            where = self._view(sparse.indices.bufferView, sparse.indices.byteOffset, sparse.indices.componentType, sparse.count, 1)
-            there = self._view(sparse.values.bufferView, sparse.values.byteOffset, accessor.componentType, sparse.count, width)
+            where = self._view(
+                sparse.indices.bufferView, sparse.indices.byteOffset, sparse.indices.componentType, sparse.count, 1
+            )
+            there = self._view(
+                sparse.values.bufferView, sparse.values.byteOffset, accessor.componentType, sparse.count, width
+            )
             values[where[:, 0]] = there
         return values / np.iinfo(values.dtype).max if accessor.normalized and values.dtype.kind in "iu" else values
 
@@ -199,14 +205,24 @@ class Buffers:
 def _joined(places: list[Placed], data: Buffers) -> Soup:
     vertices, faces, normals, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [no_normals(0)], 0
     for place in places:
-        points, own, linear = _vectors(place.primitive, "POSITION", data), _faces(place.primitive, data), place.world_from_node[:3, :3]
+        points, own, linear = (
+            _vectors(place.primitive, "POSITION", data),
+            _faces(place.primitive, data),
+            place.world_from_node[:3, :3],
+        )
         with np.errstate(all="ignore"):  # as above
             vertices.append(points @ linear.T + place.world_from_node[:3, 3])
             normals.append(_normals(place.primitive, data, linear, own))
         faces.append(np.where((own >= 0) & (own < len(points)), own + offset, -1))
         offset += len(points)
     part = np.repeat(np.arange(len(places)), [len(own) for own in faces[1:]])
-    return Soup(np.concatenate(vertices), np.concatenate(faces), part, [place.names for place in places], np.concatenate(normals))
+    return Soup(
+        np.concatenate(vertices),
+        np.concatenate(faces),
+        part,
+        [place.names for place in places],
+        np.concatenate(normals),
+    )
 
 
 def _normals(primitive: Primitive, data: Buffers, linear: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
@@ -232,7 +248,9 @@ def _faces(primitive: Primitive, data: Buffers) -> Int[np.ndarray, "f 3"]:
         corners = np.arange(data.header.accessors[primitive.attributes["POSITION"]].count)
     if primitive.mode == TRIANGLES:
         if len(corners) % 3:
-            raise InputError(f"a primitive has {len(corners)} corners, which makes no triangles", file=data.path, cure=CURE)
+            raise InputError(
+                f"a primitive has {len(corners)} corners, which makes no triangles", file=data.path, cure=CURE
+            )
         return corners.reshape(-1, 3)
     first = np.full(max(len(corners) - 2, 0), corners[0]) if primitive.mode == FAN else corners[:-2]
     faces = np.stack([first, corners[1:-1], corners[2:]], axis=1)

@@ -27,7 +27,9 @@ def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[n
     return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def edges_of(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Bool[np.ndarray, " e"], Int[np.ndarray, " e"]]:
+def edges_of(
+    faces: Int[np.ndarray, "f 3"],
+) -> tuple[Int[np.ndarray, "e 2"], Bool[np.ndarray, " e"], Int[np.ndarray, " e"]]:
     """The 3F half-edges sorted by edge: (low, high) vertex, whether it runs from low to high, and its face."""
     start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
     face = np.repeat(np.arange(len(faces)), 3)
@@ -42,10 +44,16 @@ def neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "n 2"], B
     starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
     counts = np.diff(np.r_[starts, len(pair)])
     first = starts[counts == 2]
-    return np.stack([face[first], face[first + 1]], axis=1), forward[first] != forward[first + 1], bool((counts == 1).any())
+    return (
+        np.stack([face[first], face[first + 1]], axis=1),
+        forward[first] != forward[first + 1],
+        bool((counts == 1).any()),
+    )
 
 
-def consistently_wound(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[Bool[np.ndarray, " f"], bool]:
+def consistently_wound(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Bool[np.ndarray, " f"], bool]:
     """Which faces to flip so that neighbours agree, and whether the surface is open.
 
     Of a connected patch's two orientations, an open patch takes the one that flips less area, a closed one the one
@@ -70,7 +78,9 @@ def consistently_wound(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray
     return (total[kept] < 0) & (kept != flipped), has_border
 
 
-def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], crease_deg: float) -> Float[np.ndarray, "f 3 3"]:
+def corner_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], crease_deg: float
+) -> Float[np.ndarray, "f 3 3"]:
     """Unit normal at each corner of each face: angle-weighted over the faces of its vertex within `crease_deg` of its own."""
     area = area_vectors(vertices, faces)
     normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)

@@ -16,7 +16,8 @@ MOST_PARTS = 100_000  # of one file
 def check_count(parts: int, file: str | Path) -> None:
     """Raise InputError for more than MOST_PARTS parts in one file."""
     if parts > MOST_PARTS:
-        raise InputError(f"has {parts:,} parts", file=file, cure=f"join parts of one material: at most {MOST_PARTS:,} are read")
+        cure = f"join parts of one material: at most {MOST_PARTS:,} are read"
+        raise InputError(f"has {parts:,} parts", file=file, cure=cure)
 
 
 def part_labels(
@@ -34,43 +35,32 @@ def part_labels(
     [1, 2]
     """
     there = sorted({name for each in names for name in each})
-    parts, material = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
-    for mapping in (parts, overrides):
-        for part, chosen in mapping.items():
-            if part not in there:
-                raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=did_you_mean(part, [one_line(name) for name in there]))
-            _check_material(chosen, materials, part, file)
-    if material is not None:
-        _check_material(material, materials, None, file)
-    return np.array([_label(each, materials, parts, material, overrides, file) for each in names], dtype=np.int16)
+    parts, default = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
+    for part, material in [*parts.items(), *overrides.items(), *([(None, default)] if default is not None else [])]:
+        if part is not None and part not in there:
+            cure = did_you_mean(part, [one_line(name) for name in there])
+            raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=cure)
+        if material not in materials:
+            cure = did_you_mean(material, materials)
+            raise InputError(f"unknown material {material!r}", file=file, key=part, cure=cure)
 
+    def label(goes_by: tuple[str, ...]) -> int:
+        """The label of a part by all its names."""
+        called = one_line(" / ".join(goes_by)) or "(unnamed)"
+        for mapping in (overrides, parts):
+            chosen = {mapping[name] for name in goes_by if name in mapping}
+            if len(chosen) > 1:
+                found = f"part {called} gets several materials: {', '.join(sorted(chosen))}"
+                raise InputError(found, file=file, cure="name it once")
+            if chosen:
+                return list(materials).index(chosen.pop()) + 1
+        if default is None:
+            entry = (
+                f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}"
+                if goes_by
+                else "give it a name in a mesh editor"
+            )
+            raise InputError(f"part {called} has no material", file=file, key=called, cure=entry)
+        return list(materials).index(default) + 1
 
-def _label(
-    names: tuple[str, ...],
-    materials: Sequence[str],
-    parts: Mapping[str, str],
-    default: str | None,
-    overrides: Mapping[str, str],
-    file: str | Path,
-) -> int:
-    for mapping in (overrides, parts):
-        chosen = {mapping[name] for name in names if name in mapping}
-        if len(chosen) > 1:
-            raise InputError(f"part {_called(names)} gets several materials: {', '.join(sorted(chosen))}", file=file, cure="name it once")
-        if chosen:
-            return list(materials).index(chosen.pop()) + 1
-    if default is None:
-        part = _called(names)
-        cure = f"add it to `parts`, e.g. {_called(names[:1])}: {materials[0]}" if names else "give it a name in a mesh editor"
-        raise InputError(f"part {part} has no material", file=file, key=part, cure=cure)
-    return list(materials).index(default) + 1
-
-
-def _called(names: Sequence[str]) -> str:
-    """A part by all its names, as messages write it."""
-    return one_line(" / ".join(names)) or "(unnamed)"
-
-
-def _check_material(name: str, materials: Sequence[str], part: str | None, file: str | Path) -> None:
-    if name not in materials:
-        raise InputError(f"unknown material {name!r}", file=file, key=part, cure=did_you_mean(name, materials))
+    return np.array([label(each) for each in names], dtype=np.int16)

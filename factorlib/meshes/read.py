@@ -8,22 +8,22 @@ result in silence is refused.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError
 from factorlib.meshes.gltf import read_gltf
-from factorlib.meshes.limits import Limits
+from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
-from factorlib.meshes.off import read_off
 from factorlib.meshes.parts import check_count, part_labels
 from factorlib.meshes.ply import read_ply
 from factorlib.meshes.soup import Soup, check
-from factorlib.meshes.stl import read_stl
+from factorlib.meshes.stl import read_off, read_stl
 from factorlib.reading import read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # all in one file
@@ -63,6 +63,25 @@ def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str
     return soup.parts
 
 
+class MeshesOnce:
+    """Meshes of a data set, each read once for each choice of materials for its parts; sizes were limited by an earlier stage.
+
+    file: the path of a file that dataset.yaml names;  materials: the data set's;  crease_deg: as of `read_mesh`
+    """
+
+    def __init__(self, file: Callable[[str], Path], materials: Sequence[str], crease_deg: float):
+        self.file, self.materials, self.crease_deg = file, materials, crease_deg
+        self._meshes: dict[tuple, Mesh] = {}
+
+    def mesh(self, name: str, entry: MeshEntry, overrides: Mapping[str, str] = {}) -> Mesh:
+        """The mesh `name` with `overrides` of its parts' materials, read when first asked for."""
+        key = (name, *sorted(overrides.items()))
+        if key not in self._meshes:
+            file = self.file(entry.file)
+            self._meshes[key] = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
+        return self._meshes[key]
+
+
 def read_soup(path: str | Path, limits: Limits) -> Soup:
     """What the file says; InputError where it says nothing usable."""
     path = Path(path)
@@ -70,11 +89,10 @@ def read_soup(path: str | Path, limits: Limits) -> Soup:
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
     with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE):
-        soup = (
-            WITHIN[suffix](path, read_bytes(path, "a mesh", most_bytes=limits.bytes), limits)
-            if suffix in WITHIN
-            else read_gltf(path, limits)
-        )
+        if suffix in WITHIN:
+            soup = WITHIN[suffix](path, read_bytes(path, "a mesh", most_bytes=limits.bytes), limits)
+        else:
+            soup = read_gltf(path, limits)
     check_count(len(soup.parts), path)
     return check(soup, path)
 
@@ -94,20 +112,14 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Pa
 
 def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Welded vertices, the faces by these, and which of the faces to keep; InputError if none."""
-    vertices, faces = _used(soup)
-    weld = welded(vertices)
-    first = np.unique(weld, return_index=True)[1]
-    vertices, faces = vertices[first], weld[faces]
+    used, faces = np.unique(soup.faces, return_inverse=True)  # a stray vertex far away must not set the scale
+    weld = welded(soup.vertices[used])
+    vertices = soup.vertices[used][np.unique(weld, return_index=True)[1]]
+    faces = weld[faces.reshape(-1, 3)]
     keep = good_faces(vertices, faces, file)
     if not keep.any():
         raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
     return vertices, faces, keep
-
-
-def _used(soup: Soup) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that a face uses, and the faces by these: a stray vertex far away must not set the scale."""
-    used, faces = np.unique(soup.faces, return_inverse=True)
-    return soup.vertices[used], faces.reshape(-1, 3)
 
 
 def good_faces(vertices: np.ndarray, faces: np.ndarray, file: str | Path) -> np.ndarray:
@@ -129,11 +141,14 @@ def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> n
         length = np.linalg.norm(supplied, axis=-1, keepdims=True)
         unit = supplied / length
         face = (area / np.linalg.norm(area, axis=1, keepdims=True))[:, None, :]
-        sane = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05) & (np.sum(unit * face, axis=-1) > 0.26)
+        right_length = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05)
+        sane = right_length & (np.sum(unit * face, axis=-1) > 0.26)
     return np.where(sane[..., None], unit, own)
 
 
-def split_at_creases(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, face_label: np.ndarray, is_open: bool) -> Mesh:
+def split_at_creases(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, face_label: np.ndarray, is_open: bool
+) -> Mesh:
     """One vertex per position and normal."""
     rounded = np.round(normals.reshape(-1, 3) * 2**20).astype(np.int64)
     key = np.concatenate([faces.reshape(-1, 1), rounded], axis=1)

@@ -75,26 +75,25 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
 def check(soup: Soup, file: str | Path) -> Soup:
     """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
     place that leaves no digits for the shape."""
+
+    def refuse(found: str, cure: str) -> None:
+        raise InputError(found, file=file, cure=cure)
+
     if len(soup.faces) == 0:
-        raise InputError("mesh without faces", file=file, cure="export triangles, not only points or lines")
+        refuse("mesh without faces", "export triangles, not only points or lines")
     low, high = int(soup.faces.min()), int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
-        index = low if low < 0 else high
-        raise InputError(f"a face uses vertex {index + 1} of {len(soup.vertices)}", file=file, cure="is the file whole?")
+        refuse(f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}", "is the file whole?")
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
         found = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
-        raise InputError(found, file=file, cure="remove them in a mesh editor, or export the mesh again")
-    _check_extent(soup.vertices[soup.faces.reshape(-1)], file)
-    return soup
-
-
-def _check_extent(corners: Float[np.ndarray, "n 3"], file: str | Path) -> None:
+        refuse(found, "remove them in a mesh editor, or export the mesh again")
+    corners, unit = soup.vertices[soup.faces.reshape(-1)], "give it in another unit, about its own origin"
     largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
-    cure = "give it in another unit, about its own origin"
     if largest > LARGEST:
-        raise InputError(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", file=file, cure=cure)
+        refuse(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", unit)
     if 0 < extent < LEAST_EXTENT:
-        raise InputError(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", file=file, cure=cure)
+        refuse(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", unit)
     if 0 < extent < LEAST_SHARE * largest:
-        raise InputError(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", file=file, cure=cure)
+        refuse(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", unit)
+    return soup

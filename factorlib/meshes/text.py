@@ -20,7 +20,9 @@ def lines_of(content: bytes) -> Iterator[str]:
     >>> list(lines_of("Stühle\\r\\nb\\rc\\x0cd\\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
     (['Stühle', 'b', 'c\\x0cd'], ['Stühle'])
     """
-    with io.TextIOWrapper(io.BytesIO(content), _encoding_of(content)) as text:  # line by line: a list of them is far larger
+    with io.TextIOWrapper(
+        io.BytesIO(content), _encoding_of(content)
+    ) as text:  # line by line: a list of them is far larger
         for line in text:
             check_length(len(line))
             yield line.rstrip("\n")

@@ -9,7 +9,18 @@ from pathlib import Path
 from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError, did_you_mean
-from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, Grid, Insert, OfPhotos, Relight, Transfer, is_light_file, is_mesh_file
+from factorlib.recipe.schema import (
+    BALL,
+    KINDS,
+    AnyRecipe,
+    Grid,
+    Insert,
+    OfPhotos,
+    Relight,
+    Transfer,
+    is_light_file,
+    is_mesh_file,
+)
 from factorlib.recipe.table import read_table
 from factorlib.yamlfile import load_yaml, read_yaml
 
@@ -36,13 +47,26 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     if isinstance(recipe, Relight):
         _check_once([Path(name).stem for name in recipe.lights], "light", path, "lights")
         if not recipe.lights and len(photos) == 1:
-            raise InputError("there is no other photo whose light could be used", file=path, key="lights", cure="name a file (.hdr, .exr)")
+            fault = "there is no other photo whose light could be used"
+            raise InputError(fault, file=path, key="lights", cure="name a file (.hdr, .exr)")
     if isinstance(recipe, Transfer | Grid):
         _check(recipe.materials, dataset.spec.materials, "material", path, "materials")
     if isinstance(recipe, Transfer | Insert):
         own = read_table(path.parent / recipe.table) if recipe.table is not None else {}
-        wanted = recipe.materials.values() if isinstance(recipe, Transfer) else [recipe.material] if recipe.material is not None else []
-        _check(wanted, [*dataset.spec.materials, *own], "material", path, "materials" if isinstance(recipe, Transfer) else "material")
+        wanted = (
+            recipe.materials.values()
+            if isinstance(recipe, Transfer)
+            else [recipe.material]
+            if recipe.material is not None
+            else []
+        )
+        _check(
+            wanted,
+            [*dataset.spec.materials, *own],
+            "material",
+            path,
+            "materials" if isinstance(recipe, Transfer) else "material",
+        )
     if isinstance(recipe, Insert):
         _check_insert(recipe, meshes, dataset, path)
     return recipe
@@ -52,7 +76,9 @@ def _check_insert(recipe: Insert, meshes: list[str], dataset: Dataset, path: Pat
     if not is_mesh_file(recipe.mesh):
         _check([recipe.mesh], [BALL, *meshes], "mesh", path, "mesh")
     elif Path(recipe.mesh).suffix.lower() not in MESHES:
-        raise InputError(f"{recipe.mesh!r} is no mesh that is read here", file=path, key="mesh", cure=f"one of {', '.join(MESHES)}")
+        raise InputError(
+            f"{recipe.mesh!r} is no mesh that is read here", file=path, key="mesh", cure=f"one of {', '.join(MESHES)}"
+        )
     if recipe.beside is not None:
         for photo in recipe.photos or [photo.name for photo in dataset.spec.photos]:
             objects = [obj.name for obj in dataset.photo(photo).objects]
@@ -72,7 +98,8 @@ def is_plain_file(path: Path) -> bool:
 def _check_once(names: list[str], what: str, path: Path, key: str) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"the {what} {name!r} is named twice: one picture would replace the other", file=path, key=key, cure="name it once")
+            fault = f"the {what} {name!r} is named twice: one picture would replace the other"
+            raise InputError(fault, file=path, key=key, cure="name it once")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:

@@ -17,8 +17,7 @@ from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
-from factorlib.meshes.once import MeshesOnce
-from factorlib.meshes.read import CREASE_DEG, read_mesh
+from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file
 from factorlib.recipe.table import read_table
 from factorlib.render.ground import Plane, resting_plane

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.images.picture import exposure_of, picture
-from factorlib.report.artifacts import Artifacts
-from factorlib.report.photos import ringed
+from factorlib.report.artifacts import Artifacts, Picture
 from factorlib.report.png import data_uri, outline, reduced
 from factorlib.results.metrics import ScoredLight
 from factorlib.urm.observations import Observations
 
 MAP_SIZE = 64
 LEAST_OBSERVED = 0.002  # of a disc: fewer normals than this are not ringed
+MAGENTA = (214, 40, 120)
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -58,14 +58,15 @@ def exposures(run: Artifacts) -> dict[str, float]:
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
 
-def balls(run: Artifacts, seen: dict[str, list[str]], exposure: dict[str, float]) -> list[list[Cell]]:
-    """Rows of materials, columns of photos."""
-    return [[_ball(run, m, p, m in seen[p], exposure[p]) for p in run.set.photos] for m in run.set.materials]
+def balls(run: Artifacts, observed: dict[str, list[str]], exposure: dict[str, float]) -> list[list[Cell]]:
+    """Rows of materials, columns of photos; observed: the materials that each photo shows."""
+    return [[_ball(run, m, p, m in observed[p], exposure[p]) for p in run.set.photos] for m in run.set.materials]
 
 
 def _ball(run: Artifacts, material: str, photo: str, observed: bool, exposure: float) -> Cell:
-    radiance = run.ball(photo, material)
-    return Cell(material, photo, observed, None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure)))
+    radiance = run.rgb("render", f"materials/{photo}/{material}")
+    uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
+    return Cell(material, photo, observed, uri)
 
 
 def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> np.ndarray:
@@ -79,27 +80,30 @@ def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> np.ndarray:
 def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     """One cell per material: solved, with the observed normals ringed, and beside it what the photo measured."""
     observations = run.observations(photo)
-    return [_map(run, photo, index, material, observations, exposure) for index, material in enumerate(run.set.materials)]
+    return [_map(run, photo, index, name, observations, exposure) for index, name in enumerate(run.set.materials)]
 
 
-def _map(run: Artifacts, photo: str, index: int, material: str, observations: Observations | None, exposure: float) -> Cell:
-    channels = run.reflectance_map(photo, material)
-    rows = observations.material == index if observations is not None else np.zeros(0, bool)
-    measured = data_uri(measured_map(observations.take(rows), exposure)) if rows.any() else None
+def _map(run: Artifacts, photo: str, index: int, name: str, seen: Observations | None, exposure: float) -> Cell:
+    channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
+    rows = seen.material == index if seen is not None else np.zeros(0, bool)
+    measured = data_uri(measured_map(seen.take(rows), exposure)) if rows.any() else None
     if channels is None:
-        return Cell(material, photo, bool(rows.any()), None, measured)
+        return Cell(name, photo, bool(rows.any()), None, measured)
     pixels = disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
-    seen = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
-    if seen.mean() > LEAST_OBSERVED:
-        inside = pixels[..., 3] > 0
-        pixels[..., :3] = np.rint(255 * ringed(pixels[..., :3] / 255, seen | ~inside))
-    return Cell(material, photo, bool(rows.any()), data_uri(pixels), measured)
+    observed = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
+    if observed.mean() > LEAST_OBSERVED:
+        line = outline(observed | ~(pixels[..., 3] > 0))  # white on dark and black on bright
+        pixels[line, :3] = np.where(pixels[line, :3].mean(axis=-1, keepdims=True) > 127.5, 0, 255)
+    return Cell(name, photo, bool(rows.any()), data_uri(pixels), measured)
 
 
 def measured_map(observations: Observations, exposure: float) -> np.ndarray:
-    """Mean radiance by normal, seen from the front, as RGBA; transparent where no normal was seen."""
-    n, side = observations.normal, _side(len(observations))  # camera frame: x right, y down
-    column, row = (np.clip(((n[:, k] + 1) / 2 * side).astype(int), 0, side - 1) for k in (0, 1))
+    """Mean radiance by normal, seen from the front, as RGBA; transparent where no normal was seen.
+
+    The disc is as many cells across as leave about two observations to a cell, at most `MAP_SIZE`.
+    """
+    n, side = observations.normal, int(np.clip(np.sqrt(len(observations) * 2 / np.pi), 8, MAP_SIZE))
+    column, row = (np.clip(((n[:, k] + 1) / 2 * side).astype(int), 0, side - 1) for k in (0, 1))  # x right, y down
     cell = row * side + column
     weight = np.bincount(cell, minlength=side**2)
     total = np.stack([np.bincount(cell, c, side**2) for c in observations.radiance.T], axis=-1)
@@ -108,20 +112,17 @@ def measured_map(observations: Observations, exposure: float) -> np.ndarray:
     return np.concatenate([picture(mean, exposure), alpha], axis=-1)
 
 
-def _side(observations: int) -> int:
-    """Cells across the disc: about two observations to a cell, at most `MAP_SIZE` across."""
-    return int(np.clip(np.sqrt(observations * 2 / np.pi), 8, MAP_SIZE))
-
-
-def light_row(run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None) -> LightRow | None:
+def light_row(
+    run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None
+) -> LightRow | None:
     """The row of light `name`; None where no such light was exported.  errors: its part of metrics.json"""
-    radiance = run.illumination(name)
+    radiance = run.rgb("export", f"illumination/{name}")
     if radiance is None:
         return None
     exposure = exposure_of(radiance, percentile=95.0)
-    brightest, area = radiance.max(axis=-1) * exposure, lat_long_solid_angles(*radiance.shape[:2])[:, None]
+    brightest, area = radiance.max(axis=-1) * exposure, _areas(radiance)
     over, energy = brightest > 1, radiance.sum(axis=-1) * area
-    true, known = run.true_illumination(name), run.coverage(name)
+    true, known = run.rgb("evaluate", f"illumination/{name}"), run.rgb("export", f"coverage/{name}")
     mean = float((radiance * area[..., None]).sum() / (3 * area.sum() * radiance.shape[1]))
     error = None if known is None else known.mean(axis=-1) / np.maximum(1, radiance.mean(axis=-1) / max(mean, 1e-30))
     return LightRow(
@@ -135,29 +136,29 @@ def light_row(run: Artifacts, name: str, photos: list[str], errors: dict[str, di
     )  # fmt: skip
 
 
-def _outlined(pixels: np.ndarray, over: np.ndarray) -> np.ndarray:
-    found = pixels.copy()
-    found[outline(over)] = (214, 40, 120)
-    return found
+def _areas(lat_long: Picture) -> Float[np.ndarray, "h 1"]:
+    return lat_long_solid_angles(*lat_long.shape[:2])[:, None]
 
 
-def _true_map(true: np.ndarray, estimate: np.ndarray, exposure: float) -> np.ndarray:
+def _outlined(pixels: np.ndarray, over: Bool[np.ndarray, "h w"]) -> np.ndarray:
+    pixels[outline(over)] = MAGENTA
+    return pixels
+
+
+def _true_map(true: Picture, estimate: Picture, exposure: float) -> np.ndarray:
     """The true map, scaled to the mean of the estimate: the overall scale is a matter of gauge."""
-    area = [lat_long_solid_angles(*m.shape[:2])[:, None, None] / m.shape[1] for m in (true, estimate)]
-    scale = float((estimate * area[1]).sum() / max((true * area[0]).sum(), 1e-30))
-    small = reduced(true, max(estimate.shape[:2]))
-    return _outlined(picture(small * scale, exposure), (small * scale * exposure).max(axis=-1) > 1)
+    means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
+    small = reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30))
+    return _outlined(picture(small, exposure), (small * exposure).max(axis=-1) > 1)
 
 
 def _spheres(run: Artifacts, name: str) -> str | None:
     """Truth above, estimate below, the estimate scaled to the truth's mean."""
-    pair = [run.spheres(name, which) for which in ("truth", "estimate")]
-    if any(p is None for p in pair):
+    truth, estimate = (run.rgb("evaluate", f"spheres/{name}_{which}") for which in ("truth", "estimate"))
+    if truth is None or estimate is None:
         return None
-    truth, estimate = pair
-    rows = [truth, estimate * (truth.mean() / max(float(estimate.mean()), 1e-30))]
     exposure = exposure_of(truth, truth.max(-1) > 0, 97.0)
-    discs = [[disc(np.repeat(np.repeat(ball, 2, 0), 2, 1), exposure) for ball in np.split(row, 3, axis=1)] for row in rows]
-    gap = np.zeros((discs[0][0].shape[0] + 8, 8, 4), np.uint8)
-    padded = [[np.concatenate([np.pad(d, ((4, 4), (0, 0), (0, 0))), gap], axis=1) for d in row] for row in discs]
-    return data_uri(np.concatenate([np.concatenate(row, axis=1) for row in padded], axis=0))
+    rows = [truth, estimate * (truth.mean() / max(float(estimate.mean()), 1e-30))]
+    balls = [[np.repeat(np.repeat(ball, 2, 0), 2, 1) for ball in np.split(row, 3, axis=1)] for row in rows]
+    discs = [[np.pad(disc(ball, exposure), ((4, 4), (0, 8), (0, 0))) for ball in row] for row in balls]
+    return data_uri(np.concatenate([np.concatenate(row, axis=1) for row in discs]))

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 import msgspec
 
 from factorlib.report.text import number, percent
-from factorlib.results.materials import Vec3
-from factorlib.results.metrics import (
-    ComparedMaterial,
-    Kinds,
-    LightErrors,
-    MaterialErrors,
-    Metrics,
-    NormalError,
-    PictureError,
-    PoseError,
-    Relighting,
-    Resynthesis,
-    ScoredLight,
-)
+from factorlib.results.metrics import ComparedMaterial, Kinds, MaterialErrors, Metrics, PictureError, ScoredLight
 
 T = TypeVar("T")
 
-GAUGES = {"none": "nothing scaled", "scalar_per_set": "one scalar for the set", "channel_per_photo": "one per channel and picture"}
+GAUGES = {
+    "none": "nothing scaled",
+    "scalar_per_set": "one scalar for the set",
+    "channel_per_photo": "one per channel and picture",
+}
 KINDS = {
     "in_true_light": "recovered material, true light",
     "in_estimated_light": "recovered material, recovered light",
@@ -52,6 +44,10 @@ CAPTIONS = {
     "normals": "Angle over the observed pixels. The null faces the camera everywhere.",
     "poses": "A symmetric shape can be far off in rotation and right in every pixel: see the normals. Null: a random rotation, on average.",
 }
+PICTURE_HEAD = [
+    "",
+    *(f"{what}|{title}" for title in GAUGES.values() for what in ("PSNR lin., dB", "PSNR, dB", "DSSIM")),
+]
 
 
 class Table(msgspec.Struct, frozen=True):
@@ -59,120 +55,99 @@ class Table(msgspec.Struct, frozen=True):
 
     key: str
     title: str
-    caption: str
     head: list[str]
     rows: list[list[str]]
     nulls: list[int] = []
 
+    @property
+    def caption(self) -> str:
+        """What the table compares, in sentences."""
+        return CAPTIONS[self.key]
+
 
 def error_tables(metrics: Metrics, photos: list[str], materials: list[str]) -> list[Table]:
-    """Of what the metrics have, in the set's order of photos and materials; re-synthesis always."""
-    made = [
-        _resynthesis(metrics.resynthesis, photos),
-        _materials(metrics.materials, materials),
-        _relighting(metrics.relighting),
-        _unobserved(metrics.relighting),
-        _light(metrics.light),
-        _normals(metrics.normals, photos),
-        _poses(metrics.poses, photos),
-    ]
-    return [table for table in made if table]
+    """The tables of what the metrics have, in the set's order of photos and materials."""
+    tables, relit = [], metrics.relighting
+    if metrics.resynthesis.mean:
+        scored = {n: p.gauges for n, p in _ordered(metrics.resynthesis.photos, photos) if p.gauges}
+        rows = [(name, {g: s.estimate for g, s in by.items()}) for name, by in scored.items()]
+        rows.append(("mean", {g: s.estimate for g, s in metrics.resynthesis.mean.items()}))
+        rows.append(("null: flat colours, mean", {g: s.null for g, s in metrics.resynthesis.mean.items()}))
+        title = "Re-synthesis against the photos"
+        tables.append(Table("resynthesis", title, PICTURE_HEAD, _by_gauge(rows), [len(rows) - 1]))
+    if metrics.materials:
+        tables.append(_materials(metrics.materials, materials))
+    if relit:
+        tables.append(_relit("relighting", "Relighting, all pairs of material and light", relit.mean))
+    if relit and relit.mean_unobserved:
+        tables.append(_relit("unobserved", "Relighting, only pairs that no photo shows", relit.mean_unobserved))
+    if metrics.light:
+        tables.append(_light(metrics.light.mean))
+    if metrics.normals:
+        degrees = {n: [(e.estimate.median_deg, e.null.median_deg), (e.estimate.p90_deg, e.null.p90_deg)]
+                   for n, e in _ordered(metrics.normals, photos)}  # fmt: skip
+        rows = [[name, *(number(deg, 2) + "°" for pair in pairs for deg in pair)] for name, pairs in degrees.items()]
+        head = ["", *(f"{who}|{what}" for what in ("median", "90th percentile") for who in ("found", "null"))]
+        tables.append(Table("normals", "Normals against the truth", head, rows))
+    if metrics.poses:
+        every = [(f"{p} · {o}", e) for p, objects in _ordered(metrics.poses, photos) for o, e in objects.items()]
+        rows = [
+            [
+                name,
+                f"{number(e.rotation_deg, 2)}°",
+                f"{number(e.null_rotation_deg, 1)}°",
+                percent(e.translation_relative, 2),
+            ]
+            for name, e in every
+        ]
+        tables.append(
+            Table("poses", "Poses against the truth", ["", "rotation", "null", "translation / distance"], rows)
+        )
+    return tables
 
 
-def _ordered(found: dict[str, T], order: list[str]) -> list[tuple[str, T]]:
-    return [(name, found[name]) for name in order if name in found]
+def _ordered(entries: Mapping[str, T], order: list[str]) -> list[tuple[str, T]]:
+    return [(name, entries[name]) for name in order if name in entries]
 
 
-def _picture(error: PictureError) -> list[str]:
-    return [number(error.psnr_linear_db, 1), number(error.psnr_tonemapped_db, 1), number(error.dssim, 4)]
+def _by_gauge(rows: Iterable[tuple[str, Mapping[str, PictureError]]]) -> list[list[str]]:
+    def cells(error: PictureError) -> list[str]:
+        """The three measures, as the columns of PICTURE_HEAD."""
+        return [number(error.psnr_linear_db, 1), number(error.psnr_tonemapped_db, 1), number(error.dssim, 4)]
+
+    return [[name, *(cell for g in GAUGES for cell in cells(by_gauge[g]))] for name, by_gauge in rows]
 
 
-def _by_gauge(rows: list[tuple[str, dict[str, PictureError]]]) -> list[list[str]]:
-    return [[name, *(cell for g in GAUGES for cell in _picture(by_gauge[g]))] for name, by_gauge in rows]
+def _relit(key: str, title: str, mean: Mapping[str, Kinds]) -> Table:
+    rows = [(name, {g: mean[g][kind] for g in GAUGES}) for kind, name in KINDS.items()]
+    return Table(key, title, PICTURE_HEAD, _by_gauge(rows), [2, 3])
 
 
-PICTURE_HEAD = ["", *(f"{what}|{title}" for title in GAUGES.values() for what in ("PSNR lin., dB", "PSNR, dB", "DSSIM"))]
-
-
-def _resynthesis(found: Resynthesis, order: list[str]) -> Table | None:
-    if not found.mean:
-        return None
-    photos = {n: p.gauges for n, p in _ordered(found.photos, order) if p.gauges}
-    rows = [(n, {g: s.estimate for g, s in by.items()}) for n, by in photos.items()]
-    rows.append(("mean", {g: s.estimate for g, s in found.mean.items()}))
-    rows.append(("null: flat colours, mean", {g: s.null for g, s in found.mean.items()}))
-    return Table("resynthesis", "Re-synthesis against the photos", CAPTIONS["resynthesis"], PICTURE_HEAD, _by_gauge(rows), [len(rows) - 1])
-
-
-def _materials(found: MaterialErrors | None, order: list[str]) -> Table | None:
-    if not found:
-        return None
-    rows = [_material(name, m) for name, m in _ordered(found.materials, order)]
-    colours = [percent(getattr(found, f"{null}mean_{part}")) for part in ("diffuse", "specular") for null in ("", "null_")]
-    rows.append(["mean", "", "", number(found.mean_roughness, 3), number(found.null_mean_roughness, 3), *colours])
+def _materials(errors: MaterialErrors, order: list[str]) -> Table:
+    rows = [_material(name, m) for name, m in _ordered(errors.materials, order)]
+    means = [getattr(errors, f"{null}mean_{part}") for part in ("diffuse", "specular") for null in ("", "null_")]
+    roughness = [number(errors.mean_roughness, 3), number(errors.null_mean_roughness, 3)]
+    rows.append(["mean", "", "", *roughness, *map(percent, means)])
     head = ["", *(f"{what}|roughness" for what in ("true", "found", "error", "null"))]
     head += [f"{what}|{part}" for part in ("diffuse", "specular") for what in ("error", "null")]
-    return Table("materials", "Materials against the truth", CAPTIONS["materials"], head, rows)
+    return Table("materials", "Materials against the truth", head, rows)
 
 
 def _material(name: str, m: ComparedMaterial) -> list[str]:
+    """Colours: the worst channel's."""
     roughness = [m.truth.roughness, m.estimate.roughness, m.error.roughness, m.null.roughness]
-    colours = [_worst(getattr(error, part)) for part in ("diffuse", "specular") for error in (m.error, m.null)]
-    return [name, *(number(r, 3) for r in roughness), *colours]
+    colours = [max(getattr(error, part), key=abs) for part in ("diffuse", "specular") for error in (m.error, m.null)]
+    return [name, *(number(r, 3) for r in roughness), *map(percent, colours)]
 
 
-def _worst(errors: Vec3) -> str:
-    return percent(max(errors, key=abs))
+def _light(mean: Mapping[str, Mapping[str, ScoredLight]]) -> Table:
+    def cells(view: str) -> list[str]:
+        """The errors of a view and of its null, by turns."""
+        plain = mean["none"][view].estimate, mean["none"][view].null
+        rmse = [error.rmse for g in GAUGES for error in (mean[g][view].estimate, mean[g][view].null)]
+        rmse += [error.rmse_scale_invariant for error in plain]
+        return [*(number(r, 3) for r in rmse), *(f"{number(error.rgb_angle_deg, 1)}°" for error in plain)]
 
-
-def _kinds(key: str, title: str, mean: dict[str, Kinds]) -> Table:
-    rows = [(name, {g: mean[g][kind] for g in GAUGES}) for kind, name in KINDS.items()]
-    return Table(key, title, CAPTIONS[key], PICTURE_HEAD, _by_gauge(rows), [2, 3])
-
-
-def _relighting(found: Relighting | None) -> Table | None:
-    return _kinds("relighting", "Relighting, all pairs of material and light", found.mean) if found else None
-
-
-def _unobserved(found: Relighting | None) -> Table | None:
-    if not found or not found.mean_unobserved:
-        return None
-    return _kinds("unobserved", "Relighting, only pairs that no photo shows", found.mean_unobserved)
-
-
-def _light(found: LightErrors | None) -> Table | None:
-    if not found:
-        return None
-    head = ["", *(f"{what}|{title}" for title in GAUGES.values() for what in ("RMSE", "null"))]
-    head += ["RMSE|own best factor", "null|own best factor", "angle|RGB", "null|RGB"]
-    rows = [_view(title, {g: found.mean[g][v] for g in GAUGES}) for v, title in VIEWS.items() if v in found.mean["none"]]
-    return Table("light", "Light: three spheres and the map itself", CAPTIONS["light"], head, rows)
-
-
-def _view(title: str, scored: dict[str, ScoredLight]) -> list[str]:
-    plain = scored["none"].estimate, scored["none"].null
-    cells = [number(error.rmse, 3) for g in GAUGES for error in (scored[g].estimate, scored[g].null)]
-    cells += [number(error.rmse_scale_invariant, 3) for error in plain]
-    return [title, *cells, *(number(error.rgb_angle_deg, 1) + "°" for error in plain)]
-
-
-def _normals(found: dict[str, NormalError] | None, order: list[str]) -> Table | None:
-    if not found:
-        return None
-    rows = [
-        [name, *(number(deg, 2) + "°" for deg in (e.estimate.median_deg, e.null.median_deg, e.estimate.p90_deg, e.null.p90_deg))]
-        for name, e in _ordered(found, order)
-    ]
-    head = ["", "found|median", "null|median", "found|90th percentile", "null|90th percentile"]
-    return Table("normals", "Normals against the truth", CAPTIONS["normals"], head, rows)
-
-
-def _poses(found: dict[str, dict[str, PoseError]] | None, order: list[str]) -> Table | None:
-    if not found:
-        return None
-    every = [(f"{p} · {o}", e) for p, objects in _ordered(found, order) for o, e in objects.items()]
-    rows = [
-        [name, number(e.rotation_deg, 2) + "°", number(e.null_rotation_deg, 1) + "°", percent(e.translation_relative, 2)]
-        for name, e in every
-    ]
-    return Table("poses", "Poses against the truth", CAPTIONS["poses"], ["", "rotation", "null", "translation / distance"], rows)
+    head = ["", *(f"{what}|{title}" for title in (*GAUGES.values(), "own best factor") for what in ("RMSE", "null"))]
+    rows = [[title, *cells(view)] for view, title in VIEWS.items() if view in mean["none"]]
+    return Table("light", "Light: three spheres and the map itself", [*head, "angle|RGB", "null|RGB"], rows)

@@ -22,6 +22,7 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
 from factorlib.light.lobes import Lobes
 from factorlib.report.artifacts import Artifacts
+from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
 
 MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
@@ -83,7 +84,7 @@ class Viewed(msgspec.Struct, frozen=True):
 
 def viewed(run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]) -> Viewed | None:
     """lights, objects: slices of the photos;  exposure: by photo.  None where no light or no material was exported."""
-    lobes, table = run.lobes(), run.exported()
+    lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported()
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None

@@ -84,11 +84,6 @@ class MaterialError(msgspec.Struct, frozen=True):
     diffuse: Vec3
     specular: Vec3
 
-    @property
-    def worst_colour(self) -> float:
-        """The largest relative error of the six."""
-        return max(abs(e) for e in (*self.diffuse, *self.specular))
-
 
 class ComparedMaterial(msgspec.Struct, frozen=True):
     """A material beside the truth; component: the connected component whose factor it has."""

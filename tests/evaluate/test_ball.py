@@ -49,12 +49,6 @@ def test_a_constant_light_is_reflected_whole_by_matte_and_mirror():
     assert mirror_ball(light, NORMALS, 16) == pytest.approx(np.tile([1.0, 2, 3], (len(NORMALS), 1)))
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.44, 0.46, 0.7, 1.0])
-def test_a_glossy_ball_loses_energy_but_never_makes_any(roughness):
-    shown = glossy_ball(constant_light(np.ones(3)), NORMALS, roughness)
-    assert shown.max() <= 1.001 and shown[NORMALS[:, 2] > 0.5].min() > 0.25
-
-
 @pytest.mark.parametrize("sharpness", [5, 60])
 @pytest.mark.parametrize("roughness", [0.25, 0.4, 0.5, 0.9])
 def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):

@@ -47,14 +47,6 @@ def test_a_factor_between_materials_and_lights_changes_nothing_but_itself():
     assert scores[0] == pytest.approx(scores[1], abs=1e-3) and found.worst_material == plain.worst_material
 
 
-def test_the_stated_factor_brings_the_materials_to_the_truth():
-    materials, lights = gauged(np.array([2.0, 0.5, 3.0]))
-    factor = compare_relit_set(materials, TRUE, lights, LIGHTS).factor
-    scaled = [(times(m, factor), TRUE[n]) for n, m in materials.items()]
-    logs = [np.log(np.divide(getattr(true, part), getattr(m, part))) for m, true in scaled for part in ("diffuse", "specular")]
-    np.testing.assert_allclose(np.median(logs, axis=0), 0, atol=1e-6)
-
-
 def test_an_exposure_of_all_lights_is_no_gauge():
     assert compare_relit_set(TRUE, TRUE, {n: lit(li, 1.2) for n, li in LIGHTS.items()}, LIGHTS).mean_psnr_db < 35
 
@@ -70,16 +62,6 @@ def test_a_disc_of_the_true_mean_colour_scores_the_null():
     white, flat = Reflectance((1.0,) * 3, (0.0,) * 3, 0.5), {"a": constant_light(colour)}  # a white ball in constant light is a flat disc
     found = compare_relit_set({"red": white}, red, flat, grey)
     assert found.mean_psnr_db == pytest.approx(found.null_mean_psnr_db, abs=0.01)
-
-
-def test_a_wrong_light_costs_and_its_pair_is_named():
-    found = compare_relit_set(TRUE, TRUE, {"a": LIGHTS["a"], "b": LIGHTS["a"]}, LIGHTS)
-    assert found.worst_light == "b" and found.worst_psnr_db < 25 < found.mean_psnr_db < 120
-
-
-def test_worse_materials_score_worse():
-    scores = [compare_relit_set({n: perturbed(m, e) for n, m in TRUE.items()}, TRUE, LIGHTS, LIGHTS).mean_psnr_db for e in (0, 0.2, 1, 3)]
-    assert scores == sorted(scores, reverse=True)
 
 
 @pytest.mark.parametrize("estimate", [BLACK, TRUE["red"]])

@@ -7,8 +7,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.evaluate.metrics import NO_TRUTH, flattened
-from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.metrics import Metrics
@@ -17,6 +15,13 @@ from stages import evaluate
 from tests.evaluate.made_artifacts import Made, make_artifacts
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
+
+
+def numbers_in(value) -> list[float]:
+    """Every number of nested plain containers."""
+    if isinstance(value, dict | list):
+        return [number for inner in (value.values() if isinstance(value, dict) else value) for number in numbers_in(inner)]
+    return [value] if isinstance(value, int | float) else []
 
 
 def metrics_of(folder, **made) -> dict:
@@ -34,8 +39,8 @@ def linked(tmp_path_factory):
 
 def test_the_file_is_of_its_type_and_finite(linked):
     msgspec.convert(linked, Metrics)
-    numbers = list(flattened(linked))
-    assert len(numbers) > 500 and all(math.isfinite(v) for _, v in numbers)
+    numbers = numbers_in(linked)
+    assert len(numbers) > 500 and all(map(math.isfinite, numbers))
 
 
 def test_every_part_is_scored_beside_its_null(linked):
@@ -50,25 +55,11 @@ def test_every_part_is_scored_beside_its_null(linked):
     assert linked["poses"]["dusk"]["balls"]["rotation_deg"] == pytest.approx(0)
 
 
-def test_a_larger_error_is_reported_larger(linked, tmp_path):
-    worse = metrics_of(tmp_path, seen=LINKED, error=3.0)
-    assert worse["materials"]["worst_roughness"] > linked["materials"]["worst_roughness"]
-    assert worse["resynthesis"]["worst_psnr_linear_db"] < linked["resynthesis"]["worst_psnr_linear_db"]
-
-
 def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     found = metrics_of(tmp_path, seen={"only": ["red"]}, truth=False)
     assert found["materials"] is found["light"] is found["relighting"] is found["relit_set"] is None
-    assert set(found["reasons"].values()) == {NO_TRUTH}
+    assert set(found["reasons"].values()) == {evaluate.NO_TRUTH}
     assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
-
-
-def test_the_table_names_what_fails(linked):
-    rows = rows_of(linked, SYNTHETIC)
-    assert all(row.value is not None for row in rows), table_text(rows)
-    broken = rows_of({"materials": {"worst_roughness": 0.2}}, SYNTHETIC)
-    text = table_text(broken)
-    assert not any(row.ok for row in broken) and "0.2" in text and "missing" in text and "NO" in text
 
 
 def test_true_normals_in_the_photos_own_pixels_are_averaged_as_the_photo_was(tmp_path):

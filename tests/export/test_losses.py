@@ -6,7 +6,6 @@ import torch
 
 from factorlib.export import loss, viewers
 from factorlib.export.viewers import MODELS, Angles, distribution
-from factorlib.jsonfile import read_json
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.brdf import ggx, specular
@@ -98,11 +97,3 @@ def test_a_white_surface_that_gives_back_all_energy_is_white_in_the_sky():
     white = Reflectance((0, 0, 0), (1.0, 1.0, 1.0), 0.7)
     for name in ("mtlx", "mtlx_standard_surface"):
         np.testing.assert_allclose(loss.in_sky(white, MODELS[name], np.array([0.3, 0.6, 1.0])), 1.0, rtol=5e-3)
-
-
-def test_file_has_every_material_in_every_model(tmp_path):
-    loss.write_losses(tmp_path / "a.json", {"grey": GREY, "black": BLACK})
-    loss.write_losses(tmp_path / "b.json", {"grey": GREY, "black": BLACK})
-    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
-    found = read_json(tmp_path / "a.json")
-    assert set(found) == {"grey", "black"} and set(found["grey"]) == set(MODELS) and set(found["grey"]["glb"]) == {"mean", "worst"}

@@ -112,8 +112,3 @@ def test_an_easier_set_does_not_replace_the_one_the_project_carries(tmp_path, mo
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(app, ["eames", "--direct"])
     assert done.exit_code == 2 and "--out" in done.output and not list(tmp_path.iterdir())
-
-
-def test_the_set_says_how_it_was_made(plain, exact):
-    assert (plain / "dataset.yaml").read_text().splitlines()[0].endswith("factorlib.generate eames")
-    assert (exact / "dataset.yaml").read_text().splitlines()[0].endswith("factorlib.generate eames --exact")

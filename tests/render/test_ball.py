@@ -25,12 +25,6 @@ def test_light_comes_from_the_side_it_is_on():
     assert row < -0.5 and abs(column) < 0.2
 
 
-def test_black_beside_the_ball():
-    lobe = Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.5]), np.ones((1, 3)))
-    picture = ball(Reflector(reflection_operator("closed_form"), lobe), LAMBERTIAN, 32)
-    assert ((picture.max(-1) > 0) == ball_normals(32)[1]).all()
-
-
 def test_observed_cells_are_where_the_normals_are_without_holes():
     normals, _ = ball_normals(20)
     right = normals[normals[:, 0] > 0.1]

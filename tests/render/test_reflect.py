@@ -11,7 +11,6 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render import reflect
 from factorlib.render.reflect import Reflector, Shadows
 from factorlib.results.materials import Reflectance
 
@@ -110,15 +109,6 @@ def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_
         shadows = Shadows(np.full((40, 256), level, np.uint8), directions)
         found = reflector(GLOSSY, normals, views, shadows=shadows)
         np.testing.assert_allclose(found, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
-
-
-def test_each_point_has_its_own_shadow_whatever_is_computed_at_once(monkeypatch):
-    reflector, directions = Reflector(reflection_operator("closed_form"), light()), fibonacci_sphere(256)
-    normals, views = points(40)
-    shadows = Shadows(255 * np.random.default_rng(0).integers(0, 2, (40, 256)).astype(np.uint8), directions)
-    whole = reflector(GLOSSY, normals, views, shadows=shadows)
-    monkeypatch.setattr(reflect, "PAIRS_AT_ONCE", 7 * len(light()))
-    np.testing.assert_allclose(reflector(GLOSSY, normals, views, shadows=shadows), whole, rtol=1e-5)
 
 
 def test_points_that_share_a_row_of_visibility_are_shadowed_as_with_rows_of_their_own():

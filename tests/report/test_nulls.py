@@ -1,6 +1,6 @@
 """Whatever is no better than its null has a sentence on the page, and nothing else has."""
 
-from factorlib.report.nulls import GAUGE, no_better_than_a_guess
+from factorlib.report.headlines import GAUGE, no_better_than_a_guess
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import (
     AngleError,

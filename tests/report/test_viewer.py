@@ -254,7 +254,7 @@ def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
     run_, _, _ = artifacts(made[0])
     shutil.copytree(made[0]["export"], tmp_path / "export")
     run_ = msgspec.structs.replace(run_, folders={**run_.folders, "export": tmp_path / "export"})
-    light = run_.illumination("day")
+    light = run_.rgb("export", "illumination/day")
     (tmp_path / "export" / "coverage").mkdir()
     write_rgb_exr(tmp_path / "export" / "coverage" / "day.exr", np.full_like(light, 2.0))
     area = lat_long_solid_angles(*light.shape[:2])[:, None] * np.ones(light.shape[1])

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from factorlib.errors import InputError
@@ -97,10 +96,6 @@ def test_what_does_not_fit_is_named_by_its_key(tmp_path, old, new, words, key):
     assert words in str(caught.value) and key in caught.value.key and "solve" in caught.value.cure
 
 
-def test_alpha_is_the_square_of_roughness():
-    assert RED.alpha == RED.roughness**2 == RED.reflectance.alpha
-
-
 def test_a_missing_material_is_named(tmp_path):
     assert in_order(TABLE, ["red"], tmp_path) == [RED]
     with pytest.raises(InputError, match="'blue' is missing"):
@@ -120,7 +115,3 @@ def test_a_mirrored_pose_is_refused(tmp_path):
     with pytest.raises(InputError, match="no rotation and translation") as caught:
         read_photo_poses(tmp_path / "a.json")
     assert caught.value.key == "objects.vase"
-
-
-def test_poses_and_cameras_are_those_of_geometry():
-    assert np.array_equal(HALL.objects["vase"].pose.translation, [0, 0, 2]) and HALL.camera.camera(16, 12).centre == (8.0, 6.0)

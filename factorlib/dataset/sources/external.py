@@ -33,12 +33,18 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     refuse = Refusal(file, file.parent)
     kind = next(kind for kind in SOURCES if getattr(spec.cameras, kind) is not None)
     shots = matched(spec, kind, READERS[kind](getattr(spec.cameras, kind), refuse), refuse)
-    external = {photo.name: _external(kind, photo, shots[photo.name], spec.cameras, refuse) for photo in spec.photos if photo.name in shots}
+    external = {
+        photo.name: _external(kind, photo, shots[photo.name], spec.cameras, refuse)
+        for photo in spec.photos
+        if photo.name in shots
+    }
     for name in [photo.name for photo in spec.photos if photo.name not in shots]:
         log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name it: "
                     "cameras.images: {%s: …}", file, kind, name, name)  # fmt: skip
     if spec.cameras.world_from_camera:
-        spec = msgspec.structs.replace(spec, photos=[_fixed_to_world(photo, shots.get(photo.name)) for photo in spec.photos])
+        spec = msgspec.structs.replace(
+            spec, photos=[_fixed_to_world(photo, shots.get(photo.name)) for photo in spec.photos]
+        )
     return spec, external
 
 
@@ -74,7 +80,12 @@ class _Named:
         for shot in shots:
             path = PurePosixPath(str(shot.image).replace("\\", "/"))
             stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
-            for table, key in ((self.by_id, shot.image), (self.by_path, path.parts), (self.by_file, path.name), (self.by_stem, stem)):
+            for table, key in (
+                (self.by_id, shot.image),
+                (self.by_path, path.parts),
+                (self.by_file, path.name),
+                (self.by_stem, stem),
+            ):
                 table.setdefault(key, []).append(shot)
 
     def alike(self, photo: PurePosixPath) -> list[Shot]:
@@ -116,7 +127,9 @@ def _pose(name: str, shot: Shot, source: CameraSource) -> Pose:
     """cam_from_object of scale 1: the camera's unit becomes the mesh's, which no picture shows."""
     similarity = source.world_from_object[name]
     cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
-    return Pose(as_rows(cam_from_object.rotation), tuple(float(x) / similarity.scale for x in cam_from_object.translation))
+    return Pose(
+        as_rows(cam_from_object.rotation), tuple(float(x) / similarity.scale for x in cam_from_object.translation)
+    )
 
 
 def _instance(photo: PhotoEntry, obj: ObjectEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Pose | None:
@@ -125,7 +138,8 @@ def _instance(photo: PhotoEntry, obj: ObjectEntry, shot: Shot, source: CameraSou
     poses = shot.poses.get(obj_id, [])
     if len(poses) > 1:
         found = f"image {shot.image} of photo {photo.name!r} shows obj_id {obj_id} {len(poses)} times"
-        refuse(f"cameras.obj_ids.{obj.mesh}", found, f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance")
+        cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
+        refuse(f"cameras.obj_ids.{obj.mesh}", found, cure)
     if not poses:
         log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
                     refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip

@@ -44,7 +44,9 @@ class Pinhole(msgspec.Struct, frozen=True):
     principal_point: Vec2
 
 
-def colmap_camera(key: str, model: str, width: float, height: float, params: Sequence[float], refuse: Refusal) -> pycolmap.Camera:
+def colmap_camera(
+    key: str, model: str, width: float, height: float, params: Sequence[float], refuse: Refusal
+) -> pycolmap.Camera:
     """A camera of one of COLMAP's models; what could be none is refused, for pycolmap takes any number."""
     said = f"{width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
     if not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX):
@@ -70,10 +72,15 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> Pinhole:
     centre = float(camera.principal_point_x), float(camera.principal_point_y)
     focals = camera.focal_length_x, camera.focal_length_y
     if not (min(camera.width, camera.height, *focals) > 0 and math.isfinite(sum(camera.params))):
-        refuse(key, f"is no camera: {camera.width}×{camera.height} pixels, {camera.model_name} {camera.params_to_string()}", DAMAGED)
+        fault = f"is no camera: {camera.width}×{camera.height} pixels, {camera.model_name} {camera.params_to_string()}"
+        refuse(key, fault, DAMAGED)
     if not (all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in focals) and max(map(abs, centre)) <= CENTRE_PX):
         found = f"a focal length of {focals[0]:g} px about ({centre[0]:g}, {centre[1]:g}) is no photo's"
-        refuse(key, found, f"a focal length is {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, a principal point at most {CENTRE_PX:g} px away; {DAMAGED}")
+        refuse(
+            key,
+            found,
+            f"a focal length is {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g} px, a principal point at most {CENTRE_PX:g} px away; {DAMAGED}",
+        )
     if camera.is_undistorted() and focals[0] == focals[1]:
         return Pinhole(float(focals[0]), centre)
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]

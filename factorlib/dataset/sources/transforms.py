@@ -63,7 +63,9 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The frames of the dataset's file `path`, in its order."""
     content = read_source(refuse.folder / path, TransformsFile)
     said = Refusal(refuse.folder / path, refuse.folder)
-    return [_shot(f"frames[{index}]", frame, lens_of(frame, content), said) for index, frame in enumerate(content.frames)]
+    return [
+        _shot(f"frames[{index}]", frame, lens_of(frame, content), said) for index, frame in enumerate(content.frames)
+    ]
 
 
 def read_source(file: Path, type_: type, key: str | None = None) -> Any:
@@ -106,7 +108,9 @@ def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tup
     """With the size of its image; without `w`, a field of view is a focal length of an image of any width, here ANY_WIDTH."""
     _check_lens(key, lens, refuse)
     if lens.fl_x is None and lens.w is None:
-        camera = colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, [_focal(lens, ANY_WIDTH), ANY_WIDTH / 2, 0.5], refuse)
+        camera = colmap_camera(
+            key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, [_focal(lens, ANY_WIDTH), ANY_WIDTH / 2, 0.5], refuse
+        )
         return camera, (ANY_WIDTH, None)
     focal = lens.fl_x if lens.fl_x is not None else _focal(lens, lens.w)
     check_focal(f"{key}.{'fl_x' if lens.fl_x is not None else 'camera_angle_x'}", focal, refuse)
@@ -123,7 +127,8 @@ def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tup
 def _check_lens(key: str, lens: Lens, refuse: Refusal) -> None:
     """Something to take the focal length from, and nothing that no camera has."""
     if lens.fl_x is None and lens.camera_angle_x is None:
-        refuse(f"{key}.fl_x", "neither fl_x nor camera_angle_x is given", "give the focal length fl_x in pixels, with w and h")
+        fault = "neither fl_x nor camera_angle_x is given"
+        refuse(f"{key}.fl_x", fault, "give the focal length fl_x in pixels, with w and h")
     if lens.fl_x is None and not 0 < lens.camera_angle_x < math.pi:
         found = f"an angle of {lens.camera_angle_x:g} is no field of view"
         refuse(f"{key}.camera_angle_x", found, "give it in radians, more than 0 and less than π")
