@@ -23,9 +23,9 @@ DOCS = ROOT / "docs" / "reliability.md"
 TESTS = {
     "faults": ["tests/faults/test_nothing_lost.py", "tests/faults/test_no_room.py", "tests/faults/test_real_kills.py"],
     "reruns": ["tests/faults/test_reruns.py"],
-    "fuzz": ["tests/faults/test_fuzz.py", "tests/faults/test_mesh_fuzz.py", "tests/faults/test_image_fuzz.py"],
+    "fuzz": ["tests/faults/test_fuzz.py"],
 }
-FUZZED = ["benchmarks.faults", "tests.faults.test_fuzz", "tests.faults.test_mesh_fuzz", "tests.faults.image_fuzz", "factorlib.images.heif"]
+FUZZED = ["benchmarks.faults", "tests.faults.test_fuzz", "tests.faults.good", "factorlib.images.heif"]
 
 
 class Tried(msgspec.Struct, frozen=True):

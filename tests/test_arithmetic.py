@@ -72,10 +72,6 @@ def test_a_test_computes_the_bits_of_a_worker(capsys):
     assert capsys.readouterr().out == process("-c", BITS, **VARIABLES)
 
 
-def test_without_workers_of_pytest_too():
-    process("-m", "pytest", "-n", "0", "-p", "no:cacheprovider", f"{__file__}::{test_a_test_computes_the_bits_of_a_worker.__name__}")
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_square_roots_are_those_of_ieee_754(dtype):
     x = np.random.default_rng(0).random(100_003).astype(dtype) * 7

@@ -6,7 +6,6 @@ import re
 
 import pytest
 
-from factorlib.dataset.read import read_dataset
 from factorlib.runner.project import LIBRARY
 from tests.export import made_export
 
@@ -60,21 +59,3 @@ def test_the_examples_of_the_pages_run(root, page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = examples(page)
     run(code, {})
-
-
-def test_names_in_the_examples_are_those_of_the_chairs():
-    spec = read_dataset(LIBRARY / "data" / "eames").spec
-    known = [*spec.materials, *(p.name for p in spec.photos), *(o.name for p in spec.photos for o in p.objects)]
-    code = "\n".join([*cells("code"), *examples("README.md"), *examples("docs/recipes.md")])
-    asked = re.findall(r'(?:materials\[|environment\(|view=|relight\()"(\w+)"', code) + re.findall(r'relight\("\w+", "(\w+)"[,)]', code)
-    assert set(asked) - set(known) == {"rde", "kitchn", "chiar"}  # which are wrong on purpose
-
-
-def test_the_notebook_is_kept_without_outputs():
-    assert NOTEBOOK["nbformat"] == 4 and len({cell["id"] for cell in NOTEBOOK["cells"]}) == len(NOTEBOOK["cells"])
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code")
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/recipes.md", "docs/tutorial.md"])
-def test_pages_lead_to_it(page):
-    assert "result.ipynb)" in (LIBRARY / page).read_text()

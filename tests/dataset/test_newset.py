@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import LEFT_OUT, MAX_MATERIALS
 from factorlib.errors import InputError
 from factorlib.newset import new_dataset
 from factorlib.validation import Validation
@@ -118,12 +117,6 @@ def test_two_photos_of_one_name_are_refused(folders):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folders / "photos" / "kitchen.png")
     with pytest.raises(InputError, match="would both be called 'kitchen'"):
         made(folders)
-
-
-def test_labels_end_where_what_is_left_out_begins(folders):
-    mask(folders / "masks" / "kitchen.png", [0, MAX_MATERIALS, LEFT_OUT])
-    _, spec = made(folders)
-    assert spec["materials"][-1] == f"label_{MAX_MATERIALS}" and len(spec["materials"]) == MAX_MATERIALS
 
 
 @pytest.mark.parametrize("name", ["photos", "poses"])

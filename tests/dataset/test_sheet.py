@@ -1,17 +1,13 @@
 """The contact sheet: every photo, its labels and its meshes, in one picture."""
 
-import io
-import re
 
 import numpy as np
-import pytest
 
-from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.picture import read_png
 from factorlib.meshes.mesh import Mesh
-from factorlib.runner import bars, screen, verbs
+from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, SIDE, drawn, write_sheet
 
@@ -54,31 +50,3 @@ def test_validate_writes_it_only_when_asked(tmp_path, capsys):
     assert verbs.validate(project, str(EAMES), []) == 0 and not (tmp_path / "build" / "eames" / "sheet.png").exists()
     assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
     assert (tmp_path / "build" / "eames" / "sheet.png").is_file() and "contact sheet" in capsys.readouterr().out
-
-
-def test_validate_shows_how_far_a_sheet_is_once_it_takes_long(tmp_path, capsys, monkeypatch):
-    project = checkout(tmp_path)
-    monkeypatch.setattr(screen, "PATIENCE", 1e9)
-    assert verbs.validate(project, str(EAMES), [], sheet=True) == 0 and capsys.readouterr().err == ""
-    monkeypatch.setattr(screen, "PATIENCE", 0.0)
-    assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
-    begun, ended = capsys.readouterr().err.splitlines()
-    assert begun.startswith("sheet ") and re.fullmatch(r"sheet +[0-9.]+ s", ended)
-
-
-def test_on_a_terminal_a_bar_is_drawn(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    seen = []
-    monkeypatch.setattr(screen, "PATIENCE", 0.0)
-    monkeypatch.setattr(bars.Bars, "progress", lambda self, step, done, total, text: seen.append((str(step), done, total)))
-    with screen.shown_if_long("sheet", Terminal()) as report:
-        report(1, 4)
-    assert seen == [("sheet", 1, 4)]
-
-
-def test_a_faulty_set_is_refused_as_ever(tmp_path):
-    with pytest.raises(InputError):
-        write_sheet(tmp_path, tmp_path / "sheet.png")

@@ -389,15 +389,6 @@ def test_a_wrong_key_is_refused_with_a_cure(folder, cameras, key, words):
     assert str(caught.value.file).endswith("dataset.yaml")
 
 
-@pytest.mark.parametrize("damage", ["images.bin", "cameras.bin"])
-def test_a_damaged_model_is_refused(folder, damage):
-    colmap(folder)
-    content = (folder / "sparse/0" / damage).read_bytes()
-    (folder / "sparse/0" / damage).write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="not readable as a COLMAP model|is no camera"):
-        read_dataset(write(folder, {"colmap": "sparse/0"}))
-
-
 def test_objects_of_one_photo_share_a_scale(folder):
     colmap(folder)
     objects = [{"name": "chair", "mesh": "chair"}, {"name": "other", "mesh": "chair"}]
@@ -418,12 +409,6 @@ def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(
     point = np.array([0.2, -0.1, 1.0])
     place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
     assert np.allclose(Camera(width, height, focal, centre).project(point), place, atol=0 if scale in (1, 2, 0.5) else 0.5)
-
-
-@pytest.mark.parametrize("width, height", [(67, 50), (50, 67)])
-def test_the_longer_side_says_how_much_smaller_a_photo_is(width, height):
-    external = ExternalCamera("colmap", 300.0, None, (200, 150) if width > height else (150, 200), {})
-    assert focal_and_centre(external, width, height, "hall") == (300.0 * 67 / 200, (width / 2, height / 2))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """A full disk and a folder that may not be written: said as the user's to mend, nothing cut is kept, and the next run goes on."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from factorlib.disk import disk_error
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY
 from tests.runner import toy
-from tests.runner.toy import files_of, make_project, write
+from tests.runner.toy import make_project, write
 
 LARGE = "(out / 'large.bin').write_bytes(bytes(200_000))\n    (out /"
 STRANGE = "raise RuntimeError('a library: I/O error: No space left on device (os error 28)')\n    (out /"
@@ -116,22 +115,6 @@ def test_a_disk_that_is_full_before_the_run_begins(project, disk, monkeypatch):
     assert said.startswith("error: ") and "the disk is full" in said and said_well(said)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("free", range(0, 400_000, 40_000))
-def test_wherever_the_disk_becomes_full_the_next_run_ends_in_the_same_bytes(project, disk, monkeypatch, free):
-    disk.fill(but=free)
-    said = run_as_command(project, monkeypatch, "all", "--dataset", "set")
-    assert said in ("0", "1") or said_well(said)
-    assert verbs.verify(project, None) == 0, "something cut was kept"
-    (disk.folder / "ballast").unlink()
-    assert make(project) == 0 and verbs.verify(project, None) == 0
-    found = files_of(project.build / "set" / "table") | files_of(project.build / "set" / "upper")
-    whole = make_project(project.root.parent / "whole")
-    write(whole.root / "stages" / "table.py", toy.TABLE.replace("(out /", LARGE, 1))
-    assert make(whole) == 0
-    assert found == files_of(whole.build / "set" / "table") | files_of(whole.build / "set" / "upper")
-
-
 def test_a_read_only_build_shows_everything_and_runs_nothing(project, disk, monkeypatch):
     assert make(project) == 0
     disk.become("ro")
@@ -183,22 +166,6 @@ def without_rights(project):
     command = [*drop, sys.executable, "-c", code, str(project.root), "all", "--dataset", "set"]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60)
-
-
-def test_a_limit_on_the_size_of_files_is_said(tmp_path):
-    """Needs no right: what is tested where nothing can be mounted."""
-    project = make_project(tmp_path / "root")
-    write(project.root / "stages" / "table.py", toy.TABLE.replace("(out /", LARGE, 1))
-    command, environment = [sys.executable, toy.__file__, str(project.root), "set"], {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    done = subprocess.run(command, env=environment, preexec_fn=small_files, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1 and "no file may become that large (ulimit -f)" in done.stderr and said_well(done.stderr, "root"), (
-        done.stderr
-    )
-    assert make(project) == 0 and verbs.verify(project, None) == 0
-
-
-def small_files() -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
 
 def test_a_file_that_may_not_be_read_is_no_full_folder(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 import os
 import sys
-from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,14 +10,9 @@ import pytest
 
 from factorlib.dataset.schema import Dataset, DatasetFile
 from factorlib.dataset.slices import dataset_slice
-from factorlib.runner.display import Display
-from factorlib.runner.executors import Pools
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Listing, Spec, plan
 from factorlib.runner.project import LIBRARY, photo_sets
-from factorlib.runner.run import run
-from factorlib.runner.survey import survey
-from tests.runner import toy
 
 
 def work(function):
@@ -71,25 +65,6 @@ def test_the_slices_of_all_photos_are_linear():
     assert works[2] - works[1] < 2.1 * (works[1] - works[0])
 
 
-class Inline(Executor):
-    def submit(self, function, *arguments):
-        future = Future()
-        future.set_result(function(*arguments))
-        return future
-
-
-class InlinePools(Pools):
-    """Steps in this process, one after the other."""
-
-    def submit(self, cores, threads, function, *arguments):
-        future = Inline().submit(function, *arguments)
-        self._busy[future] = cores, threads, None
-        return future
-
-    def done(self, future):
-        self._busy.pop(future)
-
-
 @contextmanager
 def own_modules(*packages):
     """Whatever of these packages is imported within is forgotten, and what was there before is there again."""
@@ -106,25 +81,3 @@ def own_modules(*packages):
         sys.path[:] = path
         os.environ.clear()
         os.environ.update(environment)
-
-
-def plans_of_a_run(root, photos, monkeypatch):
-    project = toy.make_project(root, **{f"p{k}": f"text {k}" for k in range(photos)})
-    seen, count = survey(project, "set", None, []), 0
-    make_plan = seen.planned
-
-    def counted(*arguments):
-        nonlocal count
-        count += 1
-        return make_plan(*arguments)
-
-    monkeypatch.setattr(seen, "planned", counted)
-    with own_modules("stages", "toylib"):
-        tally = run(seen, Display(), InlinePools(1))
-    assert not tally.failed and len(tally.ran) == 2 * photos + 2
-    return count
-
-
-def test_a_run_plans_as_often_for_many_photos_as_for_few(tmp_path, monkeypatch):
-    few, many = (plans_of_a_run(tmp_path / str(photos), photos, monkeypatch) for photos in (3, 12))
-    assert many == few

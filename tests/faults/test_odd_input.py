@@ -7,10 +7,7 @@ import sys
 import pytest
 
 from factorlib import __main__ as command_line
-from factorlib.dataset.read import read_dataset
-from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.filehash import FileHashes
 from tests.runner import toy
 from tests.runner.toy import state, write
 
@@ -84,12 +81,6 @@ def test_a_given_folder_that_leads_nowhere(project, monkeypatch, path):
     assert call(monkeypatch, project, "plan", "--dataset", "set", "--set", f"table.start={path}").startswith("error: ")
 
 
-def test_deep_pipeline_parameters_have_an_end(project):
-    write(project.root / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {params: {scale: .nan}}"))
-    with pytest.raises(InputError, match=r"stages\.table\.params\.scale.*not a finite number"):
-        state(project)
-
-
 # ── what lies in build/ ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -113,16 +104,6 @@ def test_a_damaged_cache_is_made_anew(project, cache, content):
     (project.build / "store" / "cache").mkdir(exist_ok=True)
     (project.build / "store" / "cache" / cache).write_bytes(content)
     assert set(state(project).values()) == {"current"}
-
-
-def test_damaged_entries_of_a_cache_are_made_anew(tmp_path):
-    write(tmp_path / "a.txt", "text")
-    os.utime(tmp_path / "a.txt", (1, 1))
-    hashes = FileHashes(tmp_path / "files.json")
-    right = hashes.content(tmp_path / "a.txt")
-    for wrong in (5, [], [[1, 2]], [[1, 2, 3, 4], "x"], ["abc", right], None, {"a": 1}, [list(os.stat(tmp_path / "a.txt"))[:4], 7]):
-        hashes._contents[str(tmp_path / "a.txt")] = wrong
-        assert hashes.content(tmp_path / "a.txt") == right
 
 
 @pytest.mark.parametrize("line", [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b'{"event": "warning", "text": [1]}', b"[" * 5000])
@@ -180,22 +161,3 @@ def test_what_may_not_be_read(foreign, as_other_user, monkeypatch, verb, place):
 
 
 # ── names in dataset.yaml ────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@pytest.mark.parametrize("length, good", [(100, True), (101, False), (250, False), (300, False)])
-@pytest.mark.parametrize("place", ["photo", "illumination", "material", "mesh", "object"])
-def test_names_that_are_too_long_for_files_are_refused_at_once(tmp_path, place, length, good):
-    names = dict.fromkeys(["photo", "illumination", "material", "mesh", "object"], "short") | {place: "n" * length}
-    write(tmp_path / "i.png", "")
-    write(tmp_path / "m.ply", "ply\nformat ascii 1.0\nend_header\n")
-    write(
-        tmp_path / "dataset.yaml",
-        "format: 1\nmaterials: [{material}]\nmeshes:\n  {mesh}: {{file: m.ply, material: {material}}}\nphotos:\n"
-        "  - {{name: {photo}, image: i.png, masks: i.png, illumination: {illumination}, objects: [{{name: {object}, mesh: {mesh}}}]}}\n".format(**names),
-    )
-    if good:
-        read_dataset(tmp_path)
-        return
-    with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path)
-    assert f"has {length} characters" in str(caught.value) and "at most 100" in str(caught.value)

@@ -30,7 +30,6 @@ from factorlib.runner import survey as survey_module
 from factorlib.runner.closure import Source, Sources, source_of
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.packages import Packages
-from factorlib.runner.params import parameters
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Listing, difference, plan
 from factorlib.runner.project import LIBRARY, Project, Provider, photo_sets
@@ -344,12 +343,6 @@ def another(value):
 ALL_PARAMETERS = [(stage, name) for stage in PIPELINE.stages for name in defaults(stage)]
 
 
-def test_every_parameter_is_among_those_that_are_tried():
-    assert [f"{stage}.{name}" for stage, name in ALL_PARAMETERS] == [
-        f"{stage}.{one.name}" for stage in PIPELINE.stages for one in parameters(params_of(stage))
-    ]
-
-
 @pytest.mark.parametrize("stage, name", ALL_PARAMETERS)
 def test_a_parameter_reruns_its_stage_and_what_is_below_and_its_default_nothing(stage, name):
     default = defaults(stage)[name]
@@ -480,10 +473,6 @@ def test_a_file_of_a_data_set_reruns_who_is_handed_it_and_what_is_below(dataset,
     direct = readers(dataset, file)
     assert other_keys(dataset=dataset) == with_those_below(direct, dataset)
     note("reruns", "a file of a data set", 1)
-
-
-def test_most_files_of_a_data_set_are_handed_to_somebody():
-    assert sum(bool(readers(dataset, file)) for dataset, file in FILES) > len(FILES) / 2
 
 
 @cache

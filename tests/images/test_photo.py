@@ -167,14 +167,6 @@ def test_the_exposure_is_what_the_camera_wrote(tmp_path, tags, expected):
     assert found == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
-def test_a_quarter_turn_by_hand(tmp_path):
-    # orientation 6: the camera stood on its side, the stored left edge is the displayed top, read from below
-    stored = np.zeros((2, 3, 3), dtype=np.uint8)
-    stored[1, 0] = 200  # bottom left as stored
-    photo = read_photo(save(tmp_path / "a.tif", stored, Orientation=6))
-    assert photo.radiance.shape == (3, 2, 3) and photo.radiance[0, 0, 0] > 0.5 and photo.radiance[1:].max() == 0
-
-
 @pytest.mark.parametrize("channels, names", [(1, ["Y"]), (2, ["Y", "A"]), (4, ["R", "G", "B", "A"])])
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_grey_becomes_rgb_and_alpha_is_dropped_without_darkening(tmp_path, channels, names, suffix):

@@ -17,12 +17,6 @@ def test_scaling_the_light_changes_no_picture_that_exposes_itself():
     assert exposure_of(radiance * 16) == pytest.approx(exposure_of(radiance) / 16)
 
 
-def test_the_percentile_goes_to_white():
-    radiance = np.linspace(0, 1, 101)[:, None] * np.array([1.0, 0.5, 0.2])
-    assert exposure_of(radiance, percentile=50.0) == pytest.approx(2.0)
-    assert (picture(radiance, exposure_of(radiance, percentile=50.0))[50:, 0] == 255).all()
-
-
 def test_exposure_looks_only_where_it_is_told():
     radiance = np.ones((4, 4, 3))
     radiance[0] = 1000

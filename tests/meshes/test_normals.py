@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.meshes.normals import consistently_wound, corner_angles, corner_normals
+from factorlib.meshes.normals import consistently_wound, corner_normals
 from factorlib.meshes.read import merged_normals, usable
 from factorlib.meshes.soup import Soup, no_normals
 
@@ -41,11 +41,6 @@ def test_angles_not_triangle_counts_weigh():
     mesh = mesh_of(*trimesh.remesh.subdivide(box.vertices, box.faces, face_index=[0, 1]), crease_deg=100)
     corner = np.argmin(np.linalg.norm(mesh.vertices - 0.5, axis=1))
     assert np.allclose(mesh.normals[corner], 1 / np.sqrt(3))
-
-
-def test_corner_angles_sum_to_pi():
-    triangles = np.random.default_rng(0).normal(size=(50, 3, 3)).reshape(-1, 3)
-    assert np.allclose(corner_angles(triangles, np.arange(150).reshape(-1, 3)).sum(axis=1), np.pi)
 
 
 def test_duplicate_vertices_change_nothing():

@@ -7,13 +7,13 @@ import logging
 import numpy as np
 import pytest
 import trimesh
-from faults.mesh_files import VERTICES, glb, gltf_header
 from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
 from factorlib.meshes import read_mesh, write_ply
 from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.ply import submesh
+from tests.faults.good import VERTICES, glb, gltf_header
 
 MATERIALS = ["red", "oak"]
 QUADS = """
@@ -85,36 +85,6 @@ def test_part_with_two_materials_is_refused(tmp_path):
 def test_unknown_material_is_named(tmp_path):
     with pytest.raises(InputError, match="unknown material 'ok'"):
         read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "ok"})
-
-
-@pytest.mark.parametrize(
-    "text, match",
-    [
-        ("v 0 0 0\nv 1 0 0\nv nan 1 0\nf 1 2 3\n", "not finite"),
-        ("v 0 0 0\nv 1 0 0\n", "without faces"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "uses vertex 4 of 3"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4"),
-        ("v 0 0 zero\n", "line 1"),
-        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
-    ],
-)
-def test_unusable_meshes_are_refused(tmp_path, text, match):
-    with pytest.raises(InputError, match=match):
-        read_mesh(obj(tmp_path, text), MATERIALS, "red")
-
-
-def test_missing_file_and_unknown_format(tmp_path):
-    for name, match in (("no.obj", "No such file"), ("mesh.xyz", "unknown mesh format")):
-        with pytest.raises(InputError, match=match):
-            read_mesh(tmp_path / name, MATERIALS, "red")
-
-
-def test_truncated_binary_is_refused(tmp_path):
-    path = tmp_path / "ball.ply"
-    path.write_bytes(trimesh.creation.icosphere(subdivisions=2).export(file_type="ply")[:900])
-    with pytest.raises(InputError):
-        read_mesh(path, MATERIALS, "red")
 
 
 def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):

@@ -112,16 +112,6 @@ def test_a_given_pose_is_doubted_but_never_left_out(tmp_path):
     assert obj["doubts"] and not obj["left_out"] and read_exr(out / "a.exr")["confidence"].any()
 
 
-def test_keypoints_are_where_the_search_begins(tmp_path):
-    inputs, caster, camera, pose = step(tmp_path, chair(), chair(), focal=300.0, source="dataset")
-    corners = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0]])
-    pixels = camera.project(pose.apply(corners))
-    keypoints = [{"pixel": list(p), "point": list(q)} for p, q in zip(pixels.tolist(), corners.tolist())]
-    inputs.facts["dataset.objects"]["objects"][0]["keypoints"] = keypoints
-    obj = run(tmp_path, inputs)[1]["objects"]["chair"]
-    assert obj["source"] == "keypoints" and obj["doubts"] == [] and np.allclose(obj["rotation"], pose.rotation, atol=0.02)
-
-
 def test_object_without_a_pixel_is_refused(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair(), edit=lambda label: label * 0)
     with pytest.raises(InputError, match="no pixel of the mask shows object 'chair'"):
@@ -163,14 +153,6 @@ def test_a_pose_that_the_dataset_gives_goes_before_an_earlier_one(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
     entry = run(tmp_path, earlier(tmp_path, inputs, Pose(np.eye(3), pose.translation), camera))[1]
     assert entry["objects"]["chair"]["source"] == "given" and np.allclose(entry["objects"]["chair"]["rotation"], pose.rotation)
-
-
-def test_a_photo_that_the_earlier_result_lacks_is_searched(tmp_path):
-    inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    other = earlier(tmp_path, inputs, pose, camera)
-    path = other["poses"] / "poses.json"
-    path.write_text(path.read_text().replace('"a"', '"b"'))
-    assert run(tmp_path, other)[1]["objects"]["chair"]["source"] == "found"
 
 
 def in_a_file_twice_as_large(inputs, **camera):

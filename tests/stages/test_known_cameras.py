@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 
-import msgspec
 import numpy as np
 import pycolmap
 import pytest
@@ -138,17 +137,6 @@ def test_what_dataset_yaml_says_of_the_camera_wins(tmp_path):
     assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (310.0, "dataset", list(CAMERA.centre))
 
 
-def test_what_dataset_yaml_says_of_the_principal_point_wins(tmp_path):
-    camera = aligned(scene(tmp_path / "set", "colmap", photo={"camera": {"principal_point": [100.0, 75.0]}}))["camera"]
-    assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (300.0, "colmap", [100.0, 75.0])
-
-
-def test_a_pose_in_dataset_yaml_wins(tmp_path):
-    given = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 6.0]}
-    entry = aligned(scene(tmp_path / "set", "colmap", photo={"objects": [{"name": "chair", "mesh": "chair", "pose": given}]}))
-    assert entry["objects"]["chair"]["source"] == "given" and entry["objects"]["chair"]["translation"] == [0.0, 0.0, 6.0]
-
-
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         obj = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["chair"]
@@ -164,10 +152,3 @@ def test_a_photo_that_was_cropped_is_refused(tmp_path):
     with pytest.raises(InputError, match="the photo has 200×120 pixels, its image in the source 200×150") as caught:
         aligned(folder)
     assert caught.value.key == "cameras.colmap: hall" and "cropped" in str(caught.value)
-
-
-def test_the_slice_of_a_posed_photo_is_of_its_type(tmp_path):
-    from factorlib.dataset.schema import ObjectsSlice
-
-    facts = dataset_slice(read_dataset(scene(tmp_path / "set", "bop")), "objects", "hall").facts
-    assert msgspec.convert(json.loads(json.dumps(facts)), ObjectsSlice).external.source == "bop"

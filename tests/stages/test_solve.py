@@ -177,14 +177,6 @@ def test_the_solver_of_few_lobes_writes_the_same_artifacts(tmp_path, linked):
     assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
 
 
-@pytest.mark.parametrize(
-    "solver, operator, taken",
-    [("bundle", "auto", "network"), ("few_lobes", "auto", "network"), ("paper", "auto", "paper_network"), ("paper", "network", "network")],
-)
-def test_each_solver_has_an_operator_of_its_own(solver, operator, taken):
-    assert solve.operator_of(solve.Params(solver=solver, operator=operator)) == taken
-
-
 class Killed(Exception):
     pass
 

@@ -1,0 +1,285 @@
+"""A data set that means harm reads and writes nothing outside its folder, runs no code and forges no report.
+
+With `test_hostile_input` and `test_fuzz` these are the promises of docs/security.md.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+
+import msgspec
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from factorlib.checkpoint import Checkpoint
+from factorlib.dataset.read import read_dataset
+from factorlib.errors import InputError
+from factorlib.recipe.read import read_recipe
+from factorlib.runner import verbs
+from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.survey import survey
+from factorlib.runner.terminal import printable
+from factorlib.validation import Validation
+from factorlib.yamlfile import load_yaml
+from tests.faults.good import DATASET, SOURCES, TRUTH, edited, make_set, put
+from tests.report.test_page import page_of, run
+
+EVIL_HTML = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+EVIL_ANSI = "\x1b]0;owned\x07\x1b[2J\x1b[31mall is well\r\u202e"
+CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+PATHS = {  # every path that dataset.yaml and truth.yaml may hold, and the suffix it has
+    ("photos", 0, "image"): ".png",
+    ("photos", 1, "masks"): ".png",
+    ("photos", 0, "masks", "red"): ".png",
+    ("photos", 0, "objects", 0, "mask"): ".png",
+    ("meshes", "vase", "file"): ".ply",
+    ("truth",): ".yaml",
+    ("cameras", "colmap"): "",
+    ("cameras", "transforms"): ".json",
+    ("cameras", "bop"): "",
+    ("illumination", "hall"): ".exr",
+    ("normals", "room"): ".exr",
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """The good data set, and beside it a secret, links to it, and what leads nowhere."""
+    folder = make_set(tmp_path_factory.mktemp("outside") / "set")
+    (folder / "circle").symlink_to("circle")
+    for suffix in {*PATHS.values()} - {""}:
+        put(folder.parent / f"secret{suffix}", "secret")
+        (folder / f"link{suffix}").symlink_to(folder.parent / f"secret{suffix}")
+        (folder / f"twice{suffix}").symlink_to(f"link{suffix}")
+        os.mkfifo(folder / f"pipe{suffix}")
+    (folder.parent / "secret").mkdir()
+    (folder / "link").symlink_to(folder.parent / "secret")
+    (folder / "twice").symlink_to("link")
+    (folder / "up").symlink_to(folder.parent)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """This project with a build/ of its own."""
+    root = tmp_path_factory.mktemp("project")
+    for name in ("pipeline.yaml", "stages", "factorlib", "recipes"):
+        (root / name).symlink_to(LIBRARY / name)
+    (root / "data").mkdir()
+    return Project(root, photo_sets())
+
+
+def refused(folder, spec=DATASET, truth=TRUTH) -> InputError:
+    put(folder / "dataset.yaml", yaml.safe_dump(spec))
+    put(folder / "truth.yaml", yaml.safe_dump(truth))
+    with pytest.raises(InputError) as caught:
+        read_dataset(folder)
+    assert caught.value.cure and caught.value.file and len(str(caught.value)) < 1000
+    return caught.value
+
+
+# ── it reads nothing outside itself, and nothing that never ends ─────────────────────────────────────────────────────
+
+OUT, NOWHERE = "outside the dataset", "no path that can be followed"
+WAYS = {
+    "../secret{}": OUT,
+    "m/../../secret{}": OUT,
+    "{folder}/../secret{}": OUT,
+    "link{}": OUT,
+    "twice{}": OUT,
+    "up/secret{}": OUT,
+    "circle/a{}": NOWHERE,
+    "x\0y{}": NOWHERE,
+    "é" * 200 + "{}": NOWHERE,
+    "z/" * 4000 + "{}": NOWHERE,
+    "pipe{}": "is a pipe, not a file|there is no folder|no folder",
+}
+
+
+@pytest.mark.parametrize("place", PATHS, ids=lambda place: ".".join(map(str, place)))
+def test_no_path_leads_out_or_nowhere(good, place):
+    """Above, absolute, by a link, a link to a link or a folder that is one; in circles, or longer than names may be."""
+    of_truth = place[0] in TRUTH  # of which what is not there is a warning
+    for way, words in ((way, words) for way, words in WAYS.items() if words == OUT or not of_truth):
+        path = way.format(PATHS[place], folder=good)
+        if of_truth:
+            error = refused(good, truth=edited(TRUTH, *place, value=path))
+        else:
+            error = refused(good, edited(DATASET, *place, value=path))
+            assert error.key == ".".join(map(str, place)).replace(".0", "[0]").replace(".1", "[1]")
+        assert re.search(words, error.found), (way, error)
+
+
+def test_a_dataset_yaml_that_is_a_link_out_is_refused_and_nothing_of_its_target_is_shown(tmp_path):
+    folder = make_set(tmp_path / "set")
+    (folder / "dataset.yaml").rename(tmp_path / "dataset.yaml")
+    for target in (tmp_path / "dataset.yaml", "/etc/passwd"):
+        (folder / "dataset.yaml").symlink_to(target)
+        with pytest.raises(InputError, match=OUT) as caught:
+            photo_sets().read(folder)
+        assert "root:" not in str(caught.value)
+        (folder / "dataset.yaml").unlink()
+
+
+def test_a_link_within_the_dataset_is_no_way_out(tmp_path):
+    folder = make_set(tmp_path / "set")
+    (folder / "again.png").symlink_to(folder / "7.png")
+    put(folder / "dataset.yaml", yaml.safe_dump(edited(DATASET, "photos", 0, "image", value="again.png")))
+    assert read_dataset(folder).spec.photos[0].image == "again.png"
+
+
+def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
+    dataset = read_dataset(make_set(tmp_path / "set"))
+    for kind in ("pipe", "device"):
+        given = tmp_path / kind
+        given.mkdir()
+        for name in ("poses.json", "odd.obj", "odd.hdr", "odd.json"):
+            os.mkfifo(given / name) if kind == "pipe" else (given / name).symlink_to("/dev/zero")
+        with pytest.raises(InputError, match=f"is a {kind}"):
+            survey(Project(LIBRARY, photo_sets()), "synthetic", ["align"], [f"align.poses={given}"])
+        for text in ("mesh: odd.obj\nkind: insert", "kind: relight\nlights: [odd.hdr]"):
+            with pytest.raises(InputError, match="there is no file"):
+                read_recipe(put(given / "own.yaml", text), dataset)
+
+
+# ── it writes nothing outside build/ ─────────────────────────────────────────────────────────────────────────────────
+
+NAMES = ["../up", "a/b", ".", "", "a\0b", "a b", "~", "$(touch x)", "é", "a\n", "CON:", EVIL_HTML, "\x1b[31m", "n" * 101]
+NAMED = [("photos", 0, "name"), ("photos", 0, "illumination"), ("photos", 0, "objects", 0, "name"), ("materials", 0)]
+
+
+@pytest.mark.parametrize("place", NAMED, ids=lambda place: str(place[-1]))
+def test_names_that_become_names_of_files_are_plain_words_of_100_characters(good, place):
+    for name in NAMES:
+        error = refused(good, edited(DATASET, *place, value=name))
+        assert error.key and not CONTROL.search(str(error).replace("\n", ""))
+
+
+def test_a_run_writes_nothing_but_results(project, tmp_path):
+    """Of the stage that reads what a stranger sends, over a data set whose folder has an odd name."""
+    odd = make_set(tmp_path / "it's $(touch pwned) <b>&amp; `touch pwned`")
+    before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert verbs.make(project, verbs.Wish(str(odd), ["masks"])) == 0
+    assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    assert (project.build / odd.name / "masks" / "photos.json").exists()
+    expected = ["build", "data", "factorlib", "pipeline.yaml", "recipes", "stages"]
+    assert sorted(path.name for path in project.root.iterdir()) == expected
+
+
+# ── it runs no code ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+RUNS = ["!!python/object/apply:os.system ['touch {0}']", "!!python/name:os.system", "!!python/module:os", "!code 'x'"]
+
+
+@pytest.mark.parametrize("text", RUNS)
+def test_no_tag_of_yaml_runs(tmp_path, text):
+    file = put(tmp_path / "x.yaml", f"format: 1\nmaterials: {text.format(tmp_path / 'pwned')}\n")
+    with pytest.raises(InputError):
+        load_yaml(file)
+    assert not (tmp_path / "pwned").exists()
+
+
+FORBIDDEN = {"eval", "exec", "compile", "__import__", "system", "popen", "spawnl", "execv", "unsafe_load", "full_load"}
+ALLOWED = {"re.compile", "torch.compile", "platform.system"}
+MODULES = {"pickle", "marshal", "shelve", "dill", "joblib", "cloudpickle"}
+EXCEPTIONS = {
+    "factorlib/checkpoint.py": {"pickle"},  # names the exception of what refuses to run code; torch.load is below
+    "factorlib/parcel.py": {"pickle", "cloudpickle"},  # what the processes of one run send each other over a cluster
+}
+
+
+def dangers(node: ast.AST) -> list[str]:
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+        return [name for name in names if name.partition(".")[0] in MODULES]
+    if not isinstance(node, ast.Call):
+        return []
+    text, words = ast.unparse(node.func), {word.arg: ast.unparse(word.value) for word in node.keywords}
+    danger = text.rpartition(".")[2] in FORBIDDEN and text not in ALLOWED
+    danger |= text == "torch.load" and words.get("weights_only") != "True"
+    danger |= text in ("yaml.load", "np.load", "numpy.load")
+    danger |= words.get("shell") == "True" or words.get("allow_pickle") == "True"
+    return [text] if danger else []
+
+
+def test_the_source_calls_nothing_that_runs_what_it_reads():
+    found = []
+    for path in (p for part in ("factorlib", "stages") for p in (LIBRARY / part).rglob("*.py")):
+        name = str(path.relative_to(LIBRARY))
+        calls = [what for node in ast.walk(ast.parse(path.read_text())) for what in dangers(node)]
+        found += [f"{name}: {what}" for what in calls if what not in EXCEPTIONS.get(name, ())]
+    assert not found
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_a_checkpoint_that_would_run_code_is_not_loaded(tmp_path, caplog):
+    torch.save({"a": Bomb(tmp_path / "pwned")}, tmp_path / "a.pt")
+    assert Checkpoint(tmp_path / "a.pt").load() is None
+    assert not (tmp_path / "pwned").exists() and "cannot be read" in caplog.text
+
+
+def test_text_in_a_photo_is_never_run(tmp_path):
+    folder, exif = make_set(tmp_path / "set"), Image.Exif()
+    for tag in (0x010E, 0x010F, 0x0110, 0x013B, 0x8298):
+        exif[tag] = f"$(touch {tmp_path}/pwned) `touch {tmp_path}/pwned` {EVIL_HTML} {EVIL_ANSI}"
+    Image.new("RGB", (16, 12), (90, 80, 70)).save(folder / "7.png", exif=exif)
+    assert Validation(read_dataset(folder)).faults("photo", "hall", {}, folder) == []
+    assert not (tmp_path / "pwned").exists()
+
+
+# ── it forges no report ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("verb, of", [("validate", "name"), ("masks", "name"), ("validate", "key")])
+def test_no_name_of_a_file_and_no_key_moves_the_cursor_or_sets_a_colour(project, tmp_path, verb, of):
+    folder = make_set(tmp_path / "set")
+    if of == "name":
+        put(folder / f"x{EVIL_ANSI}.png", "none")
+        spec = edited(DATASET, "photos", 0, "image", value=f"x{EVIL_ANSI}.png")
+    else:
+        spec = edited(DATASET, "photos", 0, f"key{EVIL_ANSI}", value=EVIL_ANSI)
+    put(folder / "dataset.yaml", yaml.safe_dump(spec))
+    command = [sys.executable, "-m", "factorlib", verb, "--dataset", str(folder)]
+    environment = {**os.environ, "FACTORLIB_ROOT": str(project.root), "PYTHONPATH": str(LIBRARY)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert not CONTROL.search(done.stdout + done.stderr) and "Traceback" not in done.stderr
+    assert "\\x1b[31mall is well" in done.stdout + done.stderr
+
+
+def test_text_that_a_terminal_may_be_shown_stays_as_it_is():
+    for text in ("kitchen: µ σ² ≥ 1 …\n  ┃ 40 %", "日本 é ñ 🙂", ""):
+        assert printable(text) == text
+    assert not CONTROL.search(printable(EVIL_ANSI)) and printable(printable(EVIL_ANSI)) == printable(EVIL_ANSI)
+
+
+def test_names_and_warnings_are_text_in_the_report(tmp_path):
+    text = f"{EVIL_HTML}{EVIL_ANSI}.jpg: its colour profile is {EVIL_HTML!r}"
+    log = [{"event": "warning", "stage": "masks", "photo": "day", "text": text}]
+    seen = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
+    inputs, usual = run(tmp_path, log=[], seen=seen)
+    facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "name": EVIL_HTML}}
+    put(tmp_path / "log.jsonl", "\n".join(map(json.dumps, log)))
+    page = page_of(msgspec.structs.replace(inputs, facts=facts), tmp_path / "evil")
+    assert "<script>alert" not in page and "<img src=x" not in page and page.count("&lt;script&gt;alert(1)") >= 3
+    assert page.count("<script") == usual.count("<script")
+
+
+def test_the_sources_of_cameras_are_good(tmp_path):
+    for source in SOURCES.values():
+        folder = make_set(tmp_path / next(iter(source)))
+        put(folder / "dataset.yaml", yaml.safe_dump(DATASET | {"cameras": source}))
+        assert read_dataset(folder).external
