@@ -8,8 +8,7 @@ import msgspec
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.yamlfile import Limits, load_yaml, read_yaml
-from factorlib.yamltext import plain_value
+from factorlib.yamlfile import Limits, load_yaml, parse_yaml, read_yaml
 
 LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(f"{b}: &{b} [{','.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefghi", "bcdefghij"))
 CHAIN = "a0: &a0 " + "[" * 60 + "]" * 60 + "\n" + "".join(f"a{i + 1}: &a{i + 1} [[[[[*a{i}]]]]]\n" for i in range(2000))
@@ -92,7 +91,7 @@ def test_an_unknown_key_made_of_the_converters_own_words_is_refused():
 def test_what_is_good_stays_good(text):
     import yaml
 
-    assert plain_value(text, "x.yaml") == yaml.safe_load(text)
+    assert parse_yaml(text, "x.yaml") == yaml.safe_load(text)
 
 
 @pytest.mark.long
