@@ -11,7 +11,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.picture import read_png
 from factorlib.meshes.mesh import Mesh
-from factorlib.runner import bars, screen, verbs
+from factorlib.runner import display, verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, SIDE, drawn, write_sheet
 
@@ -58,9 +58,9 @@ def test_validate_writes_it_only_when_asked(tmp_path, capsys):
 
 def test_validate_shows_how_far_a_sheet_is_once_it_takes_long(tmp_path, capsys, monkeypatch):
     project = checkout(tmp_path)
-    monkeypatch.setattr(screen, "PATIENCE", 1e9)
+    monkeypatch.setattr(display, "PATIENCE", 1e9)
     assert verbs.validate(project, str(EAMES), [], sheet=True) == 0 and capsys.readouterr().err == ""
-    monkeypatch.setattr(screen, "PATIENCE", 0.0)
+    monkeypatch.setattr(display, "PATIENCE", 0.0)
     assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
     begun, ended = capsys.readouterr().err.splitlines()
     assert begun.startswith("sheet ") and re.fullmatch(r"sheet +[0-9.]+ s", ended)
@@ -72,9 +72,9 @@ def test_on_a_terminal_a_bar_is_drawn(monkeypatch):
             return True
 
     seen = []
-    monkeypatch.setattr(screen, "PATIENCE", 0.0)
-    monkeypatch.setattr(bars.Bars, "progress", lambda self, step, done, total, text: seen.append((str(step), done, total)))
-    with screen.shown_if_long("sheet", Terminal()) as report:
+    monkeypatch.setattr(display, "PATIENCE", 0.0)
+    monkeypatch.setattr(display.Bars, "progress", lambda self, step, done, total, text: seen.append((str(step), done, total)))
+    with display.shown_if_long("sheet", Terminal()) as report:
         report(1, 4)
     assert seen == [("sheet", 1, 4)]
 

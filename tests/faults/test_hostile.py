@@ -28,9 +28,9 @@ from factorlib.errors import InputError
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.recipe.read import read_recipe
 from factorlib.runner import verbs
+from factorlib.runner.display import printable
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.runner.survey import survey
-from factorlib.runner.terminal import printable
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 from tests.report.test_page import page_of, run

@@ -11,7 +11,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.report.training import CURVES
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shipped import shipped_folder
+from factorlib.runner.shared import shipped_folder
 from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
 from stages import train
