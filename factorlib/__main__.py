@@ -21,7 +21,13 @@ from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
-NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}  # what the system refuses to this user
+NOT_OURS = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+}  # what the system refuses to this user
 
 
 def project() -> Project:
@@ -125,15 +131,25 @@ OPTIONS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {  # as `ArgumentPa
         ("--set",),
         {"dest": "settings", "action": "append", "metavar": "X.Y=Z", "help": "stage.parameter=value; else SET"},
     ),
-    "force": (("--force",), {"action": "store_true", "help": "whatever the store holds, or without asking; as FORCE=1"}),
+    "force": (
+        ("--force",),
+        {"action": "store_true", "help": "whatever the store holds, or without asking; as FORCE=1"},
+    ),
     "recipe": (
         ("--recipe",),
-        {"dest": "recipes", "action": "append", "help": "pictures to make: a path, a name in recipes/, or all; else RECIPE"},
+        {
+            "dest": "recipes",
+            "action": "append",
+            "help": "pictures to make: a path, a name in recipes/, or all; else RECIPE",
+        },
     ),
     "stages": (("stages",), {"nargs": "*", "help": "stages; all without it"}),
     "mermaid": (("--mermaid",), {"action": "store_true", "help": "as a Mermaid diagram"}),
     "photo": (("--photo",), {"help": "its name, or a recipe's; else PHOTO"}),
-    **{word: ((f"--{word}",), {"type": Path, "help": f"folder; else {word.upper()}"}) for word in ("photos", "masks", "meshes")},
+    **{
+        word: ((f"--{word}",), {"type": Path, "help": f"folder; else {word.upper()}"})
+        for word in ("photos", "masks", "meshes")
+    },
     "first": (("first",), {"nargs": "?", "help": "folder of a result, as build/eames; else A"}),
     "second": (("second",), {"nargs": "?", "help": "another; else B"}),
     "sheet": (("--sheet",), {"action": "store_true", "help": "also draw photos, labels and meshes; as SHEET=1"}),
@@ -143,36 +159,94 @@ OPTIONS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {  # as `ArgumentPa
 }
 ASKED = "dataset set force recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, function, help
-    "all": (ASKED, lambda a: verbs.make(project(), wish(a)), "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
-    "stage": (f"name {ASKED}", _stage, "Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes its pictures alone."),
-    "plan": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages)), "What would run; with a recipe and no stage, for its pictures alone."),
-    "why": (f"stages {ASKED}", lambda a: verbs.show_why(project(), wish(a, a.stages)), "Every reason why it would run."),
-    "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), wish(a, a.stages)), "How far each stage is, and what the current results warned of."),
-    "graph": ("mermaid dataset", lambda a: verbs.show_graph(project(), a.mermaid), "The stages and what they take, as text or as a Mermaid diagram."),
+    "all": (
+        ASKED,
+        lambda a: verbs.make(project(), wish(a)),
+        "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes.",
+    ),
+    "stage": (
+        f"name {ASKED}",
+        _stage,
+        "Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes its pictures alone.",
+    ),
+    "plan": (
+        f"stages {ASKED}",
+        lambda a: verbs.show_plan(project(), wish(a, a.stages)),
+        "What would run; with a recipe and no stage, for its pictures alone.",
+    ),
+    "why": (
+        f"stages {ASKED}",
+        lambda a: verbs.show_why(project(), wish(a, a.stages)),
+        "Every reason why it would run.",
+    ),
+    "status": (
+        "stages dataset set recipe",
+        lambda a: verbs.show_status(project(), wish(a, a.stages)),
+        "How far each stage is, and what the current results warned of.",
+    ),
+    "graph": (
+        "mermaid dataset",
+        lambda a: verbs.show_graph(project(), a.mermaid),
+        "The stages and what they take, as text or as a Mermaid diagram.",
+    ),
     "logs": (
         "stages dataset set recipe photo",
         lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo or os.environ.get("PHOTO") or None),
         "What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…).",
     ),
-    "params": ("stages", lambda a: verbs.show_params(project(), _stages(a)), "Every parameter of stages with default, range and meaning (make params STAGE=…)."),
-    "new": ("dataset photos masks meshes", _new, "Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml."),
-    "compare": ("first second", _compare, "A page that shows two results side by side: parameters, numbers, materials, lights and re-syntheses."),
+    "params": (
+        "stages",
+        lambda a: verbs.show_params(project(), _stages(a)),
+        "Every parameter of stages with default, range and meaning (make params STAGE=…).",
+    ),
+    "new": (
+        "dataset photos masks meshes",
+        _new,
+        "Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml.",
+    ),
+    "compare": (
+        "first second",
+        _compare,
+        "A page that shows two results side by side: parameters, numbers, materials, lights and re-syntheses.",
+    ),
     "validate": (
         "dataset set sheet",
         lambda a: verbs.validate(project(), named(a.dataset), chosen(a.settings), switched_on("SHEET", a.sheet)),
         "Check pipeline.yaml, settings and dataset without running anything.",
     ),
-    "verify": ("dataset", lambda a: verbs.verify(project(), named(a.dataset, True)), "Read every kept result, of a dataset or of all, and name what is damaged."),
-    "clean": ("dataset", lambda a: verbs.clean(project(), named(a.dataset, True)), "Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all."),
-    "gc": ("force", lambda a: verbs.collect(project(), lambda: agreed(a.force)), "Show which results are current for no dataset, and delete them; a terminal is asked first."),
-    "worker": ("scheduler cores", _worker, "Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md)."),
-    "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, named(a.dataset)), "Put a stage's current result into the package (for those who change the stage)."),
+    "verify": (
+        "dataset",
+        lambda a: verbs.verify(project(), named(a.dataset, True)),
+        "Read every kept result, of a dataset or of all, and name what is damaged.",
+    ),
+    "clean": (
+        "dataset",
+        lambda a: verbs.clean(project(), named(a.dataset, True)),
+        "Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all.",
+    ),
+    "gc": (
+        "force",
+        lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+        "Show which results are current for no dataset, and delete them; a terminal is asked first.",
+    ),
+    "worker": (
+        "scheduler cores",
+        _worker,
+        "Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md).",
+    ),
+    "ship": (
+        "name dataset",
+        lambda a: verbs.ship(project(), a.name, named(a.dataset)),
+        "Put a stage's current result into the package (for those who change the stage).",
+    ),
 }
 
 
 def parser(program: str) -> argparse.ArgumentParser:
     """Reads the words of every verb; `run` in what it returns is the verb's function."""
-    whole = argparse.ArgumentParser(program, description="Any other word is the name of a stage: it is run, and what it needs.")
+    whole = argparse.ArgumentParser(
+        program, description="Any other word is the name of a stage: it is run, and what it needs."
+    )
     add = whole.add_subparsers(title="verbs", metavar="verb", required=True).add_parser
     for name, (options, function, text) in VERBS.items():
         one = add(name, help=text, description=text, allow_abbrev=False)

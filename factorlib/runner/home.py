@@ -164,7 +164,9 @@ def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[P
     planned = [] if more is not None else survey.planned(frozenset()) if planned is None else planned
     stages, before = survey.spec.pipeline.stages, survey.home.last_keys()
     there = {str(step) for stage in stages for step in survey.spec.steps_of(stage)}
-    over_recipes = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")  # others were asked for before
+    over_recipes = tuple(
+        f"{name}/" for name, stage in stages.items() if stage.over == "recipe"
+    )  # others were asked for before
     keys = {step: key for step, key in before.items() if step in there or step.startswith(over_recipes)} | (more or {})
     keys |= {str(p.step): p.key for p in planned if p.status == "current"}
     if keys != before:

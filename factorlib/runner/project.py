@@ -160,7 +160,10 @@ class Project(msgspec.Struct, frozen=True):
 
         InputError where one is not there, is not good, or two are called the same.
         """
-        folders = (self.root / "recipes", self.root / "recipes" / data.folder.name)  # one of the data set's own goes before
+        folders = (
+            self.root / "recipes",
+            self.root / "recipes" / data.folder.name,
+        )  # one of the data set's own goes before
         known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
         paths = [path for word in words for path in (known.values() if word == ALL else [_recipe_at(word, known)])]
         found: dict[str, Recipe] = {}
@@ -197,12 +200,20 @@ def _recipe_at(word: str, known: dict[str, Path]) -> Path:
     if word in known or path.is_file():
         return known.get(word, path)
     if "/" in word or path.suffix:
-        raise InputError("there is no such recipe", file=word, key="RECIPE", cure=did_you_mean(path.stem, [*known, ALL]))
+        raise InputError(
+            "there is no such recipe", file=word, key="RECIPE", cure=did_you_mean(path.stem, [*known, ALL])
+        )
     raise InputError(f"there is no recipe {word!r}", key="RECIPE", cure=did_you_mean(word, [*known, ALL]))
 
 
 def check_name(
-    name: str, kind: str, *, file: Any = None, key: str | None = None, reserved: tuple[str, ...] = (), most: int = LONGEST
+    name: str,
+    kind: str,
+    *,
+    file: Any = None,
+    key: str | None = None,
+    reserved: tuple[str, ...] = (),
+    most: int = LONGEST,
 ) -> str:
     """`name`, where it can be the name of one file or folder and is not taken; InputError otherwise.
 

@@ -240,7 +240,11 @@ def is_running(seen: Survey, planned: Planned) -> bool:
 def events_of(seen: Survey, planned: Planned) -> list[dict]:
     """The log of a step's current result."""
     current = planned.status == "current"
-    return [{"text": "", **msgspec.json.decode(line)} for line in sound_lines(seen.store.log(planned.key))] if current else []
+    return (
+        [{"text": "", **msgspec.json.decode(line)} for line in sound_lines(seen.store.log(planned.key))]
+        if current
+        else []
+    )
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
@@ -253,9 +257,13 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
     """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
     seen = _looked_at(project, wish)
-    chosen = [p for p in seen.planned() if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of)]
+    chosen = [
+        p for p in seen.planned() if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of)
+    ]
     if not chosen:
-        raise InputError(f"no step is of {photo!r}", key="PHOTO", cure=did_you_mean(str(photo), [*seen.data.photos, *seen.recipes]))
+        raise InputError(
+            f"no step is of {photo!r}", key="PHOTO", cure=did_you_mean(str(photo), [*seen.data.photos, *seen.recipes])
+        )
     errors = {p.step: path for p in chosen if (path := seen.home.errors / f"{label(p.step)}.txt").is_file()}
     shown = {step: seen.project.shown(path) for step, path in errors.items()}
     print("\n".join(words.log_lines([(p, events_of(seen, p), shown.get(p.step)) for p in chosen])))
@@ -311,7 +319,9 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if is_path(dataset) else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = _science("newset").new_dataset(folder, photos, masks, meshes)
-    print(f"{project.shown(folder)}/dataset.yaml is written" + (", with `?` where you must say more:" if missing else ""))
+    print(
+        f"{project.shown(folder)}/dataset.yaml is written" + (", with `?` where you must say more:" if missing else "")
+    )
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
     return 0
 
@@ -390,10 +400,18 @@ def verify(project: Project, dataset: str | None) -> int:
     if not there:
         return 0
     pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    count, damaged = read_all(Store(project.build / "store"), [home] if home else made_homes(project), pipeline, home is None)
+    count, damaged = read_all(
+        Store(project.build / "store"), [home] if home else made_homes(project), pipeline, home is None
+    )
     for where, what, steps in damaged:
-        print("\n".join([f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {line}" for line in what)]))
-    more = f"{len(damaged)} damaged; the next run that needs one makes it again" if damaged else "all are as they were kept"
+        print(
+            "\n".join([f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {line}" for line in what)])
+        )
+    more = (
+        f"{len(damaged)} damaged; the next run that needs one makes it again"
+        if damaged
+        else "all are as they were kept"
+    )
     print(f"{count} results read: {more}")
     return 1 if damaged else 0
 
@@ -410,5 +428,7 @@ def ship(project: Project, stage: str, dataset: str) -> int:
     planned = next(p for p in seen.planned() if p.step.stage == stage)
     if planned.status != "current":
         raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
-    print(f"{stage}: {project.shown(put(seen.store.tree(planned.output), planned.record, project.root, stages[stage].shipped))}")
+    print(
+        f"{stage}: {project.shown(put(seen.store.tree(planned.output), planned.record, project.root, stages[stage].shipped))}"
+    )
     return 0

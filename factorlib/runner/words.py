@@ -29,9 +29,13 @@ def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = []
     for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip())
+        lines.append(
+            f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip()
+        )
     current = sum(p.status == "current" for p in planned)
-    return lines + [f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"]
+    return lines + [
+        f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"
+    ]
 
 
 def why_lines(planned: list[Planned]) -> list[str]:
@@ -43,7 +47,9 @@ def why_lines(planned: list[Planned]) -> list[str]:
     return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
 
 
-def status_lines(planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]) -> list[str]:
+def status_lines(
+    planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]
+) -> list[str]:
     """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
     lines = []
     for stage in dict.fromkeys(p.step.stage for p in planned):
@@ -72,7 +78,10 @@ def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
         return [f"{stage} has no parameters"]
     lines = []
     for one in found:
-        lines += [f"{stage}.{one.name} = {one.default}    ({one.allowed})", *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    ")]
+        lines += [
+            f"{stage}.{one.name} = {one.default}    ({one.allowed})",
+            *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    "),
+        ]
     return lines
 
 
@@ -116,7 +125,11 @@ def _cost(planned: Planned, events: list[dict]) -> str:
 def _made_with(record: dict, events: list[dict]) -> str:
     """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
     machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    packages = [f"{name.removeprefix('package:')} {version}" for name, version in sorted(record.items()) if name.startswith("package:")]
+    packages = [
+        f"{name.removeprefix('package:')} {version}"
+        for name, version in sorted(record.items())
+        if name.startswith("package:")
+    ]
     kind = [f"{machine['system']} {machine['processor']}"] if machine else []
     parts = [f"Python {machine.get('python', record.get('python', ''))}", *kind, *packages]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
