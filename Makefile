@@ -65,7 +65,7 @@ help:
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
 	@echo 'make logs DATASET=… STAGE=… PHOTO=…  what results cost and were made with: time, peak memory, versions, warnings'
-	@echo 'make graph                           the stages and what they take; SVG=build/graph.svg DATASET=…: as a drawing of how far each is'
+	@echo 'make graph                           the stages and what they take; $(PY) -m factorlib graph --mermaid: as a diagram'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'

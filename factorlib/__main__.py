@@ -1,6 +1,6 @@
 """The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
 
-Read by `argparse`, for a run with nothing to do must not wait: libraries that read it take longer than all that follows.
+It is read by `argparse`, for a run with nothing to do must not wait for a library that reads it more comfortably.
 """
 
 from __future__ import annotations
@@ -10,83 +10,51 @@ import errno
 import logging
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
+from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
-from factorlib.runner.terminal import plain_streams, printable
 
-NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}  # what the system refuses to this user
-
-Verb = Callable[[argparse.Namespace], int]
-Option = tuple[tuple[str, ...], dict[str, object]]  # as `ArgumentParser.add_argument` takes them
-VERBS: dict[str, tuple[Verb, tuple[Option, ...]]] = {}  # by name, in the order of `--help`
-
-
-def _option(*names: str, **how: object) -> Option:
-    return names, how
-
-
-DATASET = _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET")
-SETTINGS = _option("--set", dest="settings", action="append", metavar="X.Y=Z", help="stage.parameter=value, as in solve.lobes=64; else SET")
-FORCE = _option("--force", action="store_true", help="run again, whatever the store holds; as FORCE=1")
-RECIPES = _option("--recipe", dest="recipes", action="append", help="pictures to make: a path, a name in recipes/, or all; else RECIPE")
-STAGES = _option("stages", nargs="*", help="stages; all without it")
-
-
-def verb(name: str, *options: Option) -> Callable[[Verb], Verb]:
-    """Makes a function the verb `name`, which takes these options; its docstring is its help."""
-
-    def known(function: Verb) -> Verb:
-        """Remember it."""
-        VERBS[name] = function, options
-        return function
-
-    return known
+NOT_OURS = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+}  # what the system refuses to this user
 
 
 def project() -> Project:
-    """The checkout that FACTORLIB_ROOT names, or this package lies in, or, where it is installed, the current folder lies in."""
-    return Project(Path(os.environ.get("FACTORLIB_ROOT") or _checkout()).resolve(), photo_sets())
-
-
-def _checkout() -> Path:
+    """The checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in."""
     here = Path.cwd()
-    for folder in (LIBRARY, here, *here.parents):
-        if (folder / PIPELINE).is_file():
-            return folder
-    cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<a folder with {PIPELINE}, stages and data>"
-    raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
+    near = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
+    if not (root := os.environ.get("FACTORLIB_ROOT") or near):
+        cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<a folder with {PIPELINE}, stages and data>"
+        raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
+    return Project(Path(root).resolve(), photo_sets())
 
 
 # ── what the environment says where the command line does not: make passes it on so, untouched by any shell ──────────
 
 
-def named(dataset: str | None) -> str:
-    """The dataset, by its name or path; whether it may be called so is the project's affair."""
-    if (dataset := named_if_any(dataset)) is None:
-        raise InputError("no dataset is named", key="DATASET", cure="add DATASET=<a name in data/, or a path to a folder>")
+def named(dataset: str | None, optional: bool = False) -> str | None:
+    """The dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
+    dataset = os.environ.get("DATASET") if dataset is None else dataset
+    if dataset is None and not optional:
+        cure = "add DATASET=<a name in data/, or a path to a folder>"
+        raise InputError("no dataset is named", key="DATASET", cure=cure)
     return dataset
-
-
-def named_if_any(dataset: str | None) -> str | None:
-    """The data set's name or path: the option's, else the environment's DATASET, else None."""
-    return os.environ.get("DATASET") if dataset is None else dataset
 
 
 def chosen(settings: list[str] | None) -> list[str]:
     """Parameters `stage.name=value` as they were written: the options', else the environment's SET."""
     return settings or [os.environ.get("SET", "")]
-
-
-def wish(asked: argparse.Namespace, stages: list[str] | None = None) -> verbs.Wish:
-    """What is asked for, by the options, else by the environment; `stages`: those of the command line, all where there are none."""
-    recipes = asked.recipes or [name for name in [os.environ.get("RECIPE")] if name]
-    return verbs.Wish(named(asked.dataset), stages or None, chosen(asked.settings), forced(getattr(asked, "force", False)), recipes)
 
 
 def forced(force: bool) -> bool:
@@ -102,116 +70,53 @@ def switched_on(key: str, option: bool) -> bool:
     return option or word == "1"
 
 
+def agreed(force: bool) -> bool:
+    """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
+    return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
+
+
+def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
+    """What is asked for, by the options, else by the environment; without `stages` all of them."""
+    recipes = asked.recipes or [name for name in [os.environ.get("RECIPE")] if name]
+    force = forced(getattr(asked, "force", False))
+    return verbs.Wish(named(asked.dataset), stages or None, chosen(asked.settings), force, recipes)
+
+
+def _stages(asked: Namespace) -> list[str] | None:
+    return asked.stages or os.environ.get("STAGE", "").split() or None
+
+
+def _path(given: Path | None, key: str) -> Path | None:
+    """The option's path, else the one that the environment names."""
+    return given or (Path(os.environ[key]).expanduser() if os.environ.get(key) else None)
+
+
 # ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@verb("all", DATASET, SETTINGS, FORCE, RECIPES)
-def all_(asked: argparse.Namespace) -> int:
-    """Run the whole pipeline, as far as anything must run, and make the pictures of recipes that are named."""
-    return verbs.make(project(), wish(asked))
-
-
-@verb("stage", _option("name"), DATASET, SETTINGS, FORCE, RECIPES)
-def stage(asked: argparse.Namespace) -> int:
-    """Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes that one's pictures alone."""
+def _stage(asked: Namespace) -> int:
     known = project()
     verbs.check_stage(known, asked.name, list(VERBS))
     return verbs.make(known, wish(asked, [asked.name]))
 
 
-@verb("plan", STAGES, DATASET, SETTINGS, FORCE, RECIPES)
-def plan(asked: argparse.Namespace) -> int:
-    """What would run; with a recipe and no stage, for its pictures alone."""
-    return verbs.show_plan(project(), wish(asked, asked.stages))
-
-
-@verb("why", STAGES, DATASET, SETTINGS, FORCE, RECIPES)
-def why(asked: argparse.Namespace) -> int:
-    """Every reason why it would run."""
-    return verbs.show_why(project(), wish(asked, asked.stages))
-
-
-@verb("status", STAGES, DATASET, SETTINGS, RECIPES)
-def status(asked: argparse.Namespace) -> int:
-    """How far each stage is, and what the current results warned of."""
-    return verbs.show_status(project(), wish(asked, asked.stages))
-
-
-@verb(
-    "graph",
-    _option("--mermaid", action="store_true", help="as a Mermaid diagram"),
-    _option("--svg", type=Path, help="file to draw to; else SVG"),
-    DATASET,
-    SETTINGS,
-    RECIPES,
-)
-def graph(asked: argparse.Namespace) -> int:
-    """The stages and what they take, as text or as a drawing; the drawing of a dataset has its photos, and how far each stage is."""
-    svg = asked.svg or _folder_named("SVG")
-    return verbs.show_graph(project(), asked.mermaid, svg, wish(asked) if svg and named_if_any(asked.dataset) else None)
-
-
-@verb("logs", STAGES, DATASET, SETTINGS, RECIPES, _option("--photo", help="its name, or a recipe's; else PHOTO"))
-def logs(asked: argparse.Namespace) -> int:
-    """What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…)."""
-    stages = asked.stages or os.environ.get("STAGE", "").split() or None
-    return verbs.show_logs(project(), wish(asked, stages), asked.photo or os.environ.get("PHOTO") or None)
-
-
-@verb("params", STAGES)
-def params(asked: argparse.Namespace) -> int:
-    """Every parameter of stages with its default, its range and its meaning (make params STAGE=…)."""
-    return verbs.show_params(project(), asked.stages or os.environ.get("STAGE", "").split() or None)
-
-
-@verb("new", DATASET, *(_option(f"--{word}", type=Path, help=f"folder of {word}; else {word.upper()}") for word in ("photos", "masks", "meshes")))
-def new(asked: argparse.Namespace) -> int:
-    """Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml."""
-    folders = [given or _folder_named(key) for given, key in ((asked.photos, "PHOTOS"), (asked.masks, "MASKS"), (asked.meshes, "MESHES"))]
+def _new(asked: Namespace) -> int:
+    folders = (_path(getattr(asked, word), word.upper()) for word in ("photos", "masks", "meshes"))
     return verbs.begin(project(), named(asked.dataset), *folders)
 
 
-def _folder_named(key: str) -> Path | None:
-    """The folder or file that the environment names."""
-    return Path(os.environ[key]).expanduser() if os.environ.get(key) else None
-
-
-@verb("compare", _option("first", nargs="?", help="folder of a result, as build/eames; else A"), _option("second", nargs="?", help="another; else B"))
-def compare(asked: argparse.Namespace) -> int:
-    """A page that shows two results side by side: what differs in parameters, numbers, materials, lights and re-syntheses."""
+def _compare(asked: Namespace) -> int:
     folders = [given or os.environ.get(key) for given, key in ((asked.first, "A"), (asked.second, "B"))]
     if not all(folders):
         raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
     return verbs.compare(project(), *map(Path, folders))
 
 
-@verb("validate", DATASET, SETTINGS, _option("--sheet", action="store_true", help="as SHEET=1"))
-def validate(asked: argparse.Namespace) -> int:
-    """Check pipeline.yaml, settings and dataset without running anything; with a sheet, draw photos, labels and meshes side by side."""
-    return verbs.validate(project(), named(asked.dataset), chosen(asked.settings), switched_on("SHEET", asked.sheet))
+def _worker(asked: Namespace) -> int:
+    from factorlib.runner.cluster import start_worker
 
-
-@verb("verify", DATASET)
-def verify(asked: argparse.Namespace) -> int:
-    """Read every kept result, of a dataset or of all, and name what is damaged."""
-    return verbs.verify(project(), named_if_any(asked.dataset))
-
-
-@verb("clean", DATASET)
-def clean(asked: argparse.Namespace) -> int:
-    """Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all."""
-    return verbs.clean(project(), named_if_any(asked.dataset))
-
-
-@verb("gc", _option("--force", action="store_true", help="without asking; as FORCE=1"))
-def gc(asked: argparse.Namespace) -> int:
-    """Show which results in the store are current for no dataset, and delete them; a terminal is asked first, but for --force."""
-    return verbs.collect(project(), lambda: agreed(asked.force))
-
-
-def agreed(force: bool) -> bool:
-    """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
-    return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
+    start_worker(asked.scheduler, asked.cores, asked.further)
+    return 0
 
 
 def _cores(word: str) -> int:
@@ -220,47 +125,145 @@ def _cores(word: str) -> int:
     return int(word)
 
 
-@verb(
-    "worker",
-    _option("scheduler", help="its address, as tcp://10.0.0.1:8786"),
-    _option("--cores", type=_cores, help="that it computes on; default: all of this machine"),
-)
-def worker(asked: argparse.Namespace) -> int:
-    """Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md)."""
-    from factorlib.runner.cluster import start_worker
-
-    start_worker(asked.scheduler, asked.cores, asked.further)
-    return 0
-
-
-@verb("ship", _option("stage"), DATASET)
-def ship(asked: argparse.Namespace) -> int:
-    """Put a stage's current result into the package (for those who change the stage)."""
-    return verbs.ship(project(), asked.stage, named(asked.dataset))
-
-
-# ── reading the command line ─────────────────────────────────────────────────────────────────────────────────────────
+OPTIONS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {  # as `ArgumentParser.add_argument` takes them
+    "dataset": (("--dataset", "-d"), {"help": "its name in data/, or a path to its folder; else DATASET"}),
+    "set": (
+        ("--set",),
+        {"dest": "settings", "action": "append", "metavar": "X.Y=Z", "help": "stage.parameter=value; else SET"},
+    ),
+    "force": (
+        ("--force",),
+        {"action": "store_true", "help": "whatever the store holds, or without asking; as FORCE=1"},
+    ),
+    "recipe": (
+        ("--recipe",),
+        {
+            "dest": "recipes",
+            "action": "append",
+            "help": "pictures to make: a path, a name in recipes/, or all; else RECIPE",
+        },
+    ),
+    "stages": (("stages",), {"nargs": "*", "help": "stages; all without it"}),
+    "mermaid": (("--mermaid",), {"action": "store_true", "help": "as a Mermaid diagram"}),
+    "photo": (("--photo",), {"help": "its name, or a recipe's; else PHOTO"}),
+    **{
+        word: ((f"--{word}",), {"type": Path, "help": f"folder; else {word.upper()}"})
+        for word in ("photos", "masks", "meshes")
+    },
+    "first": (("first",), {"nargs": "?", "help": "folder of a result, as build/eames; else A"}),
+    "second": (("second",), {"nargs": "?", "help": "another; else B"}),
+    "sheet": (("--sheet",), {"action": "store_true", "help": "also draw photos, labels and meshes; as SHEET=1"}),
+    "scheduler": (("scheduler",), {"help": "its address, as tcp://10.0.0.1:8786"}),
+    "cores": (("--cores",), {"type": _cores, "help": "that it computes on; default: all of this machine"}),
+    "name": (("name",), {}),
+}
+ASKED = "dataset set force recipe"
+VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, function, help
+    "all": (
+        ASKED,
+        lambda a: verbs.make(project(), wish(a)),
+        "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes.",
+    ),
+    "stage": (
+        f"name {ASKED}",
+        _stage,
+        "Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes its pictures alone.",
+    ),
+    "plan": (
+        f"stages {ASKED}",
+        lambda a: verbs.show_plan(project(), wish(a, a.stages)),
+        "What would run; with a recipe and no stage, for its pictures alone.",
+    ),
+    "why": (
+        f"stages {ASKED}",
+        lambda a: verbs.show_why(project(), wish(a, a.stages)),
+        "Every reason why it would run.",
+    ),
+    "status": (
+        "stages dataset set recipe",
+        lambda a: verbs.show_status(project(), wish(a, a.stages)),
+        "How far each stage is, and what the current results warned of.",
+    ),
+    "graph": (
+        "mermaid dataset",
+        lambda a: verbs.show_graph(project(), a.mermaid),
+        "The stages and what they take, as text or as a Mermaid diagram.",
+    ),
+    "logs": (
+        "stages dataset set recipe photo",
+        lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo or os.environ.get("PHOTO") or None),
+        "What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…).",
+    ),
+    "params": (
+        "stages",
+        lambda a: verbs.show_params(project(), _stages(a)),
+        "Every parameter of stages with default, range and meaning (make params STAGE=…).",
+    ),
+    "new": (
+        "dataset photos masks meshes",
+        _new,
+        "Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml.",
+    ),
+    "compare": (
+        "first second",
+        _compare,
+        "A page that shows two results side by side: parameters, numbers, materials, lights and re-syntheses.",
+    ),
+    "validate": (
+        "dataset set sheet",
+        lambda a: verbs.validate(project(), named(a.dataset), chosen(a.settings), switched_on("SHEET", a.sheet)),
+        "Check pipeline.yaml, settings and dataset without running anything.",
+    ),
+    "verify": (
+        "dataset",
+        lambda a: verbs.verify(project(), named(a.dataset, True)),
+        "Read every kept result, of a dataset or of all, and name what is damaged.",
+    ),
+    "clean": (
+        "dataset",
+        lambda a: verbs.clean(project(), named(a.dataset, True)),
+        "Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all.",
+    ),
+    "gc": (
+        "force",
+        lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+        "Show which results are current for no dataset, and delete them; a terminal is asked first.",
+    ),
+    "worker": (
+        "scheduler cores",
+        _worker,
+        "Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md).",
+    ),
+    "ship": (
+        "name dataset",
+        lambda a: verbs.ship(project(), a.name, named(a.dataset)),
+        "Put a stage's current result into the package (for those who change the stage).",
+    ),
+}
 
 
 def parser(program: str) -> argparse.ArgumentParser:
     """Reads the words of every verb; `run` in what it returns is the verb's function."""
-    whole = argparse.ArgumentParser(program, description="Any other word is the name of a stage: it is run, and what it needs.")
+    whole = argparse.ArgumentParser(
+        program, description="Any other word is the name of a stage: it is run, and what it needs."
+    )
     add = whole.add_subparsers(title="verbs", metavar="verb", required=True).add_parser
-    for name, (function, options) in VERBS.items():
-        one = add(name, help=function.__doc__, description=function.__doc__, allow_abbrev=False)
+    for name, (options, function, text) in VERBS.items():
+        one = add(name, help=text, description=text, allow_abbrev=False)
         one.set_defaults(run=function)
-        for names, how in options:
+        for option in options.split():
+            names, how = OPTIONS[option]
             one.add_argument(*names, **how)
     return whole
 
 
 def run(words: list[str], program: str) -> int:
-    """What the verb of the command line returns.  A first word that is neither an option nor a verb is read as `stage <word>`."""
+    """What the verb of the command line returns.  A first word that is neither an option nor a verb is a stage."""
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
     known = parser(program)
     asked, further = known.parse_known_args(words or ["--help"])
-    if further and asked.run is not worker:
+    if further and asked.run is not _worker:
         known.error(f"unrecognized arguments: {' '.join(further)}")
     asked.further = further
     return asked.run(asked)
@@ -278,21 +281,16 @@ def main() -> NoReturn:
     except BrokenPipeError:  # whoever reads has enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that the flush at exit says nothing
         sys.exit(1)
-    except OSError as error:
-        _stop_at(error)
+    except OSError as error:  # the system's word where a user can mend it; whatever else is a defect
+        from factorlib.disk import disk_error
 
-
-def _stop_at(error: OSError) -> NoReturn:
-    """End with the system's word where a user can mend it; whatever else is a defect."""
-    from factorlib.disk import disk_error
-
-    known = disk_error(error, project().build)
-    if known is None and error.errno in NOT_OURS:
-        cure = "check that the folder is there, and that you may read it and write to it"
-        known = InputError(error.strerror, file=error.filename, cure=cure)
-    if known is None:
-        raise error
-    sys.exit(printable(f"error: {known}"))
+        known = disk_error(error, project().build)
+        if known is None and error.errno in NOT_OURS:
+            cure = "check that the folder is there, and that you may read it and write to it"
+            known = InputError(error.strerror, file=error.filename, cure=cure)
+        if known is None:
+            raise
+        sys.exit(printable(f"error: {known}"))
 
 
 if __name__ == "__main__":

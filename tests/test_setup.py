@@ -1,54 +1,84 @@
-"""Set-up: what it says where something is missing."""
+"""Set-up: which commands it gives to package clients, and what it says where something is missing."""
+
+import sys
 
 import pytest
 
 from factorlib import setup
 
 
-def test_found_is_silent(monkeypatch, capsys):
-    monkeypatch.setattr(setup, "LIBRARIES", {})
+@pytest.fixture
+def lacking(monkeypatch):
+    """A machine that lacks a library of each kind, has apt-get, and whose user is not root."""
+    monkeypatch.setattr(setup, "NEEDED", {"libnone.so.9": "libnone9"})
+    monkeypatch.setattr(setup, "FASTER", {"libfast.so.1": "libfast1"})
+    monkeypatch.setattr(setup.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}" if name == "apt-get" else None)
+    return monkeypatch
+
+
+def test_a_library_that_is_needed_is_one_message_with_the_command(lacking):
+    with pytest.raises(SystemExit, match=r"libnone.so.9(.|\n)*sudo apt-get update && sudo apt-get install -y libnone9"):
+        setup.check_system()
+
+
+def test_a_library_that_makes_it_faster_is_recommended_and_silent_where_it_is_there(lacking, capsys):
+    lacking.setattr(setup, "NEEDED", {})
+    setup.check_system()
+    assert "three times faster" in (said := capsys.readouterr().out) and "install -y libfast1" in said
+    lacking.setattr(setup, "FASTER", {})
     setup.check_system()
     assert capsys.readouterr() == ("", "")
 
 
-def test_missing_is_one_message_with_the_command(monkeypatch):
-    monkeypatch.setattr(setup, "LIBRARIES", {"libnone.so.9": "libnone9"})
-    monkeypatch.setattr(setup.os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}" if name == "apt-get" else None)
-    with pytest.raises(SystemExit) as caught:
-        setup.check_system()
-    assert "libnone.so.9" in caught.value.code and "sudo apt-get update && sudo apt-get install -y libnone9" in caught.value.code
+def test_root_installs_what_is_missing_and_says_so(lacking, capsys):
+    calls, there = [], set()
+    lacking.setattr(setup.os, "geteuid", lambda: 0)
+    lacking.setattr(setup, "loads", lambda name: name in there)
+    lacking.setattr(
+        setup.subprocess, "run", lambda command, **_: calls.append(command) or there.update(setup.NEEDED, setup.FASTER)
+    )
+    setup.check_system()
+    assert calls[1][-1] == "libnone9" and "installing libnone9" in capsys.readouterr().out
+    there.remove("libfast.so.1")
+    setup.check_system()
+    assert (
+        calls[-1][-1] == "libfast1" and "installing libfast1: renders are three times faster" in capsys.readouterr().out
+    )
 
 
 def test_another_python_is_refused(monkeypatch):
     monkeypatch.setattr(setup.sys, "version_info", (3, 9, 1))
     with pytest.raises(SystemExit, match=r"3\.11 or 3\.12"):
-        setup.check_system()
+        setup.check_python()
 
 
 def test_an_index_that_does_not_answer_is_not_used():
-    assert not setup.answers("http://localhost:9/none/")
-    assert not setup.answers("no address")
+    assert not setup.answers("http://localhost:9/none/") and not setup.answers("no address")
 
 
-def test_extras_are_installed_alone(monkeypatch):
-    called = []
-    monkeypatch.setattr(setup, "pip", lambda *words: called.append(words))
-    monkeypatch.setenv("EXTRAS", "blender, interchange")
+@pytest.fixture
+def called(monkeypatch, tmp_path):
+    """The commands that would be run, by runs.  There is no uv, and PyTorch's index of CPU wheels answers."""
+    calls = []
+    monkeypatch.setattr(setup, "run", lambda commands, words: calls.append(commands) or "uv" not in commands[0])
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
+    monkeypatch.setattr(setup, "answers", lambda url: True)
+    monkeypatch.delenv("TORCH_INDEX", raising=False)
+    return calls
+
+
+@pytest.mark.parametrize("extras, alone, others", [
+    ("blender, interchange", ["bpy", "MaterialX", "usd-core"], []),
+    ("dask blender", ["bpy"], ["cloudpickle", "dask", "dask-jobqueue", "distributed"]),
+])  # fmt: skip
+def test_extras_are_installed_alone_or_move_nothing_of_the_lock(called, monkeypatch, extras, alone, others):
+    monkeypatch.setenv("EXTRAS", extras)
     setup.install_extras()
-    ((command, alone, *packages),) = called
-    assert (command, alone) == ("install", "--no-deps")
-    assert [package.split("=")[0].split(">")[0] for package in packages] == ["bpy", "MaterialX", "usd-core"]
-
-
-def test_an_extra_with_packages_of_its_own_gets_them_and_moves_none_of_the_lock(monkeypatch):
-    called = []
-    monkeypatch.setattr(setup, "pip", lambda *words: called.append(words))
-    monkeypatch.setenv("EXTRAS", "dask blender")
-    setup.install_extras()
-    alone, (command, how, lock, *packages) = called
-    assert alone[1] == "--no-deps" and (command, how, lock) == ("install", "-c", str(setup.LOCK))
-    assert [package.split(">")[0] for package in packages] == ["cloudpickle", "dask", "dask-jobqueue", "distributed"]
+    bare = [[word.split("=")[0].split(">")[0] for word in command] for (command,) in called]
+    assert bare[0][-len(alone) - 1 :] == ["--no-deps", *alone]
+    assert not others or bare[1][-len(others) - 2 :] == ["-c", str(setup.LOCK), *others]
 
 
 def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
@@ -57,74 +87,39 @@ def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
         setup.install_extras()
 
 
-SAY = "import sys, time\nfor k in range(3):\n    print(f\"WARNING: Location 'file:///x/{word}{k}/' is ignored\", file=sys.stderr)\n"
-
-
-@pytest.fixture
-def installing(monkeypatch, tmp_path):
-    """`install` with a Python program in place of a package client."""
-    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
-    monkeypatch.setattr(setup, "BEAT", 0.3)
-    monkeypatch.setattr(setup, "_shown", 0.0)
-    return lambda *programs: setup.install([[setup.sys.executable, "-c", program] for program in programs], 9)
-
-
-def test_warnings_of_the_package_client_are_shown_once(installing, capfd):
-    assert installing(SAY.replace("{word}", "a"), SAY.replace("{word}", "b"))
-    said = capfd.readouterr()
-    assert said.err.count("WARNING: Location") == 1 and "5 more warnings of the same kind left out" in said.out
-
-
-def test_a_warning_of_another_kind_and_every_error_are_shown(installing, capfd):
-    assert not installing(SAY.replace("{word}", "") + "print('WARNING: other', file=sys.stderr)\nprint('ERROR: no such package a', file=sys.stderr)\nsys.exit(1)", "pass")
-    said = capfd.readouterr().err
-    assert said.count("WARNING") == 2 and "ERROR: no such package a" in said
-
-
-def test_a_silent_installation_shows_that_it_lives(installing, capfd, tmp_path):
-    (tmp_path / "pip-1.0.dist-info").mkdir()
-    assert installing(f"import os, time; os.mkdir({str(tmp_path / 'one-1.0.dist-info')!r}); time.sleep(1.5)")
-    assert 2 <= capfd.readouterr().out.count("set-up: 1 of 9 packages installed") <= 8
-
-
-def test_installations_run_at_once(installing, tmp_path):
-    met = "import pathlib, sys, time\nhere = pathlib.Path({!r})\n(here / {!r}).touch()\nfor _ in range(400):\n    if (here / {!r}).exists(): sys.exit(0)\n    time.sleep(.05)\nsys.exit(1)"
-    assert installing(met.format(str(tmp_path), "a", "b"), met.format(str(tmp_path), "b", "a")), "each waits for the other"
-
-
-@pytest.fixture
-def called(monkeypatch, tmp_path):
-    """What `install_packages` would run: lists of commands.  There is no uv, and PyTorch's index of CPU wheels answers."""
-    calls = []
-    monkeypatch.setattr(setup, "install", lambda commands, total=0: calls.append(commands) or True)
-    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
-    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
-    monkeypatch.setattr(setup, "torch_index", lambda: setup.TORCH_CPU)
-    return calls
-
-
-def test_every_package_of_the_lock_is_installed_once_and_torch_apart(called, tmp_path):
+def test_the_lock_is_installed_by_pip_where_uv_cannot_be_had_and_torch_apart(called, tmp_path):
     setup.install_packages()
-    ((torch, *others),) = called
-    assert all("--no-deps" in command for command in (torch, *others)) and setup.TORCH in torch
-    packages = [word for command in others for word in command if "==" in word]
-    locked = [line for line in setup.LOCK.read_text().splitlines() if line and not line.startswith("#")]
-    assert sorted(packages) == sorted(locked)
+    locked, torch = called[-1]
+    assert all(command[1:3] == ["-m", "pip"] and "--no-deps" in command for command in (locked, torch))
+    assert locked[-2:] == ["-r", str(setup.LOCK)] and torch[-3:] == [setup.TORCH, "--index-url", setup.TORCH_CPU]
     assert (tmp_path / "factorlib.pth").read_text() == "../../../..\n"
 
 
 def test_a_torch_of_another_index_is_asked_what_it_needs(called, monkeypatch):
-    monkeypatch.setattr(setup, "torch_index", lambda: "https://example.org/cuda")
+    monkeypatch.setenv("TORCH_INDEX", "https://example.org/cuda")
     setup.install_packages()
-    assert called[-1] == [setup.with_pip(["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"])]
+    assert called[-1] == [
+        setup.with_pip(["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"])
+    ]
 
 
-@pytest.mark.parametrize("index, torch_by", [(setup.TORCH_CPU, "uv"), (None, "pip")])
-def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(called, monkeypatch, index, torch_by):
-    monkeypatch.setattr(setup, "install", lambda commands, total=0: called.append(commands) or len(called) > 1)
-    monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(setup, "torch_index", lambda: index)
+@pytest.mark.parametrize("reached, torch_by", [(True, "/bin/uv"), (False, "pip")])
+def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(called, monkeypatch, reached, torch_by):
+    monkeypatch.setattr(setup, "run", lambda commands, words: called.append(commands) or len(called) > 1)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: "/bin/uv")
+    monkeypatch.setattr(setup, "answers", lambda url: reached)
     setup.install_packages()
-    (torch, others), by_pip = called[:2]
-    assert others[0] == "uv" and (torch[0] == "uv") == (torch_by == "uv") and setup.TORCH in torch
+    (locked, torch), by_pip = called[:2]
+    assert locked[0] == "/bin/uv" and torch_by in torch and setup.TORCH in torch
     assert all(command[1:3] == ["-m", "pip"] for command in by_pip)
+
+
+def test_commands_run_at_once_show_that_they_live_and_say_how_they_ended(monkeypatch, capfd, tmp_path):
+    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
+    monkeypatch.setattr(setup, "BEAT", 0.2)
+    met = "import pathlib, time\n(pathlib.Path({0!r}) / {1!r}).touch()\nwhile not (pathlib.Path({0!r}) / {2!r}).exists(): time.sleep(.05)\ntime.sleep(.5)"
+    commands = [[sys.executable, "-c", met.format(str(tmp_path), *names)] for names in ("ab", "ba")]
+    assert setup.run(commands, "working")
+    assert "set-up: working: 0 s, 0 packages are there" in capfd.readouterr().out
+    assert not setup.run([[sys.executable, "-c", "raise SystemExit('ERROR: no such package')"]], "working")
+    assert "ERROR: no such package" in capfd.readouterr().err

@@ -29,8 +29,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.defaults import Names, defaults_of, names_of, values_of
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.leftover import left_over
+from factorlib.runner.filehash import FileHashes, left_over
 
 KINDS = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
 

@@ -164,7 +164,7 @@ def _client(scheduler: str | None) -> Iterator[Any]:
         return
     try:
         client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
         raise InputError(f"no Dask scheduler answers at {scheduler} ({error})", key="scheduler", cure=cure) from error
     with client:

@@ -33,6 +33,15 @@ def hash_of_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
 
 
+def left_over(name: str) -> bool:
+    """Whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
+
+    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
+    [True, True, True, True, True, False]
+    """
+    return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"
+
+
 def write_cache(path: Path, tables: Any) -> None:
     """In whole or not at all; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
     with contextlib.suppress(OSError):

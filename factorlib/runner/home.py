@@ -1,98 +1,100 @@
-"""The home of a dataset's results, build/<dataset>: links to the current results, marks, and the log of all runs.
+"""The folders that a user sees: build/<dataset>, with links to the current results, marks, and the log of all runs.
 
-    <stage>       link to the current result of a stage, in build/store
+    <stage>       link to the current result of a stage, in build/store: its tree, or for a stage over photos a view
     current.json  which key each step has
     log.jsonl     what all runs did
     errors/       where a step failed by a defect, its traceback
     recipes/      links to the current pictures of each recipe
     dataset.txt   whose results these are: only a folder with this mark is a home that the runner made
+
+A view has the results of all photos of a stage in one folder, by hard links.  It is right if its files have the stamps of
+the trees' own; one that is not, because somebody put another file in, or a tree was replaced, is made anew.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
+import logging
 import os
 import shlex
+import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import json_text
-from factorlib.runner.names import RESERVED, check_name
-from factorlib.runner.project import Project, is_path
-from factorlib.wholefile import replace_file
+from factorlib.jsonfile import json_text, read_json
+from factorlib.runner.integrity import Inspector, stamps_of
+from factorlib.runner.plan import Planned, Step
+from factorlib.runner.project import RESERVED, Project, check_name, is_path
+from factorlib.runner.store import Store, sweep_drafts
+from factorlib.wholefile import replace_file, write_text
 
+if TYPE_CHECKING:
+    from factorlib.runner.survey import Survey
+
+log = logging.getLogger("factorlib.runner")
 Key = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]  # it becomes a part of paths
+LONGEST = 85  # bytes of the name of a step's files, to which suffixes are added
 
 
 class Home(msgspec.Struct, frozen=True):
-    """One such folder, directly in build/."""
+    """One such folder, directly in build/.
+
+    log: what runs cost and reported;  mark: says whose results these are;  errors: tracebacks, by step
+    """
 
     folder: Path
 
-    @property
-    def log(self) -> Path:
-        """What the runs of this data set cost and reported, one JSON object a line."""
-        return self.folder / "log.jsonl"
-
-    @property
-    def keys_file(self) -> Path:
-        """Which result of each step is current, as JSON: {step: key}."""
-        return self.folder / "current.json"
-
-    @property
-    def errors(self) -> Path:
-        """Folder of the errors of steps that failed, a text file each."""
-        return self.folder / "errors"
-
-    def pictures(self, stage: str) -> Path:
-        """Folder of the links to the current results of a stage over recipes, one for each recipe."""
-        return self.folder / stage
-
-    @property
-    def mark(self) -> Path:
-        """The file that says whose results these are: the path of the dataset's folder."""
-        return self.folder / "dataset.txt"
+    log = property(lambda self: self.folder / "log.jsonl")
+    keys_file = property(lambda self: self.folder / "current.json")
+    mark = property(lambda self: self.folder / "dataset.txt")
+    errors = property(lambda self: self.folder / "errors")
 
     def keys(self) -> dict[str, str]:
-        """Key by step, as the last run left it; InputError where the file is damaged."""
+        """Step -> key of its current result, nothing where there is none; InputError where the file is damaged."""
         try:
             return msgspec.json.decode(self.keys_file.read_bytes(), type=dict[str, Key])
         except FileNotFoundError:
             return {}
         except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            found = f"does not say which results are current ({getattr(error, 'strerror', None) or error})"
+            words = f"does not say which results are current ({getattr(error, 'strerror', None) or error})"
             cure = "delete it: the next run writes it anew and finds the results that are in the store"
-            raise InputError(found, file=self.keys_file, cure=cure) from error
+            raise InputError(words, file=self.keys_file, cure=cure) from error
 
-    def last_keys(self) -> dict[str, str]:
+    def last_keys(self, warn: bool = False) -> dict[str, str]:
         """The same, nothing where the file is damaged."""
         try:
             return self.keys()
-        except InputError:
+        except InputError as error:
+            if warn:
+                log.warning("%s; nothing is lost, but it is not known what changed since the last run", error)
             return {}
 
-    def write_keys(self, keys: dict[str, str]) -> None:
-        """Replace the table of current results, step -> key."""
-        replace_file(self.keys_file, json_text(keys).encode())
+
+# ── which home is whose ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def home_of(project: Project, dataset: Path) -> Home:
     """build/<name of the dataset's folder>; refused where a folder of that name elsewhere has it."""
-    home = home_named(project, dataset.name, dataset)
+    home = _home_named(project, dataset.name, dataset)
     owner = owner_of(project, home)
     if owner is not None and os.path.isdir(owner) and not owner.samefile(dataset):
-        raise _other_owner(home, owner, dataset, f"rename one of the folders, or give its results up: make clean DATASET={_quoted(owner)}")
+        cure = f"rename one of the folders, or give its results up: make clean DATASET={shlex.quote(str(owner))}"
+        raise _other_owner(home, owner, dataset, cure)
     return home
 
 
-def home_named(project: Project, name: str, dataset: Path | None = None) -> Home:
+def _home_named(project: Project, name: str, dataset: Path | None = None) -> Home:
     """build/<name>, which is a folder directly in build/, not a link that leads elsewhere, or is not there yet."""
     check_name(name, "a dataset", file=dataset, key="DATASET", reserved=RESERVED)
     folder = project.build / name
     if os.path.realpath(folder) != os.path.join(os.path.realpath(project.build), name):
-        raise InputError("is a link, where the runner keeps a dataset's results", file=folder, cure="delete the link, or move it elsewhere")
+        words = "is a link, where the runner keeps a dataset's results"
+        raise InputError(words, file=folder, cure="delete the link, or move it elsewhere")
     return Home(folder)
 
 
@@ -103,7 +105,7 @@ def made_home(project: Project, dataset: str) -> Home | None:
     """
     found = project.find_dataset(dataset)
     folder = found or Path(os.path.abspath(dataset))
-    home = home_named(project, folder.name)
+    home = _home_named(project, folder.name)
     if not home.mark.is_file():
         if found is not None:
             return None
@@ -114,7 +116,8 @@ def made_home(project: Project, dataset: str) -> Home | None:
     there = owner is not None and os.path.isdir(owner)
     theirs = owner is not None and not (found and there and owner.samefile(found)) and owner != folder
     if theirs and (is_path(dataset) or (found and there)):
-        raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={_quoted(owner if there else home.folder.name)}")
+        word = shlex.quote(str(owner if there else home.folder.name))
+        raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={word}")
     return home
 
 
@@ -122,17 +125,15 @@ def made_homes(project: Project) -> list[Home]:
     """Every home that the runner made; links are not followed."""
     if not project.build.is_dir():
         return []
-    folders = [Path(entry) for entry in os.scandir(project.build) if entry.is_dir(follow_symlinks=False) and entry.name not in RESERVED]
-    return [home for home in map(Home, sorted(folders)) if home.mark.is_file()]
+    entries = sorted(entry.path for entry in os.scandir(project.build) if entry.is_dir(follow_symlinks=False))
+    homes = [Home(Path(path)) for path in entries]
+    return [home for home in homes if home.folder.name not in RESERVED and home.mark.is_file()]
 
 
 def _other_owner(home: Home, owner: Path, dataset: Path, cure: str) -> InputError:
     name = home.folder.name
-    return InputError(f"two datasets are called {name!r}: build/{name} holds the results of {owner}", file=dataset, cure=cure)
-
-
-def _quoted(word: str | Path) -> str:
-    return shlex.quote(str(word))
+    words = f"two datasets are called {name!r}: build/{name} holds the results of {owner}"
+    return InputError(words, file=dataset, cure=cure)
 
 
 def owner_of(project: Project, home: Home) -> Path | None:
@@ -150,3 +151,156 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
     words = str(dataset.relative_to(project.root)) if dataset.is_relative_to(project.root) else str(dataset)
     if owner_of(project, home) != project.root / words:
         replace_file(home.mark, f"{words}\n".encode("utf-8", "surrogateescape"))
+
+
+# ── after a run, or where there was nothing to run ───────────────────────────────────────────────────────────────────
+
+
+def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
+    """Write down which key each step has now; steps of photos and stages that are no more are dropped.
+
+    more: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
+    """
+    planned = [] if more is not None else survey.planned(frozenset()) if planned is None else planned
+    stages, before = survey.spec.pipeline.stages, survey.home.last_keys()
+    there = {str(step) for stage in stages for step in survey.spec.steps_of(stage)}
+    over_recipes = tuple(
+        f"{name}/" for name, stage in stages.items() if stage.over == "recipe"
+    )  # others were asked for before
+    keys = {step: key for step, key in before.items() if step in there or step.startswith(over_recipes)} | (more or {})
+    keys |= {str(p.step): p.key for p in planned if p.status == "current"}
+    if keys != before:
+        claim(survey.project, survey.home, survey.data.folder)
+        replace_file(survey.home.keys_file, json_text(keys).encode())
+    if more is None:
+        _show(survey, planned)
+        survey.outputs.inspector.save()
+
+
+def _show(survey: Survey, planned: list[Planned]) -> None:
+    """Point the links at the current results; of a stage over photos, at one folder with all of them; one for each recipe."""
+    home, stages = survey.home.folder, survey.spec.pipeline.stages
+    current: dict[str, dict[str | None, str]] = {}
+    for p in (p for p in planned if p.status == "current"):
+        if p.step.recipe:
+            point(home / p.step.stage / p.step.recipe, survey.store.tree(p.output))
+        else:
+            current.setdefault(p.step.stage, {})[p.step.photo] = p.output
+    for name, outputs in current.items():
+        view = stages[name].over and view_of(survey.store, survey.outputs.inspector, outputs, stages[name].gather)
+        point(home / name, view or survey.store.tree(outputs[None]))
+    for link in home.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
+        if link.is_symlink() and link.name not in stages:
+            link.unlink(missing_ok=True)
+    failed = {label(step) for stage in stages for step in survey.spec.steps_of(stage)}
+    failed -= {label(p.step) for p in planned if p.status == "current"}
+    for path in survey.home.errors.glob("*.txt"):  # what is written of a failure goes with success, or with the step
+        if path.stem not in failed:
+            path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
+        survey.home.errors.rmdir()
+    sweep_drafts(home)
+
+
+def label(step: Step) -> str:
+    """The name of a step's own files, short however long the photo's name is.
+
+    >>> label(Step("masks", "kitchen")), len(label(Step("masks", "k" * 240)))
+    ('masks-kitchen', 70)
+    """
+    name = str(step).replace("/", "-")
+    return name if len(name.encode()) <= LONGEST else f"{step.stage[:20]}-{hashlib.sha256(name.encode()).hexdigest()}"
+
+
+def point(link: Path, target: Path) -> None:
+    """Make `link` name the folder `target` from one moment to the next; relative, so that build/ can be moved."""
+    words = os.path.relpath(target, link.parent)
+    if link.is_symlink() and os.readlink(link) == words:
+        return
+    link.parent.mkdir(parents=True, exist_ok=True)
+    draft = link.with_name(f".{link.name}.{os.getpid()}")
+    draft.unlink(missing_ok=True)
+    os.symlink(words, draft, target_is_directory=True)
+    if link.is_dir() and not link.is_symlink():
+        raise InputError("is a folder of its own, where the runner puts a link", file=link, cure="move it elsewhere")
+    os.replace(draft, link)
+
+
+# ── views ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather: str | None) -> Path:
+    """One folder with the files of all photos ({photo: output}), and `<photo>.json` of each gathered into `gather`."""
+    target = store.views / hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
+    wanted = {}
+    for output in outputs.values():
+        wanted |= inspector.known.get(output) or stamps_of(store.tree(output))
+
+    def is_right() -> bool:
+        """Whether the folder has the trees' own files, and the table that is gathered from them."""
+        now = stamps_of(target)
+        table = {gather: now.pop(gather)} if gather and gather in now else {}
+        if now != wanted or bool(table) != bool(gather):
+            return False
+        if gather and table != inspector.known.get(target.name):
+            if (target / gather).read_bytes() != gathered(store, outputs).encode():
+                return False
+            inspector.remember(target.name, table)
+        return True
+
+    if not is_right():
+        store.tmp.mkdir(parents=True, exist_ok=True)
+        draft = store.tmp / f"view-{os.getpid()}-{target.name}"
+        shutil.rmtree(draft, ignore_errors=True)
+        try:
+            _fill(draft, store, outputs, gather)
+            store.put(draft, target, is_right)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    return target
+
+
+def gathered(store: Store, outputs: dict[str, str]) -> str:
+    """One JSON text of the `<photo>.json` of every tree: {photo: content}."""
+    return json_text({photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
+
+
+def _fill(draft: Path, store: Store, outputs: dict[str, str], gather: str | None) -> None:
+    draft.mkdir()
+    for photo, output in sorted(outputs.items()):
+        for name in sorted(stamps_of(store.tree(output))):
+            if (target := draft / name).exists():
+                words = f"two photos write the same file {target.name!r}"
+                raise InputError(words, key=photo, cure="put the photo's name into it")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(store.tree(output) / name, target)
+            except OSError:  # no hard links on this file system
+                shutil.copy2(store.tree(output) / name, target)
+    if gather:
+        write_text(draft / gather, gathered(store, outputs))
+        (draft / gather).chmod(0o444)
+
+
+# ── logs: a JSON object on each line ─────────────────────────────────────────────────────────────────────────────────
+
+
+def sound_lines(path: Path) -> list[bytes]:
+    """The lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    sound = [line for line in lines if _is_event(line)]
+    if len(sound) < len(lines):
+        words = "%s: %d damaged lines are left out; the results are not affected"
+        log.warning(words, path, len(lines) - len(sound))
+    return sound
+
+
+def _is_event(line: bytes) -> bool:
+    try:
+        event = msgspec.json.decode(line)
+        return isinstance(event, dict) and isinstance(event.get("event"), str)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return False

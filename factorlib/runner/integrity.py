@@ -15,8 +15,7 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.filehash import hash_of_file, write_cache
-from factorlib.runner.leftover import left_over
+from factorlib.runner.filehash import hash_of_file, left_over, write_cache
 
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
 NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes

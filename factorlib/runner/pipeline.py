@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.names import check_name
+from factorlib.runner.project import check_name
 from factorlib.yamlfile import parse_yaml, read_yaml
 
 FORMAT = 1

@@ -1,4 +1,4 @@
-"""Where everything lies: the project's root, its pipeline, its results, its datasets by name or path."""
+"""Where everything lies: the project's root, its pipeline, its results, its datasets and recipes by name or path."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from typing import Any, Protocol
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.names import RESERVED, check_name
 from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 PIPELINE = "pipeline.yaml"
 DATASET_FILE = "dataset.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
+RESERVED = ("studies", "bench", "store", "compare")  # folders of build/ that are no datasets
+LONGEST = 255  # bytes of a name, on every common file system
+ALL = "all"  # recipes
 
 
 class Slice(Protocol):
@@ -30,21 +32,11 @@ class Slice(Protocol):
     files: list[str]
 
 
-def nothing_to_look_at(slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
-    """Stands in for a validation where a data set has none: no faults."""
-    return []
-
-
 class Recipe(msgspec.Struct, frozen=True):
     """What a recipe says.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
 
     facts: dict[str, Any]
     files: dict[str, Path]
-
-
-def nothing_in_files(files: dict[str, Path]) -> list[InputError]:
-    """Stands in where a data set does not look at the files of recipes: no faults."""
-    return []
 
 
 def no_recipes(path: Path) -> Recipe:
@@ -56,17 +48,17 @@ class Data(msgspec.Struct, frozen=True):
     """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
 
     recipe: reads a recipe for this data set; InputError where it asks for what is not there
-    faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes it
-            and the file in which these stand
+    faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes
+            it and the file in which these stand
     recipe_faults: of the files that a recipe names
     """
 
     folder: Path
     photos: list[str]
     slice: Callable[[str, str | None], Slice]
-    faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = nothing_to_look_at
+    faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
     recipe: Callable[[Path], Recipe] = no_recipes
-    recipe_faults: Callable[[dict[str, Path]], list[InputError]] = nothing_in_files
+    recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
 
 
 class Provider(msgspec.Struct, frozen=True):
@@ -83,10 +75,11 @@ def photo_sets() -> Provider:
 
     def read(path: Path) -> Data:
         """The data set of a folder, as the runner sees it."""
-        _check_own(path)
+        file = path / DATASET_FILE
+        if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(path)):
+            raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
         dataset = read_dataset(path)
         take_sigterm_back()
-        photos = [photo.name for photo in dataset.spec.photos]
 
         def recipe(file: Path) -> Recipe:
             """Read when one is asked for."""
@@ -95,29 +88,21 @@ def photo_sets() -> Provider:
             found = read_recipe(file, dataset)
             return Recipe(msgspec.to_builtins(found), files_of(found, file))
 
-        look = _looking_at(dataset)
-        slices = partial(dataset_slice, dataset)
-        return Data(dataset.folder, photos, slices, lambda *of: look().faults(*of), recipe, lambda files: look().recipe_faults(files))
+        @cache
+        def look() -> Any:
+            """`factorlib.validation`, by its name as stages are, when it is first asked for: it imports science."""
+            return importlib.import_module("factorlib.validation").Validation(dataset)
+
+        return Data(
+            dataset.folder,
+            [photo.name for photo in dataset.spec.photos],
+            partial(dataset_slice, dataset),
+            lambda *of: look().faults(*of),
+            recipe,
+            lambda files: look().recipe_faults(files),
+        )
 
     return Provider(SLICES, read)
-
-
-def _check_own(folder: Path) -> None:
-    """A dataset.yaml that is a link is as much a path of the data set as those that stand in it."""
-    file = folder / DATASET_FILE
-    if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(folder)):
-        raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
-
-
-def _looking_at(dataset: Any) -> Callable[[], Any]:
-    """Gives the `Validation` of `factorlib.validation`, found by its name as stages are, when it is first asked: it imports science."""
-
-    @cache
-    def validation() -> Any:
-        """Made when it is first asked for, for it imports much."""
-        return importlib.import_module("factorlib.validation").Validation(dataset)
-
-    return validation
 
 
 class Project(msgspec.Struct, frozen=True):
@@ -166,7 +151,30 @@ class Project(msgspec.Struct, frozen=True):
         if found is not None:
             check_name(found.name, "a dataset", file=found, key="DATASET", reserved=RESERVED)
             if self.root.is_relative_to(found) or found == self.build:
-                raise InputError("a dataset cannot be the folder that holds the project", file=found, key="DATASET", cure=HOW)
+                words = "a dataset cannot be the folder that holds the project"
+                raise InputError(words, file=found, key="DATASET", cure=HOW)
+        return found
+
+    def recipes(self, data: Data, words: list[str]) -> dict[str, Recipe]:
+        """The recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
+
+        InputError where one is not there, is not good, or two are called the same.
+        """
+        folders = (
+            self.root / "recipes",
+            self.root / "recipes" / data.folder.name,
+        )  # one of the data set's own goes before
+        known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+        paths = [path for word in words for path in (known.values() if word == ALL else [_recipe_at(word, known)])]
+        found: dict[str, Recipe] = {}
+        for path in dict.fromkeys(paths):
+            name = check_name(path.stem, "a recipe", file=path, key="RECIPE", most=200)
+            if name in found:
+                words = f"two recipes are called {name!r}: their pictures would lie in one folder"
+                raise InputError(words, file=path, cure="rename one of them")
+            found[name] = data.recipe(path)
+        if not found and ALL in words:
+            raise InputError("there is none in recipes/", key="RECIPE", cure="name a file: RECIPE=<path>.yaml")
         return found
 
 
@@ -182,5 +190,46 @@ def _folder_at(path: Path, name: str) -> Path | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:  # no right to look, links in a circle, a part too long, a NUL
-        raise InputError(f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})", key="DATASET", cure=HOW) from error
+        words = f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})"
+        raise InputError(words, key="DATASET", cure=HOW) from error
     return path if stat.S_ISDIR(mode) else path.parent
+
+
+def _recipe_at(word: str, known: dict[str, Path]) -> Path:
+    path = Path(os.path.abspath(word))
+    if word in known or path.is_file():
+        return known.get(word, path)
+    if "/" in word or path.suffix:
+        raise InputError(
+            "there is no such recipe", file=word, key="RECIPE", cure=did_you_mean(path.stem, [*known, ALL])
+        )
+    raise InputError(f"there is no recipe {word!r}", key="RECIPE", cure=did_you_mean(word, [*known, ALL]))
+
+
+def check_name(
+    name: str,
+    kind: str,
+    *,
+    file: Any = None,
+    key: str | None = None,
+    reserved: tuple[str, ...] = (),
+    most: int = LONGEST,
+) -> str:
+    """`name`, where it can be the name of one file or folder and is not taken; InputError otherwise.
+
+    kind: of what it is the name, with its article;  most: bytes that it may have
+    """
+    length = len(name.encode(errors="replace"))
+    wrong = {
+        "that is no name": not name,
+        "that is another folder": name in (".", ".."),
+        "it has a slash": "/" in name,
+        "it has a NUL": "\0" in name,
+        "it has an end of a line": "\n" in name and kind == "a recipe",
+        "build/ uses that name": name in reserved,
+        "it is not UTF-8": name.encode(errors="replace").decode() != name,
+        f"it has {length} bytes, {most} may be": length > most,
+    }
+    if found := next((words for words, holds in wrong.items() if holds), None):
+        raise InputError(f"{kind} cannot be called {name!r}: {found}", file=file, key=key, cure="give it another name")
+    return name

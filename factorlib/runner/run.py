@@ -21,15 +21,12 @@ from filelock import FileLock, Timeout
 
 from factorlib.runner.display import Display
 from factorlib.runner.executors import Pools
-from factorlib.runner.finish import label, remember
-from factorlib.runner.home import claim
-from factorlib.runner.logs import sound_lines
+from factorlib.runner.gc import tenant
+from factorlib.runner.home import claim, label, remember, sound_lines, view_of
 from factorlib.runner.pipeline import DASK, DATASET, Pipeline
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey, given_folder
-from factorlib.runner.tenancy import tenant
-from factorlib.runner.views import view_of
 from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 

@@ -1,9 +1,12 @@
-"""A store that several checkouts share: what one has made, the others copy.
+"""Results that others have made: in a store that several checkouts share, and those that ship with the source.
 
 `FACTORLIB_STORE=<folder>` names it.  It is laid out as every store is, but nothing there is used in place: a result is copied
 into the checkout's own store, its key compared with its record and every file with its hash, and what a checkout makes is copied
 there where it may write.  So a shared store that vanishes, is damaged or read-only costs time and no result, and no
 command deletes anything in it: `gc` and `clean` know the checkout's own store alone.
+
+A shipped result lies where the package is, with what it was made from.  A step takes it where its parameters, and the sources
+of the modules that make it, are those that it was made from; FORCE=1 makes it anew.
 """
 
 from __future__ import annotations
@@ -17,16 +20,23 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
+import msgspec
+
 from factorlib.errors import InputError
-from factorlib.runner.integrity import hashes_of_tree
-from factorlib.runner.logs import sound_lines
+from factorlib.jsonfile import json_text
+from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.home import sound_lines
+from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Store
+from factorlib.runner.store import Entry, Store, holds
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
 NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
 ABANDONED = 86400.0  # seconds after which a draft in the shared store is taken to be of a run that was killed
+
+MADE_FROM = "made_from.json"
+CURE = "restore it from the repository, or make the result anew with FORCE=1"
 
 Say = Callable[[str], None]
 
@@ -45,11 +55,6 @@ def shared_store(own: Path) -> Path | None:
         if isinstance(error, InputError):
             raise
         raise InputError(f"cannot be looked at ({error})", file=named[:100], key=VARIABLE, cure="name a folder that you may read") from error
-
-
-def has(shared: Store, key: str) -> bool:
-    """Whether a result of `key` is there, by its name alone."""
-    return (shared.keys / f"{key}.json").is_file()
 
 
 def fetch(shared: Store, own: Store, key: str, record: Record, draft: Path, say: Say) -> tuple[Entry, Path | None] | None:
@@ -79,7 +84,7 @@ def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
         if not shared.root.is_dir():
             raise FileNotFoundError(errno.ENOENT, "it is gone")
         there = shared.entry(key)
-        if there and _is_right(shared, there):
+        if there and holds(shared.tree(there.output), there.files):
             return
         _drop_abandoned(shared)
         if _copied(own.tree(entry.output), draft, entry.files):
@@ -103,18 +108,7 @@ def _copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
         (draft / name).parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
-    return _holds(draft, files)
-
-
-def _is_right(store: Store, entry: Entry) -> bool:
-    return _holds(store.tree(entry.output), entry.files)
-
-
-def _holds(folder: Path, files: dict[str, str]) -> bool:
-    try:
-        return hashes_of_tree(folder) == files
-    except (InputError, OSError):
-        return False
+    return holds(draft, files)
 
 
 def _copy_log(source: Store, target: Store, key: str) -> None:
@@ -129,3 +123,63 @@ def _drop_abandoned(shared: Store) -> None:
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > ABANDONED:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+# ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def made_from(record: Record, modules: list[str]) -> Record:
+    """The part of a step's record that a result made by `modules` depends on.
+
+    >>> made_from({"param:steps": 3, "source:stages.train": "1", "source:factorlib.errors": "2", "package:torch": "2.13"}, ["stages.train"])
+    {'param:steps': 3, 'source:stages.train': '1'}
+    """
+    own = {f"source:{module}" for module in modules}
+    return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
+
+
+class Shipped(msgspec.Struct, frozen=True):
+    """What made_from.json says: the record, as far as the result depends on it, and the hash of each file."""
+
+    record: Record
+    files: dict[str, str]
+
+
+def shipped_folder(roots: list[Path], shipping: Shipping, record: Record) -> Path | None:
+    """The folder, below one of `roots`, whose result is that of `record`; None where it was made from something else.
+
+    Raises InputError where a file in it is not the one that was shipped.
+    """
+    for path in (root / shipping.folder for root in roots if (root / shipping.folder / MADE_FROM).is_file()):
+        shipped = _read(path)
+        if shipped.record == made_from(record, shipping.made_by):
+            for name, digest in shipped.files.items():
+                if not (path / name).is_file() or hash_of_file(path / name) != digest:
+                    raise InputError("is not the file that was shipped with the source", file=path / name, cure=CURE)
+            return path
+    return None
+
+
+def _read(folder: Path) -> Shipped:
+    try:
+        return msgspec.json.decode((folder / MADE_FROM).read_bytes(), type=Shipped)
+    except msgspec.DecodeError as error:
+        raise InputError(f"does not say what the shipped files were made from ({error})", file=folder / MADE_FROM, cure=CURE) from None
+
+
+def copy_shipped(folder: Path, out: Path) -> None:
+    """The files of a shipped result, as the step's own."""
+    for name in _read(folder).files:
+        shutil.copyfile(folder / name, out / name)
+
+
+def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
+    """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
+    target = root / shipping.folder
+    target.mkdir(parents=True, exist_ok=True)
+    files = {path.name: path.read_bytes() for path in sorted(result.iterdir())}
+    for name, content in files.items():
+        replace_file(target / name, content)
+    shipped = Shipped(made_from(record, shipping.made_by), {name: hash_of_file(target / name) for name in files})
+    replace_file(target / MADE_FROM, json_text(shipped).encode())
+    return target

@@ -17,7 +17,9 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -29,6 +31,9 @@ from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.runner.integrity import Inspector, hashes_of_tree
 from factorlib.wholefile import replace_file, sync, sync_tree
+
+DRAFT = re.compile(r"\..+\.([0-9]{1,9})")  # of `factorlib.wholefile.replace_file`: a dot, the name, the process
+OLD = 3600.0  # seconds: what is younger may be written by a process of another machine that shares the folder
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -52,7 +57,7 @@ class Store:
         """What is written of a key, None where it was never made; whether its tree is there and right an Inspector says."""
         try:
             entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
-        except (FileNotFoundError, msgspec.DecodeError):
+        except (OSError, msgspec.DecodeError):  # a folder in its place, say
             return None
         return entry if output_of(entry.files) == entry.output else None
 
@@ -75,11 +80,13 @@ class Store:
         for name in files:
             (folder / name).chmod(0o444)
         sync_tree(folder)
-        return entry, self.put(folder, self.tree(entry.output), lambda: _holds(self.tree(entry.output), files))
+        return entry, self.put(folder, self.tree(entry.output), lambda: holds(self.tree(entry.output), files))
 
     def keep(self, key: str, entry: Entry) -> None:
         """From now on `key` has that result."""
         self.keys.mkdir(parents=True, exist_ok=True)
+        if (self.keys / f"{key}.json").is_dir():
+            self._set_aside(self.keys / f"{key}.json")
         replace_file(self.keys / f"{key}.json", json_text(entry).encode())
 
     def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
@@ -169,8 +176,29 @@ def output_of(files: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _holds(tree: Path, files: dict[str, str]) -> bool:
+def holds(tree: Path, files: dict[str, str]) -> bool:
+    """Whether a folder has exactly those files, every content read."""
     try:
         return hashes_of_tree(tree) == files
     except (OSError, InputError):
         return False
+
+
+def sweep_drafts(folder: Path) -> None:
+    """Delete the drafts of writers that were killed: their process is no more, and they are OLD."""
+    for path in folder.glob(".*"):
+        found = DRAFT.fullmatch(path.name)
+        with contextlib.suppress(OSError):
+            if found and not is_alive(int(found[1])) and time.time() - path.lstat().st_mtime > OLD:
+                path.unlink()
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is such a process on this machine, whoever's it is."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import sys
 from dataclasses import dataclass
@@ -21,10 +20,7 @@ from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, said_of_settings, with_settings, words_by_key
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project, Recipe
-from factorlib.runner.recipes import asked_for
 from factorlib.runner.store import Outputs, Store
-
-log = logging.getLogger("factorlib.runner")
 
 
 @dataclass
@@ -72,7 +68,7 @@ def survey(
     folder = project.dataset_folder(dataset)
     data = project.provider.read(folder)
     home, store = home_of(project, data.folder), Store(project.build / "store")
-    asked = asked_for(project, data, recipes or [])
+    asked = project.recipes(data, recipes or [])
     spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
     if force:
         forced = pipeline.stages if targets is None else targets
@@ -86,16 +82,8 @@ def survey(
         hashes.save()
         packages.save()
     outputs = Outputs(store)
-    entries = {step: outputs.entry(key) for step, key in _last_keys(home).items()}
+    entries = {step: outputs.entry(key) for step, key in home.last_keys(warn=True).items()}
     return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked, words)
-
-
-def _last_keys(home: Home) -> dict[str, str]:
-    try:
-        return home.keys()
-    except InputError as error:
-        log.warning("%s; nothing is lost, but it is not known what changed since the last run", error)
-        return {}
 
 
 def _records(

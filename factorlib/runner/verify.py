@@ -9,46 +9,30 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import msgspec
-
 from factorlib.errors import InputError
 from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.home import Home
+from factorlib.runner.home import Home, gathered
 from factorlib.runner.integrity import Inspector, stamps_of
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import key_of
 from factorlib.runner.store import Entry, Store
-from factorlib.runner.views import gathered
+
+Damage = tuple[Path, list[str], list[str]]  # where; a line for each fault; whose result, as `masks/kitchen (eames)`
 
 
-class Damage(msgspec.Struct, frozen=True):
-    """where: the folder or file;  what: a line for each fault;  steps: whose result it is, as `masks/kitchen (eames)`."""
-
-    where: Path
-    what: list[str]
-    steps: list[str]
-
-
-class Verdict(msgspec.Struct, frozen=True):
-    """How many results were read, and what is wrong among them."""
-
-    results: int
-    damaged: list[Damage]
-
-
-def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> Verdict:
-    """Read the results that `homes` name, or everything in the store."""
+def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> tuple[int, list[Damage]]:
+    """Read the results that `homes` name, or everything in the store; how many there are, and what is damaged."""
     inspector = Inspector(store.root)
     users = _users(homes)
     keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if everything else set()))
     entries = {key: store.entry(key) for key in keys}
-    damaged = [Damage(store.keys / f"{key}.json", ["missing or not readable"], users.get(key, [])) for key in keys if entries[key] is None]
+    damaged = [(store.keys / f"{key}.json", ["missing or not readable"], users.get(key, [])) for key in keys if entries[key] is None]
     good = {key: entry for key, entry in entries.items() if entry}
     damaged += [_of_record(store, key, entry, users) for key, entry in good.items() if key_of(entry.record) != key]
     damaged += list(_of_trees(store, inspector, good, users))
     damaged += [found for home in homes for found in _of_views(store, home, good, pipeline)]
     inspector.save()
-    return Verdict(len(keys), damaged)
+    return len(keys), damaged
 
 
 def _users(homes: list[Home]) -> dict[str, list[str]]:
@@ -66,7 +50,7 @@ def _name(key: str, entry: Entry, users: Mapping[str, list[str]]) -> list[str]:
 
 
 def _of_record(store: Store, key: str, entry: Entry, users: Mapping[str, list[str]]) -> Damage:
-    return Damage(store.keys / f"{key}.json", ["its record is not the one that made the key"], _name(key, entry, users))
+    return (store.keys / f"{key}.json", ["its record is not the one that made the key"], _name(key, entry, users))
 
 
 def _of_trees(store: Store, inspector: Inspector, entries: Mapping[str, Entry], users: Mapping[str, list[str]]) -> Iterator[Damage]:
@@ -77,7 +61,7 @@ def _of_trees(store: Store, inspector: Inspector, entries: Mapping[str, Entry], 
     for output, keys in of_tree.items():
         if what := inspector.thorough(output, entries[keys[0]].files):
             steps = [name for key in keys for name in _name(key, entries[key], users)]
-            yield Damage(store.tree(output), what, steps)
+            yield (store.tree(output), what, steps)
 
 
 def _of_views(store: Store, home: Home, entries: Mapping[str, Entry], pipeline: Pipeline) -> Iterator[Damage]:
@@ -92,7 +76,7 @@ def _of_views(store: Store, home: Home, entries: Mapping[str, Entry], pipeline: 
         if link.is_dir() and link.resolve().parent == store.views.resolve():
             gather = pipeline.stages[stage].gather if stage in pipeline.stages else None
             if what := list(_of_view(store, link.resolve(), of_photos, gather)):
-                yield Damage(link, what, [f"{stage} ({home.folder.name})"])
+                yield (link, what, [f"{stage} ({home.folder.name})"])
 
 
 def _of_view(store: Store, view: Path, of_photos: Mapping[str, Entry], gather: str | None) -> Iterator[str]:

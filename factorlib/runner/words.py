@@ -4,31 +4,38 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 from msgspec import structs
 
 from factorlib.runner.params import Parameter
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
+from factorlib.runner.survey import Survey
 
 if TYPE_CHECKING:
     from factorlib.runner.gc import Unneeded
-    from factorlib.runner.verify import Verdict
 
 SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
+
+
+def say(seen: Survey, text: str) -> None:
+    """Print a line that begins with the dataset's name."""
+    print(f"{seen.data.folder.name}: {text}")
 
 
 def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = []
     for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip())
+        lines.append(
+            f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip()
+        )
     current = sum(p.status == "current" for p in planned)
-    return lines + [f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"]
+    return lines + [
+        f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"
+    ]
 
 
 def why_lines(planned: list[Planned]) -> list[str]:
@@ -40,7 +47,9 @@ def why_lines(planned: list[Planned]) -> list[str]:
     return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
 
 
-def status_lines(planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]) -> list[str]:
+def status_lines(
+    planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]
+) -> list[str]:
     """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
     lines = []
     for stage in dict.fromkeys(p.step.stage for p in planned):
@@ -50,16 +59,6 @@ def status_lines(planned: list[Planned], running: Callable[[Planned], bool], war
         lines.append(f"{stage:<10} {counts}")
     said = dict.fromkeys(f"warning: {p.step}: {text}" for p in planned if p.status == "current" for text in warnings(p))
     return lines + list(said)
-
-
-def damage_lines(verdict: Verdict, shown: Callable[[Path], str]) -> list[str]:
-    """What is damaged, where, whose result it is, and what to do."""
-    lines = []
-    for damage in verdict.damaged:
-        lines += [f"{', '.join(damage.steps) or 'a result'}: {shown(damage.where)}", *(f"    {line}" for line in damage.what)]
-    if not lines:
-        return [f"{verdict.results} results read: all are as they were kept"]
-    return [*lines, f"{verdict.results} results read: {len(verdict.damaged)} damaged; the next run that needs one makes it again"]
 
 
 def graph_lines(pipeline: Pipeline) -> list[str]:
@@ -79,7 +78,10 @@ def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
         return [f"{stage} has no parameters"]
     lines = []
     for one in found:
-        lines += [f"{stage}.{one.name} = {one.default}    ({one.allowed})", *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    ")]
+        lines += [
+            f"{stage}.{one.name} = {one.default}    ({one.allowed})",
+            *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    "),
+        ]
     return lines
 
 
@@ -90,48 +92,47 @@ def mermaid_lines(pipeline: Pipeline) -> list[str]:
     return ["graph TD", *nodes, *edges]
 
 
-class Logged(msgspec.Struct, frozen=True):
-    """A step with the events of its result's log, and the file that says by which defect it failed."""
+def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
+    """What each step cost, what it was made with where that is not as for the step above, and what it warned of.
 
-    planned: Planned
-    events: list[dict]
-    failed: str | None
-
-
-def log_lines(logged: list[Logged]) -> list[str]:
-    """Of each step what it cost, what it was made with where that is not as for the step above, and what it warned of."""
-    lines, last = [], None
-    for one in logged:
-        lines.append(f"{one.planned.step!s:<26} {_cost(one)}".rstrip())
-        if one.planned.status == "current" and (made_with := _made_with(one)) != last:
-            unbroken = made_with.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")  # a name and its version
-            wrapped = textwrap.wrap(unbroken, 110, initial_indent="    ", subsequent_indent="    ")
-            lines += [line.replace("\N{NO-BREAK SPACE}", " ") for line in wrapped]
+    logged: steps with the events of their results' logs, and the file that says by which defect one failed
+    """
+    lines, last = [], ""
+    for planned, events, failed in logged:
+        lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
+        if planned.status == "current" and (made_with := _made_with(planned.record or {}, events)) != last:
+            for part in textwrap.wrap(made_with, 110, initial_indent="    ", subsequent_indent="    "):
+                lines.append(part.replace("\N{NO-BREAK SPACE}", " "))
             last = made_with
-        lines += [f"    warning: {event.get('text', '')}" for event in one.events if event["event"] == "warning"]
-        lines += [f"    it failed by a defect of the program: {one.failed}"] if one.failed else []
+        lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
+        lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
     return lines
 
 
-def _cost(logged: Logged) -> str:
-    done = next((event for event in reversed(logged.events) if event["event"] == "done"), None)
-    if logged.planned.status != "current":
-        return f"{logged.planned.status}: {_short(logged.planned.reasons)}"
+def _cost(planned: Planned, events: list[dict]) -> str:
+    done = next((event for event in reversed(events) if event["event"] == "done"), None)
+    if planned.status != "current":
+        return f"{planned.status}: {_short(planned.reasons)}"
     if done is None:
         return "its log is not there"
     if done.get("shared"):
         return "from the shared store, without its log"
     cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
-    return f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
+    cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
+    return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
 
 
-def _made_with(logged: Logged) -> str:
-    """Python, the machine's kind and the packages whose versions count."""
-    record = logged.planned.record or {}
-    machine = next((event["machine"] for event in reversed(logged.events) if "machine" in event), {})
-    packages = [f"{name.removeprefix('package:')} {version}" for name, version in sorted(record.items()) if name.startswith("package:")]
-    python = f"Python {machine.get('python', record.get('python', ''))}"
-    return ", ".join([python, *([f"{machine['system']} {machine['processor']}"] if machine else []), *packages])
+def _made_with(record: dict, events: list[dict]) -> str:
+    """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
+    machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
+    packages = [
+        f"{name.removeprefix('package:')} {version}"
+        for name, version in sorted(record.items())
+        if name.startswith("package:")
+    ]
+    kind = [f"{machine['system']} {machine['processor']}"] if machine else []
+    parts = [f"Python {machine.get('python', record.get('python', ''))}", *kind, *packages]
+    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
 
 
 def _alike(planned: list[Planned]) -> list[list[Planned]]:

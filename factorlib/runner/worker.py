@@ -30,13 +30,12 @@ from factorlib.errors import InputError
 from factorlib.runner.closure import Sources
 from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, hash_of_file
+from factorlib.runner.home import sound_lines
 from factorlib.runner.integrity import Stamp, stamps_of
-from factorlib.runner.logs import warnings_in
 from factorlib.runner.pipeline import Shipping, said_of_settings
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import fetch, offer
-from factorlib.runner.shipped import copy_shipped, shipped_folder
+from factorlib.runner.shared import copy_shipped, fetch, offer, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Store
 from factorlib.stage import Inputs
@@ -249,8 +248,9 @@ def _fetched(task: Task, events: Events) -> tuple[Entry, Path | None] | None:
         return None
     store = Store(task.store)
     found = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
-    for text in warnings_in(store.log(task.key)) if found else ():
-        events.say(text)
+    for line in sound_lines(store.log(task.key)) if found else ():
+        if (event := json.loads(line))["event"] == "warning":
+            events.say(str(event.get("text", "")))
     if found and not store.log(task.key).exists():
         _write_log(task, events, {"seconds": 0.0, "shared": True})
     return found

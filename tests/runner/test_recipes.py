@@ -10,7 +10,6 @@ from factorlib.runner import verbs
 from factorlib.runner.gc import collect
 from factorlib.runner.home import made_homes
 from factorlib.runner.project import Project, Provider, Recipe
-from factorlib.runner.recipes import asked_for
 from factorlib.runner.survey import survey
 from tests.runner import toy
 from tests.runner.toy import write
@@ -127,7 +126,7 @@ def test_a_path_is_a_recipe_as_well(project, monkeypatch):
 def test_a_recipe_that_is_not_there_names_those_that_are(project, word, wrong):
     data = project.provider.read(project.root / "data" / "set")
     with pytest.raises(InputError) as error:
-        asked_for(project, data, [word])
+        project.recipes(data, [word])
     assert wrong in str(error.value)
 
 
@@ -135,7 +134,7 @@ def test_two_recipes_of_one_name_are_refused(project):
     write(project.root / "mine" / "hello.yaml", '{"word": "own"}')
     data = project.provider.read(project.root / "data" / "set")
     with pytest.raises(InputError, match="two recipes are called 'hello'"):
-        asked_for(project, data, ["hello", str(project.root / "mine" / "hello.yaml")])
+        project.recipes(data, ["hello", str(project.root / "mine" / "hello.yaml")])
 
 
 def test_clean_forgets_the_pictures_too(project):

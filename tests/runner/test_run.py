@@ -305,6 +305,14 @@ def test_clean_takes_a_dataset_and_then_gc_its_results(project):
     assert "current" not in state(project).values()
 
 
+def test_a_folder_in_place_of_a_keys_record_is_a_result_that_is_gone(project):
+    keys = project.build / "store" / "keys"
+    path = next(path for path in keys.iterdir() if json.loads(path.read_text())["record"]["stage"] == "total")
+    path.unlink()
+    path.mkdir()
+    assert new_runs(project) == ["total"] and path.is_file()
+
+
 def heed_interrupts():
     """A shell hands SIGINT down as ignored to what it runs in the background, this test perhaps."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -7,7 +7,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.shipped import MADE_FROM
+from factorlib.runner.shared import MADE_FROM
 from tests.runner.test_run import make, new_runs
 from tests.runner.toy import make_project, write
 

@@ -10,7 +10,7 @@ from factorlib.__main__ import project
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shipped import shipped_folder
+from factorlib.runner.shared import shipped_folder
 from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
 from stages import train
