@@ -80,7 +80,6 @@ help:
 	@echo 'make bench-eames_like                data/eames, and sets made alike that no setting was chosen on: captured lights too by $(PY) -m benchmarks.eames_like --lights FOLDER'
 	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
 	@echo 'make bench-runners                   a run with nothing to do, a plan and a status, beside DVC and Snakemake (docs/runner.md)'
-	@echo 'make bench-stale                     the tables in docs/ that were measured on other sources, or do not say on which'
 	@echo 'make bench-reference REASON="…"         the numbers of data/synthetic that make test compares with, and README.md, anew'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
 	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'

@@ -78,8 +78,8 @@ def main(
         folder.mkdir(exist_ok=True)
         for name in FIGURES:
             shutil.copy(out / name, folder / name)
-        refresh(stability.DOCS, as_tables(result, spheres.scores), "benchmarks.operator")
-        refresh(stability.DOCS, stability.as_tables(laws), "benchmarks.operator.stability")
+        refresh(stability.DOCS, as_tables(result, spheres.scores))
+        refresh(stability.DOCS, stability.as_tables(laws))
     print(f"{out}: operator.json, stability.json, spheres.json, {', '.join(FIGURES)}")
 
 

@@ -31,7 +31,6 @@ from benchmarks.runners.picture import picture
 from benchmarks.runners.projects import WORK, WRITERS, make_outputs, names, write_photos
 from factorlib.wholefile import write_text
 
-COMMAND = "benchmarks.runners"
 OURS = "factorlib"
 VERBS = ("nothing to do", "plan", "status")
 HERE = [sys.executable, "-m", "factorlib"]
@@ -71,7 +70,7 @@ def main(
     print(as_table(timings))
     write_text(out / "runners.svg", picture(timings))
     if docs:
-        refresh(ROOT / "docs" / "runner.md", {"runners": as_table(timings)}, COMMAND)
+        refresh(ROOT / "docs" / "runner.md", {"runners": as_table(timings)})
         write_text(ROOT / "docs" / "runner" / "runners.svg", picture(timings))
 
 

@@ -83,7 +83,7 @@ def main(
         write(out, result)
         print(f"scaling: {result['scaling']}")
     if docs:
-        refresh(DOCS / "solve-speed.md", as_tables(result), "benchmarks.solve")
+        refresh(DOCS / "solve-speed.md", as_tables(result))
         (DOCS / "solve").mkdir(exist_ok=True)
         (DOCS / "solve" / "error_over_time.svg").write_text(error_over_time(shown_in(result)), encoding="utf-8")
 

@@ -49,13 +49,13 @@ def test_every_table_has_its_place_and_the_rest_stays(tmp_path):
     text = DOCS.read_text(encoding="utf-8")
     page = tmp_path / "operator.md"
     page.write_text(text, encoding="utf-8")
-    refresh(page, tables, "benchmarks.operator")
+    refresh(page, tables)
     once = page.read_text(encoding="utf-8")
     assert all(inner in once for inner in tables.values()) and "## Stability" in once
-    refresh(page, tables, "benchmarks.operator")
+    refresh(page, tables)
     assert page.read_text(encoding="utf-8") == once
     with pytest.raises(InputError, match="no place for the table 'other'"):
-        refresh(page, {"other": ""}, "benchmarks.operator")
+        refresh(page, {"other": ""})
 
 
 def test_numbers_are_short():
