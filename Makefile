@@ -73,7 +73,7 @@ help:
 	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
-	@echo 'make bench-operator                  time, error and looks of the reflection operators, to build/bench/operator'
+	@echo 'make bench-operator                  time and error of the reflection operators, to build/bench/operator'
 	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, with few lobes, to build/bench/parts'
 	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
 	@echo 'make bench-eames_like                data/eames, and sets made alike that no setting was chosen on: captured lights too by $(PY) -m benchmarks.eames_like --lights FOLDER'
