@@ -37,7 +37,6 @@ PLACE = ROOT / "build/bench/eames-like"
 SEEDS = (101, 102, 103, 104, 105)
 CAPTURED_SEEDS = (106, 107, 108, 109, 110)
 MAPS = 6  # of a set: one for each photo
-STAGES = [f"stages.{name}" for name in ("masks", "align", "urm", "solve", "export", "render", "evaluate")]
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
 
@@ -244,9 +243,8 @@ def main(
     text = paragraph(eames, [*others, *lit])
     print("\n\n".join([*tables.values(), text]))
     if docs:
-        modules = ["benchmarks.eames_like", *STAGES]
-        refresh(ROOT / "docs/light-prior.md", tables, "benchmarks.eames_like", modules=modules)
-        refresh(ROOT / "README.md", {"eames": text}, "benchmarks.eames_like", modules=modules)
+        refresh(ROOT / "docs/light-prior.md", tables)
+        refresh(ROOT / "README.md", {"eames": text})
 
 
 if __name__ == "__main__":

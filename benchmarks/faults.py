@@ -25,7 +25,6 @@ TESTS = {
     "reruns": ["tests/faults/test_reruns.py"],
     "fuzz": ["tests/faults/test_fuzz.py"],
 }
-FUZZED = ["benchmarks.faults", "tests.faults.test_fuzz", "tests.faults.good", "factorlib.images.heif"]
 
 
 class Tried(msgspec.Struct, frozen=True):
@@ -100,8 +99,8 @@ def main(
     print("\n\n".join(found.values()))
     if docs:
         fuzz = {"fuzz": found.pop("fuzz")} if "fuzz" in found else {}
-        refresh(DOCS, found, "benchmarks.faults")
-        refresh(DOCS, fuzz, "benchmarks.faults", modules=FUZZED)  # of the sources of what reads the spoiled files
+        refresh(DOCS, found)
+        refresh(DOCS, fuzz)  # of the sources of what reads the spoiled files
 
 
 if __name__ == "__main__":

@@ -1,8 +1,4 @@
-"""Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`.
-
-Each ends with a line that no reader sees: the command that wrote it, and a hash of that command's sources, or of those of the
-modules that it names.  So `benchmarks.stale` knows which tables are of other sources than those that are here.
-"""
+"""Tables for documentation, and how they get there: between `<!-- begin name -->` and `<!-- end name -->`."""
 
 from __future__ import annotations
 
@@ -16,8 +12,6 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 
 ROOT = Path(__file__).resolve().parents[1]
-WITHOUT_NUMBERS = {"benchmarks.markdown", "studies.report:templates/index.html", "factorlib.images.heif"}
-"""Modules and data that can change no number: the form of tables and pages, and the reader of a kind of photo that none measures."""
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -40,24 +34,18 @@ def replaced(text: str, name: str, inner: str, file: Path | None = None) -> str:
     return pattern.sub(lambda found: f"{found[1]}{inner}\n{found[2]}", text)
 
 
-def refresh(path: Path, parts: dict[str, str], command: str, root: Path = ROOT, modules: Sequence[str] = ()) -> None:
-    """Write each part between its marks in the file, with the stamp of the module `command`, which measured it.
-
-    modules: those that did the measuring, where the command does other things too.
-    """
+def refresh(path: Path, parts: dict[str, str]) -> None:
+    """Write each part between its marks in the file."""
     text = path.read_text(encoding="utf-8")
-    of = f" of {' '.join(modules)}" if modules else ""
-    stamp = f"<!-- written by {command} for sources {sources_hash(*(modules or [command]), root=root)}{of} -->"
     for name, inner in parts.items():
-        text = replaced(text, name, f"{inner}\n{stamp}", path)
+        text = replaced(text, name, inner, path)
     path.write_text(text, encoding="utf-8")
 
 
 def sources_hash(*commands: str, root: Path = ROOT) -> str:
     """Eight digits of a hash of all modules of the project, and their data, that `python -m command` imports, of all commands.
 
-    Comments and docstrings do not count, as for the keys of steps, nor does what stands in
-    WITHOUT_NUMBERS, but for what is named.  Raises InputError where there is no such module.
+    Comments and docstrings do not count, as for the keys of steps.  Raises InputError where there is no such module.
     """
     sources, found = Sources([root], FileHashes(None)), {}
     for command in commands:
@@ -66,5 +54,4 @@ def sources_hash(*commands: str, root: Path = ROOT) -> str:
         package, _, name = module.rpartition(".")
         closure = sources.closure(package, name, root / "pipeline.yaml")
         found |= closure.modules | closure.data
-    found = {name: digest for name, digest in found.items() if name not in WITHOUT_NUMBERS.difference(commands)}
     return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()[:8]

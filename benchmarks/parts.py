@@ -220,7 +220,7 @@ def main(
     tables = as_tables(results)
     print("\n\n".join(tables.values()))
     if docs:
-        refresh(DOCS, tables, "benchmarks.parts")
+        refresh(DOCS, tables)
 
 
 if __name__ == "__main__":

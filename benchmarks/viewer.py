@@ -92,7 +92,7 @@ def main(build: Path) -> None:
     print(times_of)
     if build.name == "eames":
         text = f"{errors_of}\n\nA frame, of {FRAMES}:\n\n{times_of}"
-        refresh(ROOT / "docs/formats.md", {"viewer": text}, "benchmarks.viewer")
+        refresh(ROOT / "docs/formats.md", {"viewer": text})
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from factorlib.runner.project import LIBRARY, Project, photo_sets
 
 DOCS = LIBRARY / "docs" / "studies.md"
 PLACE = "real sets"
-STAGES = [f"stages.{name}" for name in ("masks", "align", "urm", "solve", "export", "render", "evaluate")]
 
 
 def rows_of(name: str, found: Metrics) -> list[list[str]]:
@@ -59,7 +58,7 @@ def main(
     found = table(["set: photo", "DSSIM of the re-synthesis", "of flat colours", "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"], rows)
     print(found)
     if docs:
-        refresh(DOCS, {PLACE: found}, "studies.real", modules=STAGES)
+        refresh(DOCS, {PLACE: found})
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ def main(
     found = table([f"materials × lights ({seeds} worlds, {times + 1} solves of each)", *MEASURES.values()], rows)
     print(found)
     if docs:
-        refresh(DOCS, {PLACE: found}, "studies.rounding")
+        refresh(DOCS, {PLACE: found})
 
 
 if __name__ == "__main__":

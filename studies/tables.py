@@ -1,7 +1,6 @@
 """Studies as tables: `python -m studies.tables [study …] [--quick] [--docs]`; --docs refreshes docs/studies.md.
 
-Runs whatever of the studies must run first, so that every number is of the sources that are here.  `benchmarks.stale` names the tables
-of the page that are of others.  What the page has of a full study stays until there is a full one to replace it: a quick one says less.
+Runs whatever of the studies must run first, so that every number is of the sources that are here.  What the page has of a full study stays until there is a full one to replace it: a quick one says less.
 """
 
 from __future__ import annotations
@@ -111,9 +110,9 @@ def main(
     everything = against_the_paper(conclusions(project_of(QUICK)) | conclusions(project_of(FULL)), page)
     print("\n\n".join([everything, *parts.values()]))
     if docs:
-        refresh(DOCS, {"conclusions": everything}, "studies.tables")
+        refresh(DOCS, {"conclusions": everything})
         for name, part in parts.items() if not quick else [(n, part) for n, part in parts.items() if not is_full(page, n)]:
-            refresh(DOCS, {name: part}, "studies.tables", modules=measuring(STUDIES[name]))
+            refresh(DOCS, {name: part})
 
 
 if __name__ == "__main__":

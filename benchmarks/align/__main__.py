@@ -74,7 +74,7 @@ def publish(tables: dict[str, str], docs: bool) -> None:
     for inner in tables.values():
         print(f"\n{inner}")
     if docs:
-        refresh(ROOT / "docs" / "align.md", tables, "benchmarks.align")
+        refresh(ROOT / "docs" / "align.md", tables)
 
 
 def real_said(row: dict) -> str:

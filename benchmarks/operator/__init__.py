@@ -1,1 +1,1 @@
-"""Time, error, stability and looks of every reflection operator: `python -m benchmarks.operator`, `make bench-operator`."""
+"""Time, error and stability of every reflection operator: `python -m benchmarks.operator`, `make bench-operator`."""

@@ -1,4 +1,4 @@
-"""Time, error and looks of every reflection operator: writes operator.json and figures to build/bench/operator.
+"""Time and error of every reflection operator: writes operator.json and figures to build/bench/operator.
 
 `python -m benchmarks.operator [--docs]`; --docs also refreshes the figures and tables of docs/operator.md.
 """
@@ -16,7 +16,6 @@ from benchmarks.markdown import refresh
 from benchmarks.operator import stability
 from benchmarks.operator.errors import diffuse_errors, gradient_errors, gradients, specular_errors
 from benchmarks.operator.figures import errors_by_input, time_against_error
-from benchmarks.operator.spheres import LIGHT, render, spheres_figure
 from benchmarks.operator.tables import as_tables
 from benchmarks.operator.timing import cuda_rates, microseconds
 from benchmarks.operator.variants import fast_names, of_dtype, variants
@@ -26,7 +25,7 @@ from factorlib.reflection.samples import diffuse_samples, specular_samples
 
 ROOT = Path(__file__).resolve().parents[2]
 TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, "reference": 1e-7}
-FIGURES = ("time_against_error.svg", "errors_by_input.svg", "spheres.svg")
+FIGURES = ("time_against_error.svg", "errors_by_input.svg")
 
 
 def measured(count: int, gradient_count: int = 512) -> dict:
@@ -58,7 +57,6 @@ def bfloat16(specular, diffuse) -> dict:
 
 def main(
     samples: Annotated[int, typer.Option(help="of the reference")] = 16384,
-    light: Annotated[Path, typer.Option(help="lat-long map in which spheres are shown")] = LIGHT,
     docs: Annotated[bool, typer.Option(help="also refresh docs/operator.md and its figures")] = False,
     out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "operator",
 ) -> None:
@@ -68,9 +66,6 @@ def main(
     write_json(out / "operator.json", result)
     (out / FIGURES[0]).write_text(time_against_error(result["operators"]), encoding="utf-8")
     (out / FIGURES[1]).write_text(errors_by_input(result["operators"]), encoding="utf-8")
-    spheres = render(light)
-    write_json(out / "spheres.json", spheres.scores)
-    (out / FIGURES[2]).write_text(spheres_figure(spheres), encoding="utf-8")
     laws = stability.measured()
     write_json(out / "stability.json", laws)
     if docs:
@@ -78,9 +73,9 @@ def main(
         folder.mkdir(exist_ok=True)
         for name in FIGURES:
             shutil.copy(out / name, folder / name)
-        refresh(stability.DOCS, as_tables(result, spheres.scores), "benchmarks.operator")
-        refresh(stability.DOCS, stability.as_tables(laws), "benchmarks.operator.stability")
-    print(f"{out}: operator.json, stability.json, spheres.json, {', '.join(FIGURES)}")
+        refresh(stability.DOCS, as_tables(result))
+        refresh(stability.DOCS, stability.as_tables(laws))
+    print(f"{out}: operator.json, stability.json, {', '.join(FIGURES)}")
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def main(docs: Annotated[bool, typer.Option(help="also refresh the tables in doc
     result = measured()
     print(json_text(result), end="")
     if docs:
-        refresh(DOCS, as_tables(result), "benchmarks.operator.stability")
+        refresh(DOCS, as_tables(result))
 
 
 if __name__ == "__main__":

@@ -10,17 +10,13 @@ QUANTILES = ("median", "p95", "p99", "worst")
 SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}
 
 
-def as_tables(result: dict, scores: dict[str, dict[str, float]]) -> dict[str, str]:
+def as_tables(result: dict) -> dict[str, str]:
     rows = result["operators"]
     return {
         "time": times(rows),
         "errors": errors(rows),
         "gradients": gradients(rows),
         "bfloat16": bfloat16(result["bfloat16"]),
-        "spheres": table(
-            ["PSNR, dB", *next(iter(scores.values()))],
-            [[k.replace("_", " "), *(f"{v:.1f}" for v in row.values())] for k, row in scores.items()],
-        ),
     }
 
 

@@ -80,7 +80,7 @@ def main(
     if docs:
         sizes = [msgspec.json.decode(path.read_bytes(), type=Measured) for path in sorted(FOLDER.glob("*.json"), key=lambda path: int(path.stem))]
         line = worked_out(sizes[-2], sizes[-1]) if len(sizes) > 1 else "(One size was measured; a line needs two.)"
-        refresh(DOCS, {"scale": rows(sizes), "worked out": line}, "benchmarks.scale")
+        refresh(DOCS, {"scale": rows(sizes), "worked out": line})
         return
     folder = FOLDER / "sets" / f"scale-{photos}-{materials}"
     if not (folder / "dataset.yaml").is_file():

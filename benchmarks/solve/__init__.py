@@ -1,1 +1,1 @@
-"""Speed against error of the joint solve, on spheres whose every truth is known."""
+"""Problems of the joint solve whose every truth is known, which tests and studies share."""

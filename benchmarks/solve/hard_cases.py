@@ -216,8 +216,8 @@ CASES: dict[str, Callable[[int], Case]] = {
 
 
 class Bound(msgspec.Struct, frozen=True):
-    """Largest errors of an `Answer`: a quarter more than the worst of four differently trained weights and two seeds of noise each
-    (`python -m benchmarks.solve_spread`).  None: cannot be determined, and is said."""
+    """Largest errors of an `Answer`: a quarter more than the worst of four differently trained weights and two seeds of noise each.
+    None: cannot be determined, and is said."""
 
     k: float | None
     roughness: float | None

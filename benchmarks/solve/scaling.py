@@ -1,7 +1,5 @@
-"""Time of the solver of few lobes against the filled entries of the matrix: n × n, from 9 entries to 1600.
-
-Small spheres (`PIXELS`² pixels each) rendered by the operator that solves them, under random lights of `LOBES` lobes, so
-that only size grows.  The exponent is the slope of log time over log entries, by least squares.
+"""Problems that differ in size alone: n materials in n lights, each pair a small sphere (`PIXELS`² pixels), rendered by the operator
+that solves them, under random lights of `LOBES` lobes.
 """
 
 from __future__ import annotations
@@ -9,54 +7,16 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from benchmarks.solve.clock import Clock
-from benchmarks.solve.workers import threaded
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
-from factorlib.model.problem import JointProblem
-from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
-from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.observations import Observations
 
 PIXELS, LOBES = 12, 6
-SIDES = (3, 5, 10, 20, 40)
-OPTIONS = FewLobes(lobes=12, insert=6, rounds=3, tolerance=1e-3)
-
-
-def run(sides=SIDES, limit_s: float = 600.0) -> dict:
-    """{"entries": {n²: {"wall", "processor"}}, "exponent": {…}}; no side is begun once `limit_s` of wall time are spent."""
-    taken, clock = {}, Clock()
-    for n in sides:
-        if clock.taken().wall < limit_s:
-            taken[str(n * n)] = msgspec.to_builtins(timed(n))
-    return {"entries": taken, "exponent": {kind: exponent({int(k): v[kind] for k, v in taken.items()}) for kind in ("wall", "processor")}}
-
-
-def timed(n: int):
-    operator = reflection_operator("network")
-    joint = JointProblem(problem(n, operator), operator, spread=threaded)
-    clock = Clock()
-    few_lobes(joint, from_nothing(n), Run(OPTIONS))
-    return clock.taken()
-
-
-def exponent(seconds: dict[int, float]) -> float | None:
-    """Slope of log seconds over log entries.
-
-    >>> round(exponent({10: 3.0, 100: 30.0, 1000: 300.0}), 6)
-    1.0
-    """
-    if len(seconds) < 2:
-        return None
-    return float(np.polyfit(np.log(list(seconds)), np.log(list(seconds.values())), 1)[0])
 
 
 def problem(n: int, operator: Operator, seed: int = 0) -> list[Block]:

@@ -4,7 +4,7 @@ The function is run once with a `Value` in place of each tensor, and its operati
 `Tape.gradient` goes backward over the tape and records the derivatives in the same way (reverse mode).  `Tape.c_code` writes the
 operations that given results need as C statements on floats, one a line.
 
-Why not a generator that exists (numbers by `python -m benchmarks.operator.generators`, processor time of one core)?
+Why not a generator that exists (processor time of one core, measured for version 0.1.0)?
 
 - SymPy derives symbolically, without sharing.  The diffuse part has 376 operations here, derived in .01 s, and 520 by SymPy after 1.8 s;
   the specular part 1,914 in .04 s, and SymPy had not finished after 60 s.

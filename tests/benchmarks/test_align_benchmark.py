@@ -83,7 +83,7 @@ def test_tables_have_their_place(tmp_path):
     assert "| exact, all | 5 of 5 |" in tables["success"] and "| all | 4 of 4 |" in tables["flags"]
     page = tmp_path / "align.md"
     page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
-    refresh(page, tables, "benchmarks.align")
+    refresh(page, tables)
     assert all(inner in page.read_text(encoding="utf-8") for inner in tables.values())
 
 
@@ -131,7 +131,7 @@ def test_a_real_photo_is_aligned_with_its_cameras_withheld(tmp_path):
     assert "| set object | 1 |" in tables["real-sets"] and f"| set, {made.name} |" in tables["real-photos"]
     page = tmp_path / "align.md"
     page.write_text(DOCS.read_text(encoding="utf-8"), encoding="utf-8")
-    refresh(page, tables, "benchmarks.align")
+    refresh(page, tables)
 
 
 def test_a_folder_without_reference_poses_is_refused(tmp_path):

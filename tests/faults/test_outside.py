@@ -23,9 +23,9 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.recipe.read import read_recipe
 from factorlib.runner import verbs
+from factorlib.runner.display import printable
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.runner.survey import survey
-from factorlib.runner.terminal import printable
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
 from tests.faults.good import DATASET, SOURCES, TRUTH, edited, make_set, put

@@ -10,8 +10,7 @@ import yaml
 
 from factorlib.errors import InputError
 from factorlib.reading import path_inside, read_text, reading
-from factorlib.yamlfile import read_yaml
-from factorlib.yamltext import plain_value
+from factorlib.yamlfile import parse_yaml, read_yaml
 
 
 @pytest.mark.parametrize(
@@ -71,4 +70,4 @@ GOOD = ["a: &x 1\nb: [*x, *x]", "a: !!str 5\nb: !!float 5", "", "---\na: 1\n...\
 
 @pytest.mark.parametrize("text", GOOD)
 def test_yaml_that_is_good_is_read_as_by_pyyaml(text):
-    assert plain_value(text, "x.yaml") == yaml.safe_load(text)
+    assert parse_yaml(text, "x.yaml") == yaml.safe_load(text)

@@ -102,7 +102,7 @@ def test_what_is_kept_is_what_is_asked_for():
 
 
 def test_the_readme_quotes_what_is_stored():
-    from benchmarks.stale import ROOT
+    from benchmarks.markdown import ROOT
 
     assert quoted(read_stored()) in (ROOT / "README.md").read_text(encoding="utf-8")
     assert "roughness is wrong by .010 (.009 to .013)" in quoted(FIVE)

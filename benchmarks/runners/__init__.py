@@ -1,1 +1,0 @@
-"""A run with nothing to do, a plan and a status, timed beside DVC and Snakemake on one and the same graph."""
