@@ -293,6 +293,16 @@ BAD = {
     "mesh of unknown material": (("meshes", "vase", "material"), "wite", "meshes.vase.material", "did you mean 'white'"),
     "part of unknown material": (("meshes", "chair", "parts", "legs"), "woof", "meshes.chair.parts.legs", "did you mean 'wood'"),
     "truth outside": (("truth",), "../truth.yaml", "truth", "outside the dataset"),
+    "focal of no camera": ((*P0, "camera"), {"focal_px": 1e300}, "photos[0].camera.focal_px", "1e+300"),
+    "focal of a hundredth": ((*P0, "camera"), {"focal_px": 0.01}, "photos[0].camera.focal_px", ".01"),
+    "centre far outside": ((*P0, "camera"), {"principal_point": [1e9, 0.0]}, "photos[0].camera.principal_point", "1e+09"),
+    "pose beyond all": (
+        (*O0, "pose"),
+        {"rotation": TURN, "translation": [0, 0, 1e300]},
+        "photos[0].objects[0].pose.translation[2]",
+        "1e+300",
+    ),
+    "turn beyond all": ((*P0, "world_from_camera"), [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]], "photos[0].world_from_camera[0][0]", "1e+300"),
 }
 
 

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import time
 
 import numpy as np
 import pycolmap
@@ -12,8 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.align.external_camera import focal_and_centre
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import ExternalCamera
+from factorlib.dataset.schema import CameraSource, DatasetFile, ExternalCamera, PhotoEntry
 from factorlib.dataset.slices import dataset_slice
+from factorlib.dataset.sources.external import matched
+from factorlib.dataset.sources.shot import Shot
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 
@@ -423,3 +426,22 @@ def test_another_picture_is_refused(external, width, height, words):
     with pytest.raises(InputError, match=words) as caught:
         focal_and_centre(external, width, height, "hall")
     assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure
+
+
+def test_thousands_of_photos_find_their_images_in_a_moment():
+    photos = [PhotoEntry(name=f"p{i}", image=f"photos/p{i}.png", masks="m.png") for i in range(5000)]
+    shots = [Shot(image=f"images/p{i}.jpg", camera=None, size=None, key="") for i in range(5000)]
+    began = time.process_time()
+    found = matched(DatasetFile(1, [], photos, cameras=CameraSource()), "colmap", shots, None)
+    assert [shot.image for shot in found.values()] == [shot.image for shot in shots]
+    assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("key", ["scale", "mesh_unit_mm"])
+@pytest.mark.parametrize("number", [1e300, 1e-300], ids=["huge", "tiny"])
+def test_a_unit_that_no_mesh_has_is_refused(folder, key, number):
+    of_source = {"transforms": "t.json", "world_from_object": {"chair": {"scale": number}}}, {"bop": ".", "mesh_unit_mm": number}
+    (folder / "t.json").write_text("{}")
+    with pytest.raises(InputError) as caught:
+        read_dataset(write(folder, of_source[key != "scale"]))
+    assert caught.value.key.endswith(key)

@@ -13,7 +13,7 @@ from factorlib.disk import disk_error
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY
 from tests.runner import toy
-from tests.runner.toy import make_project, write
+from tests.runner.toy import files_of, make_project, write
 
 LARGE = "(out / 'large.bin').write_bytes(bytes(200_000))\n    (out /"
 STRANGE = "raise RuntimeError('a library: I/O error: No space left on device (os error 28)')\n    (out /"
@@ -113,6 +113,22 @@ def test_a_disk_that_is_full_before_the_run_begins(project, disk, monkeypatch):
     disk.fill(but=0)
     said = run_as_command(project, monkeypatch, "all", "--dataset", "set")
     assert said.startswith("error: ") and "the disk is full" in said and said_well(said)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("free", range(0, 400_000, 40_000))
+def test_wherever_the_disk_becomes_full_the_next_run_ends_in_the_same_bytes(project, disk, monkeypatch, free):
+    disk.fill(but=free)
+    said = run_as_command(project, monkeypatch, "all", "--dataset", "set")
+    assert said in ("0", "1") or said_well(said)
+    assert verbs.verify(project, None) == 0, "something cut was kept"
+    (disk.folder / "ballast").unlink()
+    assert make(project) == 0 and verbs.verify(project, None) == 0
+    found = files_of(project.build / "set" / "table") | files_of(project.build / "set" / "upper")
+    whole = make_project(project.root.parent / "whole")
+    write(whole.root / "stages" / "table.py", toy.TABLE.replace("(out /", LARGE, 1))
+    assert make(whole) == 0
+    assert found == files_of(whole.build / "set" / "table") | files_of(whole.build / "set" / "upper")
 
 
 def test_a_read_only_build_shows_everything_and_runs_nothing(project, disk, monkeypatch):

@@ -1,6 +1,7 @@
 """Masks: every way to give one means the same labels, and what is doubtful is refused by name."""
 
 import json
+import time
 from itertools import groupby
 
 import numpy as np
@@ -256,3 +257,20 @@ def test_bad_object_masks(tmp_path, second, said):
     with pytest.raises(InputError, match=said) as caught:
         objects(tmp_path, masks)
     assert "b.png" in str(caught.value) and "photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
+
+
+# ---- limits ----------------------------------------------------------------------------------------------------
+
+
+def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):
+    """Pillow's own limit warns, with a line of its source, at 89 megapixels, and refuses at 179."""
+    Image.fromarray(np.ones((14_000, 14_000), bool)).save(tmp_path / "mask.png")
+    with pytest.raises(InputError, match="the mask is 14000 × 14000"):
+        read_labels("mask.png", lambda name: tmp_path / name, MATERIALS, (10, 10), "photo.png")
+    assert not recwarn.list
+
+
+def test_compressed_run_lengths_of_millions_are_read_in_their_own_time():
+    began = time.process_time()
+    assert len(decompress("10" * 500_000)) == 1_000_000
+    assert time.process_time() - began < 10

@@ -206,3 +206,8 @@ def test_a_mask_of_specks_that_averaging_loses_is_refused(folder):
     Image.fromarray(specks).save(folder / "in" / "mask.png")
     with pytest.raises(InputError, match="specks"):
         run(folder, params=masks.Params(frame=100))
+
+
+def test_the_largest_photo_is_a_parameter(folder):
+    with pytest.raises(InputError, match=r"megapixels; at most 0\.0001"):
+        run(folder, params=masks.Params(most_megapixels=0.0001))
