@@ -106,8 +106,11 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
             towards = part.by_photo.T @ J
             L[photos, own] += towards
             L[own, photos] += towards.T
-        if scores is not None:
-            _add_scores(scores, clusters[part.rows], part, J, at, slice(k + own.start, k + own.stop), k + 3 * p)
+        if scores is not None:  # a cluster's sum of slopes, each times its residual
+            summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
+            scores[:, at] += summing @ part.by_material
+            scores[:, k + own.start : k + own.stop] += summing @ J
+            scores[:, k + 3 * p :] += summing @ part.by_photo
     loss, by_light = float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum()), np.zeros(size)
     value += loss / T
     if materials_given:
@@ -145,22 +148,6 @@ def _of_determinant(
     many = len(spread) / max(len(few[0]), 1)
     hessian = np.array([[float(np.vdot(a @ covariance, b)) for b in few] for a in few])
     return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
-
-
-def _add_scores(
-    scores: Float[np.ndarray, "g s"],
-    cluster: Int[np.ndarray, " n"],
-    part: Linearised,
-    J: Float[np.ndarray, "n p"],
-    at: Int[np.ndarray, "3"],
-    own: slice,
-    photos: int,
-) -> None:
-    np.add.at(scores, (cluster[:, None], at[None]), part.by_material * part.residual[:, None])
-    for g in np.unique(cluster):
-        rows = cluster == g
-        scores[g, own] += J[rows].T @ part.residual[rows]
-        scores[g, photos:] += part.by_photo[rows].T @ part.residual[rows]
 
 
 class Inverse(NamedTuple):

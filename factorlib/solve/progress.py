@@ -9,8 +9,8 @@ from factorlib.solve.options import Choices
 from factorlib.solve.paper import REPORTS
 
 Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
-PARTS = 6  # of the joint solve without splittings: three models, tone curves, materials, lights
-POINTS = 30  # of a part: about as many as are tried
+PHASES = ("no shadows", "shadows", "shadows and bounces", "tone curves", "materials and lights")  # then splittings, and lights
+POINTS = 30  # of a phase: about as many as are tried
 
 
 def of_subsets(progress: Progress) -> Report:
@@ -30,12 +30,16 @@ def of_rounds(progress: Progress, rounds: int) -> Report:
 
 
 def of_parts(progress: Progress, choices: Choices) -> Report:
-    """The progress of the joint solve."""
+    """The progress of the joint solve, which never goes back: where there are several starts, a phase is entered several times."""
+    total, furthest = len(PHASES) + choices.splittings + 1, 0.0
 
     def report(event: Event) -> None:
-        """Say how many of all parts are done."""
-        done = event.round + min(event.iteration / POINTS, 1.0)
-        total = PARTS + choices.splittings
-        progress(min(done, total - 0.01), total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
+        """Say how many of all phases are done."""
+        nonlocal furthest
+        splitting = event.phase.removeprefix("splitting ")
+        phase = PHASES.index(event.phase) if event.phase in PHASES else len(PHASES) + int(splitting) - 1 if splitting.isdigit() else total - 1
+        within = 1.0 if event.iteration < 0 else min(event.iteration / POINTS, 1.0)
+        furthest = min(max(furthest, phase + within), total - 0.01)
+        progress(furthest, total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
 
     return report

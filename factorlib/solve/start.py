@@ -30,7 +30,9 @@ def starting_point(
     return Point(materials, [constant_light(block, materials, cells) for block in blocks])
 
 
-def starting_materials(blocks: Sequence[Block], count: int, specular_share: float, roughness: float) -> Materials:
+def starting_materials(
+    blocks: Sequence[Block], count: int, specular_share: float = SPECULAR_SHARE, roughness: float = ROUGHNESS
+) -> Materials:
     """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - specular_share), 10 * LEAST_REFLECTANCE)

@@ -28,7 +28,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Start
-from factorlib.solve.start import LEAST_RADIANCE, constant_light, mean_albedo, starting_point
+from factorlib.solve.start import LEAST_RADIANCE, constant_light, mean_albedo, starting_materials
 
 log = logging.getLogger("factorlib.solve")
 
@@ -48,66 +48,67 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
     """The point from which a solve starts."""
-    blocks, point = problem.blocks, starting_point(problem.blocks, len(names), cells)
-    albedo, rows = mean_albedo(blocks, len(names)), point.materials.rows()
-    shown = {int(m) for block in blocks for m in np.unique(block.material)}
-    factors: dict[int, np.ndarray] = {}
-    for component in sorted(set(earlier.table.gauge.component.values())):
-        members = [m for m, name in enumerate(names) if earlier.table.gauge.component.get(name) == component]
-        seen = [m for m in members if m in shown] or members
-        if not members:
-            continue
-        whole = np.array([_whole(earlier, names[m]) for m in seen])
-        factors[component] = np.exp(np.mean(np.log(albedo[seen]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
-        for m in members:
-            known = earlier.table.materials[names[m]]
-            rows[m] = [*(known.diffuse * factors[component]), *(known.specular * factors[component]), known.roughness]
-    materials = Materials.of_vector(rows.reshape(-1))
-    lights = [_light(problem, block, earlier, names, factors, materials, cells) for block in blocks]
+    blocks = problem.blocks
+    start = starting_materials(blocks, len(names))
+    component = [earlier.table.gauge.component.get(name) for name in names]
+    factors = gauge_factors(earlier, names, component, mean_albedo(blocks, len(names)), blocks)
+    rows = start.rows()
+    for m, name in enumerate(names):
+        if component[m] is not None:
+            known = earlier.table.materials[name]
+            rows[m] = [*(known.diffuse * factors[component[m]]), *(known.specular * factors[component[m]]), known.roughness]
+    materials, lights = Materials.of_vector(rows.reshape(-1)), []
+    for block in blocks:
+        constant = constant_light(block, materials, cells)
+        shown = [component[m] for m in np.unique(block.material) if component[m] is not None]
+        light = known_light(block, constant, earlier, factors[max(set(shown), key=lambda c: (shown.count(c), -c))]) if shown else None
+        lights.append(better_one(problem, block, materials, light, constant))
     return Point(materials, lights)
 
 
-def _whole(earlier: Earlier, name: str) -> Float[np.ndarray, "3"]:
-    known = earlier.table.materials[name]
-    return np.array(known.diffuse) + np.array(known.specular)
+def gauge_factors(
+    earlier: Earlier, names: Sequence[str], component: Sequence[int | None], albedo: Float[np.ndarray, "m 3"], blocks: Sequence[Block]
+) -> dict[int, Float[np.ndarray, "3"]]:
+    """By component of the earlier solution, the factor that brings its reflectances to the scale of `albedo`: over those of its materials that
+    are shown, or over all where none is."""
+    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    for c in sorted({c for c in component if c is not None}):
+        members = [m for m in range(len(names)) if component[m] == c]
+        members = [m for m in members if m in shown] or members
+        known = [earlier.table.materials[names[m]] for m in members]
+        whole = np.array([np.array(one.diffuse) + np.array(one.specular) for one in known])
+        factors[c] = np.exp(np.mean(np.log(albedo[members]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
+    return factors
 
 
-def _light(
-    problem: JointProblem,
-    block: Block,
-    earlier: Earlier,
-    names: Sequence[str],
-    factors: dict[int, np.ndarray],
-    materials: Materials,
-    cells: int,
-) -> Light:
-    """The earlier light of a block in the block's unit and the start's gauge, or a constant one."""
-    constant = constant_light(block, materials, cells)
-    components = [earlier.table.gauge.component.get(names[m], -1) for m in np.unique(block.material)]
-    known, lobes = [c for c in components if c in factors], earlier.lights.get(block.name)
+def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light | None:
+    """The earlier light of a block in the block's unit and the start's gauge; None where there is none.
+
+    A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
+    """
+    lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
-    if not known or not lobes or np.isnan(exposure).all():
-        return constant
-    factor = factors[max(set(known), key=lambda c: (known.count(c), -c))]
+    if not lobes or np.isnan(exposure).all():
+        return None
     new = np.isnan(exposure)
     level = np.mean(exposure[~new] - constant.log_exposure[~new])
     exposure = np.where(new, constant.log_exposure + level, exposure)
     tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
-    light = Light(
+    return Light(
         lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
         np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
         np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
     )
-    loss = [_loss(problem, block, one, materials) for one in (light, constant)]
+
+
+def better_one(problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light) -> Light:
+    """The known light, unless the constant one explains the block better."""
+    if known is None:
+        return constant
+    loss = [Illumination(block, one, materials, problem.operator).losses(problem.loss).mean() for one in (known, constant)]
     if loss[0] <= loss[1]:
-        return light
-    log.warning(
-        "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light", block.name
-    )
+        return known
+    log.warning("illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light", block.name)
     return constant
-
-
-def _loss(problem: JointProblem, block: Block, light: Light, materials: Materials) -> float:
-    return float(Illumination(block, light, materials, problem.operator).losses(problem.loss).mean())
