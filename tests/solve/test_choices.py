@@ -250,6 +250,13 @@ def test_nothing_is_decided_where_nothing_is_held_out(curved):
     assert not any(one.kept for one in found.tone) and found.splitting == []
 
 
+def test_without_held_out_observations_shadows_stay_and_bounces_are_left_out(lit):
+    """Both would be judged by the observations that they were fitted to, which more always explains better."""
+    found = solved([block.with_none_held_out() for block in lit], QUICK, cells=24, observations=100)
+    assert found.shadows.kept and found.shadows.margin is None
+    assert not found.interreflection.kept and found.interreflection.margin is None
+
+
 def test_models_are_compared_on_few_observations_of_each_material(curved):
     sample = sample_of(JointProblem(curved, OPERATOR), Choices(observations=50))
     for block, whole in zip(sample.blocks, curved, strict=True):

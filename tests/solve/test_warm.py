@@ -83,6 +83,17 @@ def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
         np.testing.assert_allclose(light.axis, before.axis, atol=1e-12)
 
 
+def test_cells_that_split_stay_as_small_as_they_are():
+    """A cell of 400 that splits three times has λ = 8,149; a wider one of the same weight would be brighter."""
+    (block,), (light,) = truth(0)
+    for _ in range(6):
+        light = light.split(np.arange(len(light)) >= len(light) - 2)
+    assert light.sharpness.max() > 10_000
+    shown = msgspec.structs.replace(block, radiance=Illumination(block, light, MATERIALS, OPERATOR).radiance())
+    _, (found,) = start_from(written([shown], MATERIALS, [light]), [shown])
+    np.testing.assert_allclose(found.sharpness, light.sharpness, rtol=1e-12)
+
+
 def test_materials_go_by_their_names():
     blocks, lights = truth(0)
     swapped = Materials(*(getattr(MATERIALS, f)[[2, 0, 1]] for f in MATERIALS.__struct_fields__))
