@@ -4,25 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
-from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light, UnitLobes
-from factorlib.reflection import reflection_operator
+from factorlib.model.lights import UnitLobes
 from factorlib.solve.few_lobes.jacobian import with_light
 from factorlib.solve.few_lobes.unknowns import joined
+from tests.model.made import clipped_photos
 
-OPERATOR = reflection_operator("closed_form", dtype="float64")
+
 @pytest.fixture(scope="module", params=["linear", "toned"])
 def given(request):
-    rng = np.random.default_rng(1)
-    true = random_light(rng, 5, photos=2)
-    data = block("room", true, MATERIALS, [0, 1, 2], OPERATOR, size=16)
-    clipped = data.radiance > np.quantile(data.radiance, 0.9)
-    data = msgspec.structs.replace(data, clipped=clipped, radiance=np.minimum(data.radiance, 2.0))
-    guess = random_light(rng, 4, photos=2)
-    tone = np.log([1.3, 0.8]) if request.param == "toned" else np.zeros(0)
-    light = Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone)
-    return Illumination(data, light, MATERIALS, OPERATOR)
+    return clipped_photos(request.param == "toned")
 
 
 def test_radiance_is_linear_in_light(given):

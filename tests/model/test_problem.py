@@ -4,21 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.gauge import in_gauge
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
-from factorlib.model.problem import JointProblem
-from factorlib.reflection import reflection_operator
+from tests.model.made import three_rooms
 
-OPERATOR = reflection_operator("closed_form", dtype="float64")
+
 @pytest.fixture(scope="module")
 def given():
-    rng = np.random.default_rng(4)
-    lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)]
-    guess = [random_light(rng, 4) for _ in range(3)]
-    return JointProblem(blocks, OPERATOR), Point(MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess])
+    return three_rooms()
 
 
 def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one(given):

@@ -4,31 +4,23 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
+from benchmarks.solve.problems import MATERIALS
 from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.jacobian import fit_loss, with_light
 from factorlib.solve.few_lobes.normal_equations import energy_equations, normal_equations
 from factorlib.solve.few_lobes.responses import responses
 from factorlib.solve.few_lobes.weights import fitted_illumination
+from tests.model.made import OPERATOR, bounced_photos
 
-OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=3.0, prior=0.0)
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])
 def given(request):
-    """Observations of two photos in a light fixed to the world, half of them reached by light from other surfaces, and a wrong light."""
-    rng = np.random.default_rng(1)
-    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=14)
-    data = msgspec.structs.replace(data, bounced=rng.random((len(data), 6)) * (rng.random((len(data), 1)) < 0.5))
-    guess = random_light(rng, 4, photos=2)
-    tone = np.log([1.3, 0.8]) if request.param == "toned" else np.zeros(0)
-    return Illumination(data, Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone), MATERIALS, OPERATOR)
+    return bounced_photos(request.param == "toned")
 
 
 def moved_light(given, step):

@@ -4,10 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
-from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.iterate import evaluate
@@ -15,18 +13,14 @@ from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.few_lobes.step import damped_step
+from tests.model.made import three_rooms
 
-OPERATOR = reflection_operator("closed_form", dtype="float64")
 ORDER = [2, 0, 1]  # material k of the permuted problem is material ORDER[k] of the other
 
 
 @pytest.fixture(scope="module")
 def given():
-    rng = np.random.default_rng(4)
-    lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)]
-    guess = [random_light(rng, 4) for _ in range(3)]
-    return JointProblem(blocks, OPERATOR), Point(MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess])
+    return three_rooms()
 
 
 def with_materials_permuted(problem, point):
