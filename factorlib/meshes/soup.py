@@ -77,6 +77,7 @@ def check(soup: Soup, file: str | Path) -> Soup:
     place that leaves no digits for the shape."""
 
     def refuse(found: str, cure: str) -> None:
+        """Raise the error that names this file."""
         raise InputError(found, file=file, cure=cure)
 
     if len(soup.faces) == 0:

@@ -46,7 +46,7 @@ class Block(msgspec.Struct, frozen=True):
         return len(self.material)
 
     def take(self, rows: np.ndarray | slice) -> Block:
-        """The observations `rows` (numbers or a mask) alone."""
+        """Return the observations `rows` (numbers or a mask) alone."""
         further = {name: getattr(self, name) for name in ("visibility", "bounced", "confidence")}
         kept = {name: None if values is None else values[rows] for name, values in further.items()}
         return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, **kept)

@@ -33,7 +33,7 @@ from factorlib.reflection.operator import Operator
 
 
 class Shown(NamedTuple):
-    """What n observations should show.
+    """The model says that n observations should show this.
 
     diffuse, specular   the factors of k_d and k_s in ℓ;  radiance  y
     responses           material, its rows, its responses; empty where the operator itself was asked
@@ -83,7 +83,7 @@ class Illumination(msgspec.Struct, frozen=True):
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
-        """The factor of each observation's photo on the light."""
+        """Return the exposure of each observation's photo: a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
     def shown(self) -> Shown:

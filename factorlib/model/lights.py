@@ -71,7 +71,7 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def unit_lobes(self) -> UnitLobes:
-        """The lobes without their weights."""
+        """Return the lobes without their weights."""
         return UnitLobes(self.axis, self.sharpness)
 
     @property
@@ -99,7 +99,7 @@ class Light(msgspec.Struct, frozen=True):
         return 3 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
 
     def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
-        """The same cells with other radiances."""
+        """Return the same cells with other radiances."""
         return msgspec.structs.replace(self, weight=(self.peaks * np.exp(u)).T)
 
     def split(self, which: Bool[np.ndarray, " p"]) -> Light:

@@ -39,14 +39,14 @@ Report = Callable[[str, Fit], Callable[[float], None]]  # by what is done, and i
 
 
 class Effects(msgspec.Struct, frozen=True):
-    """The fit of the chosen model on few observations, and the evidence for its parts."""
+    """Which effects were chosen: the evidence for them, and the fit of the chosen model on few observations."""
 
     fit: Fit
     shadows: Evidence
     bounces: Evidence
 
     def of(self, problem: JointProblem) -> JointProblem:
-        """The problem with what was chosen."""
+        """Return the problem with the effects that were chosen."""
         return problem.with_effects(self.shadows.kept, self.bounces.kept)
 
 
@@ -73,7 +73,7 @@ def effects_chosen(
     tried: dict[tuple[bool, bool], Trial] = {}
 
     def trial(with_shadows: bool, with_bounces: bool) -> Trial:
-        """The best fit of one model."""
+        """Fit one model from each start, once, and return the best fit."""
         if (with_shadows, with_bounces) not in tried:
             name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
             model = sample.with_effects(with_shadows, with_bounces)

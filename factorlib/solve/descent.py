@@ -75,7 +75,7 @@ class Descent(msgspec.Struct, frozen=True):
         return state
 
     def at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool) -> State:
-        """The state at materials; materials_given: as of `marginal`."""
+        """Compute the systems of all lights at some materials; `marginal` says what `materials_given` means."""
         materials = materials_of(theta)
         fields = [
             msgspec.structs.replace(f, illumination=msgspec.structs.replace(f.illumination, materials=materials)) for f in fields
@@ -127,7 +127,7 @@ def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
 
 
 def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
-    """The matrix with its diagonal 1 + damping times as large, and positive."""
+    """Return the matrix with its diagonal made 1 + damping times as large, and positive."""
     diagonal = np.diag(hessian)
     floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
     return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)

@@ -119,14 +119,14 @@ def _point_of(state: State, start: Materials, free: Bool[np.ndarray, "m 7"]) -> 
 
 
 def field_of(illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False) -> Field:
-    """The illumination with its table, and how much it and the prior count."""
+    """Give an illumination its table of responses, and say how much its observations and the prior count."""
     table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
     precision, log_determinant = prior.precision(illumination.light.axis, one.factors)
     return Field(msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST)
 
 
 def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
-    """The field with other hyperparameters."""
+    """Return the field as other hyperparameters weight it."""
     precision, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
     return msgspec.structs.replace(field, precision=precision, log_determinant=log_determinant, temperature=one.temperature)
 
@@ -175,10 +175,10 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
 
 
 def all_free(fit: Fit) -> Bool[np.ndarray, "m 7"]:
-    """Every unknown of the materials."""
+    """Let every unknown of the materials change."""
     return np.ones((len(fit.point.materials), 7), bool)
 
 
 def start_of(point: Point, hyperparameters: Sequence[Hyperparameters] | None = None) -> Fit:
-    """A point before any descent."""
+    """Return the fit that a point is before any descent."""
     return Fit(point, list(hyperparameters or [Hyperparameters() for _ in point.lights]))

@@ -151,7 +151,7 @@ def _of_determinant(
 
 
 class Inverse(NamedTuple):
-    """The inverse of a matrix, and the log of the matrix's determinant."""
+    """What `positive_definite_inverse` returns: the inverse, and the log of the determinant of the matrix itself."""
 
     matrix: Float[np.ndarray, "n n"]
     log_determinant: float

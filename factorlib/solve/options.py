@@ -11,7 +11,7 @@ Seed = Annotated[int, Meta(ge=0)]
 
 
 class Choices(Struct, frozen=True):
-    """What of the solver a user may choose."""
+    """A user may choose these of the solver."""
 
     cells: Annotated[int, Meta(ge=12, le=1600)] = 400
     """Cells of a light before any of them splits; 400 are 10° apart."""

@@ -58,7 +58,7 @@ class Run(msgspec.Struct, frozen=True):
 
 
 class Split(msgspec.Struct, frozen=True):
-    """The fit after splittings, and the evidence for each."""
+    """What splitting led to: the fit, and the evidence for each splitting."""
 
     fit: Fit
     evidence: list[Evidence]
@@ -145,7 +145,7 @@ def brightest(light: Light) -> Bool[np.ndarray, " p"]:
 
 
 def on_cells(light: Light, count: int) -> Light:
-    """The light on `count` cells of one size."""
+    """Return the light on `count` cells of one size."""
     cells = even_cells(count)
     radiance = Lobes(light.axis, light.sharpness, light.weight).radiance(cells.axis)
     lobes = msgspec.structs.replace(light, axis=cells.axis, log_sharpness=np.log(cells.sharpness), weight=radiance)
@@ -153,7 +153,7 @@ def on_cells(light: Light, count: int) -> Light:
 
 
 class Happened(msgspec.Struct, frozen=True):
-    """The events of a part."""
+    """The journal keeps the events of a part in this form."""
 
     events: list[Event]
 
@@ -176,7 +176,7 @@ class Told:
         return self.journal.keep(name, value)
 
     def __call__(self, phase: str, start: Fit) -> Callable[[float], None]:
-        """What to call with the mean robust loss of each point of a fit."""
+        """Return the function that a fit calls with the mean robust loss of each point."""
         number, iteration, cells = (self.history[-1].round + 1 if self.history else 0), 0, sum(map(len, start.point.lights))
 
         def tell(loss: float) -> None:

@@ -39,7 +39,7 @@ def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
 
 
 def with_decided(choices: Choices, earlier: Earlier) -> Choices:
-    """The choices, with shadows and bounces as they were decided before, where the two had been compared."""
+    """Return the choices with shadows and bounces as they were decided before, where the two had been compared."""
     for name in ("self_shadowing", "interreflection"):
         if getattr(choices, name) == "auto" and getattr(earlier, name):
             choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
@@ -47,7 +47,7 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
-    """The point from which a solve starts."""
+    """Build the point from which a solve starts."""
     blocks = problem.blocks
     start = starting_materials(blocks, len(names))
     component = [earlier.table.gauge.component.get(name) for name in names]
@@ -69,8 +69,10 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
 def gauge_factors(
     earlier: Earlier, names: Sequence[str], component: Sequence[int | None], albedo: Float[np.ndarray, "m 3"], blocks: Sequence[Block]
 ) -> dict[int, Float[np.ndarray, "3"]]:
-    """By component of the earlier solution, the factor that brings its reflectances to the scale of `albedo`: over those of its materials that
-    are shown, or over all where none is."""
+    """Find, for each component of the earlier solution, the factor per channel that brings its reflectances to the scale of `albedo`.
+
+    The factor is the geometric mean over the component's materials that a block shows, or over all of them where none is shown.
+    """
     shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
     for c in sorted({c for c in component if c is not None}):
         members = [m for m in range(len(names)) if component[m] == c]
@@ -82,7 +84,7 @@ def gauge_factors(
 
 
 def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light | None:
-    """The earlier light of a block in the block's unit and the start's gauge; None where there is none.
+    """Bring the earlier light of a block to the block's unit and the start's gauge; None where there is none.
 
     A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
     """
@@ -104,7 +106,7 @@ def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[n
 
 
 def better_one(problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light) -> Light:
-    """The known light, unless the constant one explains the block better."""
+    """Return the known light, unless the constant one explains the block better."""
     if known is None:
         return constant
     loss = [Illumination(block, one, materials, problem.operator).losses(problem.loss).mean() for one in (known, constant)]
