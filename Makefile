@@ -41,6 +41,8 @@ test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
 bench-%: .venv/ready
+	@name="$${GOAL#bench-}"; test -e "benchmarks/$$name.py" || test -e "benchmarks/$$name/__main__.py" || \
+	  { echo "error: there is no benchmark '$$name'; make help names them, and make studies the experiments" >&2; exit 2; }
 	@OMP_NUM_THREADS=1 $(PY) -m "benchmarks.$${GOAL#bench-}"
 
 # each reads STUDY, QUICK and FORCE from the environment

@@ -7,6 +7,7 @@ whose worker or child dies is tried again, on its own: nothing else is lost.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import os
@@ -163,12 +164,26 @@ def _client(scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     try:
+        asyncio.run(_answered(scheduler))
         client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
-        raise InputError(f"no Dask scheduler answers at {scheduler} ({error})", key="scheduler", cure=cure) from error
+        said = str(error) or f"nothing in {PATIENCE} s"
+        raise InputError(f"no Dask scheduler answers at {scheduler} ({said})", key="scheduler", cure=cure) from error
     with client:
         yield client
+
+
+async def _answered(scheduler: str) -> None:
+    """Ask what listens there who it is; TimeoutError where it says nothing in time, for which a client would wait without end."""
+    from distributed.core import rpc
+    from distributed.security import Security
+
+    remote = rpc(scheduler, timeout=PATIENCE, connection_args=Security().get_connection_args("client"))
+    try:
+        await asyncio.wait_for(remote.identity(), PATIENCE)
+    finally:
+        await remote.close_rpc()
 
 
 def _known(asked: Future) -> Future:

@@ -1,11 +1,14 @@
 """Runs on a real Dask cluster: worker processes of their own over TCP, some of them killed; the bytes are those of a run without one."""
 
+import contextlib
 import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -344,6 +347,28 @@ def test_a_scheduler_that_does_not_answer_is_named(project, monkeypatch):
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9") as refused:
         verbs.make(project, verbs.Wish("set", settings=["executor=dask", "scheduler=tcp://127.0.0.1:9"]))
     assert "dask scheduler --port" in str(refused.value)
+
+
+@pytest.mark.parametrize("greeting", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n"], ids=["silence", "an HTTP server"])
+def test_what_listens_and_is_no_scheduler_is_named_and_not_waited_for(project, monkeypatch, greeting):
+    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        held = []
+
+        def answer():
+            """Greet whoever comes, and say nothing more."""
+            with contextlib.suppress(OSError):
+                while True:
+                    held.append(server.accept()[0])
+                    held[-1].sendall(greeting)
+
+        threading.Thread(target=answer, daemon=True).start()
+        began = time.monotonic()
+        with pytest.raises(InputError, match="no Dask scheduler answers at"):
+            verbs.make(project, verbs.Wish("set", settings=["executor=dask", f"scheduler=tcp://127.0.0.1:{server.getsockname()[1]}"]))
+        assert time.monotonic() - began < 10
+        for one in held:
+            one.close()
 
 
 def test_a_worker_is_not_started_for_what_is_no_address():
