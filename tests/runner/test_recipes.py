@@ -130,6 +130,15 @@ def test_a_recipe_that_is_not_there_names_those_that_are(project, word, wrong):
     assert wrong in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["x" * 240, "two\nlines"], ids=["long", "two lines"])
+def test_a_recipe_whose_name_can_be_no_folder_is_refused(project, tmp_path, name):
+    write(tmp_path / f"{name}.yaml", json.dumps({"word": "a"}))
+    data = project.provider.read(project.root / "data" / "set")
+    with pytest.raises(InputError) as refused:
+        project.recipes(data, [str(tmp_path / f"{name}.yaml")])
+    assert refused.value.cure == "give it another name"
+
+
 def test_two_recipes_of_one_name_are_refused(project):
     write(project.root / "mine" / "hello.yaml", '{"word": "own"}')
     data = project.provider.read(project.root / "data" / "set")
