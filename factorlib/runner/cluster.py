@@ -14,7 +14,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
 from pathlib import Path
@@ -164,7 +164,8 @@ def _client(scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     try:
-        asyncio.run(_answered(scheduler))
+        with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
+            beside.submit(asyncio.run, _answered(scheduler)).result()
         client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"

@@ -1,5 +1,6 @@
 """Runs on a real Dask cluster: worker processes of their own over TCP, some of them killed; the bytes are those of a run without one."""
 
+import asyncio
 import contextlib
 import json
 import os
@@ -342,11 +343,23 @@ def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
         cluster.start_worker("tcp://127.0.0.1:1", None, [])
 
 
-def test_a_scheduler_that_does_not_answer_is_named(project, monkeypatch):
+@pytest.mark.parametrize("notebook", [False, True], ids=["a script", "a notebook, whose event loop runs"])
+def test_a_scheduler_that_does_not_answer_is_named(project, monkeypatch, notebook):
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
+    if notebook:
+        asyncio.run(_refused(project))
+    else:
+        refuse(project)
+
+
+async def _refused(project):
+    refuse(project)
+
+
+def refuse(project):
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9") as refused:
         verbs.make(project, verbs.Wish("set", settings=["executor=dask", "scheduler=tcp://127.0.0.1:9"]))
-    assert "dask scheduler --port" in str(refused.value)
+    assert "dask scheduler --port" in str(refused.value) and "event loop" not in str(refused.value)
 
 
 @pytest.mark.parametrize("greeting", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n"], ids=["silence", "an HTTP server"])
