@@ -32,9 +32,14 @@ def opened(file: Path, **context) -> Iterator[tuple]:
     """The page and a list that gathers what it complains of; context: what Playwright's `new_context` takes."""
     here = chromium().new_context(**context)
     page, complaints = here.new_page(), []
-    page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
+    page.on(
+        "console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None
+    )
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("request", lambda request: complaints.append(request.url) if not request.url.startswith(("file:", "data:")) else None)
+    page.on(
+        "request",
+        lambda request: complaints.append(request.url) if not request.url.startswith(("file:", "data:")) else None,
+    )
     page.set_default_timeout(120000)  # software draws slowly on a busy machine
     page.goto(file.resolve().as_uri())
     yield page, complaints

@@ -73,7 +73,9 @@ QUANTITIES = {
     "mirror": _light("mirror sphere", "mirror"),
     "lambertian": _light("Lambertian sphere", "lambertian"),
     "angle": _light("angle of the map's RGB", "map_all", "rgb_angle_deg", 1, "°"),
-    "balls": Quantity("balls in the recovered light, dB", f"{BALLS}.in_estimated_light.{PSNR}", f"{BALLS}.null_grey.{PSNR}", 1),
+    "balls": Quantity(
+        "balls in the recovered light, dB", f"{BALLS}.in_estimated_light.{PSNR}", f"{BALLS}.null_grey.{PSNR}", 1
+    ),
     "true light": Quantity("balls in the true light, dB", f"{BALLS}.in_true_light.{PSNR}", None, 1),
     "diffuse": Quantity("k_d", "materials.mean_diffuse", "materials.null_mean_diffuse", 0, " %", 100),
     "specular": Quantity("k_s", "materials.mean_specular", "materials.null_mean_specular", 0, " %", 100),
@@ -104,23 +106,38 @@ class Set(msgspec.Struct, frozen=True):
     def _at(self, path: str) -> float:
         found = value_at(self.metrics, path)
         if found is None:
-            raise InputError("there is no such number", file=self.results / "evaluate/metrics.json", key=path, cure="correct benchmarks/eames_like.py")
+            raise InputError(
+                "there is no such number",
+                file=self.results / "evaluate/metrics.json",
+                key=path,
+                cure="correct benchmarks/eames_like.py",
+            )
         return found
 
 
 def made(seed: int, lights: Path | None = None) -> Path:
     """The folder of the set of that seed, made where it is missing or of other sources."""
-    folder = PLACE / sources_hash("factorlib.generate.eames") / ("captured" if lights else "made") / f"eames-like-{seed}"
+    folder = (
+        PLACE / sources_hash("factorlib.generate.eames") / ("captured" if lights else "made") / f"eames-like-{seed}"
+    )
     if not (folder / "dataset.yaml").exists():
         captured = ["--lights", str(lights)] if lights else []
-        subprocess.run([sys.executable, "-m", "factorlib.generate", "eames", "--seed", str(seed), "--out", str(folder), *captured], cwd=ROOT, check=True)
+        subprocess.run(
+            [sys.executable, "-m", "factorlib.generate", "eames", "--seed", str(seed), "--out", str(folder), *captured],
+            cwd=ROOT,
+            check=True,
+        )
     return folder
 
 
 def drawn(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
     """The maps that light the set of that seed, and all others.  InputError where no two are left for a prior."""
     if len(maps) < MAPS + 2:
-        raise InputError(f"{len(maps)} maps", key="--lights", cure=f"{MAPS} light a set and the prior needs two more: name folders with {MAPS + 2}")
+        raise InputError(
+            f"{len(maps)} maps",
+            key="--lights",
+            cure=f"{MAPS} light a set and the prior needs two more: name folders with {MAPS + 2}",
+        )
     chosen = set(np.random.default_rng(seed).permutation(len(maps))[:MAPS].tolist())
     return [m for k, m in enumerate(maps) if k in chosen], [m for k, m in enumerate(maps) if k not in chosen]
 
@@ -152,7 +169,9 @@ def evaluated(name: str, dataset: Path, root: Path = ROOT) -> Set:
     settings = {"DATASET": str(dataset), "FACTORLIB_STORE": str(ROOT / "build/store"), "PYTHONPATH": str(root)}
     environment = {name: value for name, value in os.environ.items() if name not in ("SET", "FORCE")} | settings
     (ROOT / "build/store").mkdir(parents=True, exist_ok=True)
-    if subprocess.run([sys.executable, "-m", "factorlib", "evaluate"], cwd=root, env=environment, check=False).returncode:
+    if subprocess.run(
+        [sys.executable, "-m", "factorlib", "evaluate"], cwd=root, env=environment, check=False
+    ).returncode:
         raise SystemExit(1)  # it has said why
     results = root / "build" / dataset.name
     return Set(name, msgspec.to_builtins(read_metrics(results / "evaluate/metrics.json")), results)
@@ -163,18 +182,30 @@ def captured(seed: int, folders: Sequence[Path]) -> Set:
     here = PLACE / f"captured-{seed}"
     maps, others = drawn(maps_in(folders), seed)
     print(f"set {seed} is lit by {', '.join(m.name for m in maps)}", flush=True)
-    return evaluated(f"{seed}, captured", made(seed, folder_of(maps, here / "maps")), project_with_prior(others, here / "project"))
+    return evaluated(
+        f"{seed}, captured", made(seed, folder_of(maps, here / "maps")), project_with_prior(others, here / "project")
+    )
 
 
 def as_table(sets: Sequence[Set], unchosen: Sequence[Set]) -> str:
     """A column for each set, and mean and standard deviation over those that no setting was chosen on; in brackets what the null scores."""
     shares = {one.name: within(one) for one in sets}
     spread = len(unchosen) > 1
-    rows = [[q.meaning, *(_cell(q, one) for one in sets), *([_mean(q, unchosen)] if spread else [])] for q in QUANTITIES.values()]
+    rows = [
+        [q.meaning, *(_cell(q, one) for one in sets), *([_mean(q, unchosen)] if spread else [])]
+        for q in QUANTITIES.values()
+    ]
     for part in WITHIN:
         pooled = [_share(np.concatenate([shares[one.name][part] for one in unchosen]))] if spread else []
         rows.append([f"{part} within one standard error", *(_share(shares[one.name][part]) for one in sets), *pooled])
-    return table(["", *(one.name for one in sets), *(["mean ± spread of those that no setting was chosen on"] if spread else [])], rows)
+    return table(
+        [
+            "",
+            *(one.name for one in sets),
+            *(["mean ± spread of those that no setting was chosen on"] if spread else []),
+        ],
+        rows,
+    )
 
 
 def _cell(quantity: Quantity, one: Set) -> str:
@@ -190,7 +221,11 @@ def _mean(quantity: Quantity, sets: Sequence[Set]) -> str:
 
 def within(one: Set) -> dict[str, np.ndarray]:
     """|estimate − truth| over the standard error: of materials, by part, and of the lights' log radiances."""
-    return dict(zip(WITHIN, [*material_deviations(one.results, None).values(), light_deviations(one.results, None)], strict=True))
+    return dict(
+        zip(
+            WITHIN, [*material_deviations(one.results, None).values(), light_deviations(one.results, None)], strict=True
+        )
+    )
 
 
 def _share(deviations: np.ndarray) -> str:
@@ -213,7 +248,10 @@ def paragraph(eames: Set, others: Sequence[Set]) -> str:
         values = [one.value(QUANTITIES[name]) for one in others]
         if len(values) == 1:
             return QUANTITIES[name].shown(values[0])
-        mean, low, high = (QUANTITIES[name].shown(v).removesuffix(QUANTITIES[name].unit) for v in (np.mean(values), min(values), max(values)))
+        mean, low, high = (
+            QUANTITIES[name].shown(v).removesuffix(QUANTITIES[name].unit)
+            for v in (np.mean(values), min(values), max(values))
+        )
         return f"{mean} ({low} to {high}){QUANTITIES[name].unit}"
 
     grey = exact(float(np.mean([one.null(QUANTITIES["balls"]) for one in others])), 3)
@@ -232,7 +270,9 @@ def paragraph(eames: Set, others: Sequence[Set]) -> str:
 
 def main(
     seeds: Annotated[list[int] | None, typer.Option(help="of the made sets; more by --seeds again", min=1)] = None,
-    lights: Annotated[list[Path] | None, typer.Option(help="folder of captured lat-long maps; more by --lights again")] = None,
+    lights: Annotated[
+        list[Path] | None, typer.Option(help="folder of captured lat-long maps; more by --lights again")
+    ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="write docs/light-prior.md and README.md")] = False,
 ) -> None:
     """Make the sets, run the pipeline on each, and print the table."""

@@ -59,15 +59,21 @@ def summed(found: list[Tried], of: str, *fields: str) -> dict[str, Counter]:
 
 def tables(found: list[Tried]) -> dict[str, str]:
     """Those of which there is any line."""
-    faults = [[name, f"{s['tries']:,}", f"{s['lost']:,}"] for name, s in summed(found, "faults", "tries", "lost").items()]
+    faults = [
+        [name, f"{s['tries']:,}", f"{s['lost']:,}"] for name, s in summed(found, "faults", "tries", "lost").items()
+    ]
     reruns = [[name, f"{s['tries']:,}", "0"] for name, s in summed(found, "reruns", "tries").items()]
     spoiled = summed(found, "fuzz", "tries", "accepted", "refused", "other")
-    fuzz = [[name, *(f"{s[field]:,}" for field in ("tries", "accepted", "refused", "other"))] for name, s in spoiled.items()]
+    fuzz = [
+        [name, *(f"{s[field]:,}" for field in ("tries", "accepted", "refused", "other"))] for name, s in spoiled.items()
+    ]
     total = [f"{sum(s[field] for s in spoiled.values()):,}" for field in ("tries", "accepted", "refused", "other")]
     struck = sum((Counter(one.stages) for one in found if one.table == "hits" and one.stages), Counter())
     made = {
         "faults": table(["fault", "tries", "lost"], faults) if faults else "",
-        "hits": table(["stage", "killed while it was writing"], [[name, str(count)] for name, count in struck.items()]) if struck else "",
+        "hits": table(["stage", "killed while it was writing"], [[name, str(count)] for name, count in struck.items()])
+        if struck
+        else "",
         "reruns": table(["change", "changes", "wrong reruns"], reruns) if reruns else "",
         "fuzz": table(["file", "tries", "read", "refused", "other"], [*fuzz, ["all", *total]]) if fuzz else "",
     }

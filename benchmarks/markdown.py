@@ -23,14 +23,18 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     | all | 1 % |
     """
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("|" + "|".join(cells) + "|" if k == 1 else "| " + " | ".join(cells) + " |" for k, cells in enumerate(lines))
+    return "\n".join(
+        "|" + "|".join(cells) + "|" if k == 1 else "| " + " | ".join(cells) + " |" for k, cells in enumerate(lines)
+    )
 
 
 def replaced(text: str, name: str, inner: str, file: Path | None = None) -> str:
     """`text` with `inner` between the marks of `name`."""
     pattern = re.compile(rf"(<!-- begin {re.escape(name)} -->\n).*?(<!-- end {re.escape(name)} -->)", re.DOTALL)
     if not pattern.search(text):
-        raise InputError(f"no place for the table '{name}'", file=file, cure=f"add <!-- begin {name} --> and <!-- end {name} -->")
+        raise InputError(
+            f"no place for the table '{name}'", file=file, cure=f"add <!-- begin {name} --> and <!-- end {name} -->"
+        )
     return pattern.sub(lambda found: f"{found[1]}{inner}\n{found[2]}", text)
 
 

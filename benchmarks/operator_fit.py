@@ -34,7 +34,10 @@ def diffuse_remainder(orders: int = 8, powers: int = 5) -> tuple[np.ndarray, flo
         weight = weight * torch.sqrt(1 + error / error.max())
         weight = weight / weight.mean()
     even = np.array(
-        [np.polynomial.chebyshev.cheb2poly([0.0] * (2 * j) + [1.0]).tolist() + [0.0] * (2 * (powers - 1 - j)) for j in range(powers)]
+        [
+            np.polynomial.chebyshev.cheb2poly([0.0] * (2 * j) + [1.0]).tolist() + [0.0] * (2 * (powers - 1 - j))
+            for j in range(powers)
+        ]
     )
     return found.reshape(orders, powers).numpy() @ even[:, ::2], float(error.max())
 
@@ -52,7 +55,9 @@ def ggx_as_gaussians(count: int = 7) -> tuple[np.ndarray, np.ndarray]:
         return ((np.exp(-np.outer(x, rate)) @ weight + 1 / ((1 + x) ** 2 + TAIL**2)) * (1 + x) ** 2 - 1) * importance
 
     first = np.log(np.geomspace(3 / TAIL, 5, count))
-    found = least_squares(residual, np.r_[first[0], np.log(np.diff(first)), np.log(np.geomspace(TAIL**-1.5, 0.5, count))], max_nfev=20000)
+    found = least_squares(
+        residual, np.r_[first[0], np.log(np.diff(first)), np.log(np.geomspace(TAIL**-1.5, 0.5, count))], max_nfev=20000
+    )
     return parameters(found.x)
 
 
@@ -60,6 +65,9 @@ if __name__ == "__main__":
     coefficients, error = diffuse_remainder()
     print("REMAINDER, error of the peak", error)
     print(np.array2string(coefficients, separator=", ", precision=9, max_line_width=120))
-    print("in use differs by", np.abs(coefficients - REMAINDER.numpy()).max() if REMAINDER.shape == coefficients.shape else "shape")
+    print(
+        "in use differs by",
+        np.abs(coefficients - REMAINDER.numpy()).max() if REMAINDER.shape == coefficients.shape else "shape",
+    )
     for row in zip(*ggx_as_gaussians(), strict=True):
         print("({:.9g}, {:.9g})".format(*row))

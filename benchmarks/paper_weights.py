@@ -41,10 +41,14 @@ def main(folder: Path = SHIPPED, spheres: int = SPHERES, schedules: dict[str, Sc
     for part, examples in examples_of_pixels(light, pixels).items():
         start = time.process_time()
         layers = trained(
-            examples, schedules[part], lambda step, error, part=part: print(f"{part}: step {step}, error {error:.2%}", flush=True)
+            examples,
+            schedules[part],
+            lambda step, error, part=part: print(f"{part}: step {step}, error {error:.2%}", flush=True),
         )
         print(f"{part}: trained in {time.process_time() - start:.0f} s of a core", flush=True)
-        write_layers(folder / f"paper_{part}.safetensors", layers, torch.float16, inputs="see factorlib.reflection.paper_network")
+        write_layers(
+            folder / f"paper_{part}.safetensors", layers, torch.float16, inputs="see factorlib.reflection.paper_network"
+        )
 
 
 def examples_of_pixels(light: Spheres, pixels: Pixels) -> dict[str, Examples]:
@@ -56,7 +60,9 @@ def examples_of_pixels(light: Spheres, pixels: Pixels) -> dict[str, Examples]:
     sharpness, roughness = _flat(sharpness), _flat(roughness)
     return {
         "diffuse": Examples(diffuse_inputs(normal, axis, sharpness), sharpness, _flat(pixels.diffuse)),
-        "specular": Examples(specular_inputs(normal, half, axis, sharpness, roughness), sharpness, _flat(pixels.specular)),
+        "specular": Examples(
+            specular_inputs(normal, half, axis, sharpness, roughness), sharpness, _flat(pixels.specular)
+        ),
     }
 
 
@@ -79,4 +85,7 @@ if __name__ == "__main__":
     write_json(SHIPPED / "paper_accuracy.json", found)
     for part, table in found.items():
         print(part, {name: table[name] for name in ("median", "p95", "p99", "worst")})
-    print("microseconds", microseconds({"paper_network": reflection_operator("paper_network")}, lambda _: 1024)["paper_network"])
+    print(
+        "microseconds",
+        microseconds({"paper_network": reflection_operator("paper_network")}, lambda _: 1024)["paper_network"],
+    )

@@ -65,7 +65,9 @@ def observations_of(dataset: str) -> tuple[list[str], list[Observations], Rotati
     spec, built = read_dataset(folder).spec, ROOT / "build" / folder.resolve().name
     rotations = {p.name: np.array(p.world_from_camera) for p in spec.photos if p.world_from_camera is not None}
     if not (files := sorted((built / "urm").glob("*.parquet"))):
-        raise InputError("there are no observations yet", file=built / "urm", cure=f"run: make urm train DATASET={dataset}")
+        raise InputError(
+            "there are no observations yet", file=built / "urm", cure=f"run: make urm train DATASET={dataset}"
+        )
     return list(spec.materials), [usable(read_observations(path)) for path in files], rotations
 
 
@@ -85,7 +87,9 @@ def light_of(block: Block, materials: Materials, operator: Operator) -> Light:
     return best or light
 
 
-def left_out(splits: Sequence[Split], whole: Solution, materials: int, operator: Operator, report: Callable[[], None]) -> dict[str, dict[str, float]]:
+def left_out(
+    splits: Sequence[Split], whole: Solution, materials: int, operator: Operator, report: Callable[[], None]
+) -> dict[str, dict[str, float]]:
     """Decibels of each light or photo on the observations it is asked for, by where its materials come from."""
     found = {}
     for k, split in enumerate(splits):
@@ -111,7 +115,9 @@ def left_out(splits: Sequence[Split], whole: Solution, materials: int, operator:
     return found
 
 
-def _photos_left_out(splits: Sequence[Split], k: int, whole: Solution, materials: int, operator: Operator, report: Callable[[], None]) -> dict:
+def _photos_left_out(
+    splits: Sequence[Split], k: int, whole: Solution, materials: int, operator: Operator, report: Callable[[], None]
+) -> dict:
     """Of photos that share a light: all of each, in the light and of the materials that the others tell."""
     found = {}
     for f, photo in enumerate(splits[k].seen.photos):
@@ -158,7 +164,11 @@ def measured(dataset: str, photos: bool) -> dict:
     with tqdm(total=len(VARIANTS) + leaving, desc=dataset) as bar:
         whole = None
         for name, how in VARIANTS.items():
-            solution = whole if whole is not None and how and not _differs(how, whole) else solved(of(how), count, operator, how)
+            solution = (
+                whole
+                if whole is not None and how and not _differs(how, whole)
+                else solved(of(how), count, operator, how)
+            )
             lobes = [len(light) for light in solution.point.lights]
             result["parts"][name] = _summary(unseen(splits, solution, operator)) | {"lobes": [min(lobes), max(lobes)]}
             if not how:

@@ -38,7 +38,11 @@ def measured(shape: str, axis: int, off: float, photos: int, rough: bool = False
         camera, pose, label = photographed(true, rng, rng.uniform(*FILLS))
         silhouette, prior = Silhouette(label.astype(np.int16)), focal_prior(None, None, camera.width, camera.height)
         found = find(caster, silhouette, camera, prior)
-        sightings.append(Sighting(given, target_of(silhouette, given.labels, 200, 0.15), found.state.camera(camera), prior, found.state))
+        sightings.append(
+            Sighting(
+                given, target_of(silhouette, given.labels, 200, 0.15), found.state.camera(camera), prior, found.state
+            )
+        )
         truth.append((camera, pose))
     start = time.perf_counter()
     verdict = proportions(sightings)
@@ -46,7 +50,10 @@ def measured(shape: str, axis: int, off: float, photos: int, rough: bool = False
     wanted = 1 / factors / (1 / factors).prod() ** (1 / 3)
 
     def errors(mesh: Mesh, states: list[State]) -> list[float]:
-        return [normal_error(true, *posed, mesh, one.camera, state) for posed, one, state in zip(truth, sightings, states, strict=True)]
+        return [
+            normal_error(true, *posed, mesh, one.camera, state)
+            for posed, one, state in zip(truth, sightings, states, strict=True)
+        ]
 
     return {
         "shape": shape, "axis": axis, "off": off, "rough": rough, "used": verdict.used, "seconds": seconds,
@@ -65,7 +72,10 @@ def normal_error(true: Mesh, camera: Camera, pose: Pose, mesh: Mesh, found: Came
 
 
 def table(rows: list[dict]) -> str:
-    lines = ["| shape | axis times | used | factors off by at most (%) | normal error before: median, worst (°) | after (°) | s |", "|---|---:|---|---:|---:|---:|---:|"]
+    lines = [
+        "| shape | axis times | used | factors off by at most (%) | normal error before: median, worst (°) | after (°) | s |",
+        "|---|---:|---|---:|---:|---:|---:|",
+    ]
     for row in rows:
         before, after = np.array(row["before"]), np.array(row["after"])
         name = row["shape"] + (", rough" if row["rough"] else "")
@@ -76,7 +86,13 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def main(photos: int = 4, shape: str = ",".join(shapes.SHAPES), off: str = "1,1.1,1.15", rough: bool = False, out: Path = Path("build/bench/proportions")) -> None:
+def main(
+    photos: int = 4,
+    shape: str = ",".join(shapes.SHAPES),
+    off: str = "1,1.1,1.15",
+    rough: bool = False,
+    out: Path = Path("build/bench/proportions"),
+) -> None:
     rows = []
     for number, name in enumerate(shape.split(",")):
         for times in map(float, off.split(",")):

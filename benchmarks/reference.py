@@ -115,8 +115,12 @@ def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored
     """From the metrics of all seeds, the default one first.  InputError where a number is missing."""
     values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
     for path in (p for p, v in values.items() if None in v):
-        raise InputError("there is no such number", file=Path("metrics.json"), key=path, cure="correct benchmarks/numbers.py")
-    numbers = {p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()}
+        raise InputError(
+            "there is no such number", file=Path("metrics.json"), key=path, cure="correct benchmarks/numbers.py"
+        )
+    numbers = {
+        p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()
+    }
     old: Mapping[str, Number] = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
     return Stored(DATASET, len(runs), DOUBT, numbers, [Refresh(reason, changed), *(before.refreshes if before else [])])
@@ -135,7 +139,9 @@ def quoted(found: Stored) -> str:
     def shown(path: str, form: str, scale: float = 1.0) -> str:
         """A number and its range."""
         n = found.numbers[path]
-        value, low, high = ((form % (scale * v)).replace("0.", ".", 1 if scale * v < 1 else 0) for v in (n.value, n.low, n.high))
+        value, low, high = (
+            (form % (scale * v)).replace("0.", ".", 1 if scale * v < 1 else 0) for v in (n.value, n.low, n.high)
+        )
         return f"{value} ({low} to {high})"
 
     return (
@@ -164,7 +170,10 @@ def main(
     runs = [run(project, seed) for seed in reversed(range(seeds))][::-1]
     write_json(STORED, found := stored(runs, why, before))
     refresh(LIBRARY / "README.md", {"synthetic": quoted(found)})
-    print("\n".join(f"{found.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in found.refreshes[0].changed.items()) or "nothing changed")
+    print(
+        "\n".join(f"{found.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in found.refreshes[0].changed.items())
+        or "nothing changed"
+    )
 
 
 if __name__ == "__main__":

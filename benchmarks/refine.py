@@ -106,7 +106,9 @@ def photographed(kind: str, number: int, rng: np.random.Generator, operator: Ope
     silhouette = Silhouette(channels["label"].astype(np.int16))
     if flipped:
         mirrored = np.diag([1.0, 1, -1]) @ rotation @ np.diag([-1.0, 1, 1])  # x is the chair's left and right
-        wrong = by_contours(given, silhouette, camera, state_of(Pose(mirrored, middle - mirrored @ given.centre), camera, given))
+        wrong = by_contours(
+            given, silhouette, camera, state_of(Pose(mirrored, middle - mirrored @ given.centre), camera, given)
+        )
         return Photo(shape, camera, truth, caster, given, channels, wrong.pose(given), truth)
     by = np.deg2rad(rng.uniform(2, 8)) if kind == "turned" else 0.0
     turned = rotation_of_vector(by * unit(rng.normal(size=3))) @ rotation
@@ -124,7 +126,9 @@ def by_contours(caster: Caster, silhouette: Silhouette, camera: Camera, start: S
     return refined(caster, target, camera, start, FocalPrior(camera.focal, 0.0), 12).state
 
 
-def rendered(caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.random.Generator, operator: Operator) -> dict:
+def rendered(
+    caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.random.Generator, operator: Operator
+) -> dict:
     """The channels that `masks` would write."""
     maps = rasterise(caster, camera, pose)
     y, x = np.nonzero(maps.label)
@@ -149,7 +153,9 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
     seen = []
     for k, photo in enumerate(photos):
         maps = rasterise(photo.given, photo.camera, photo.pose)
-        geometry = {f"normal.{a}": maps.normal[..., i] for i, a in enumerate("xyz")} | {f"view.{a}": maps.view[..., i] for i, a in enumerate("xyz")}
+        geometry = {f"normal.{a}": maps.normal[..., i] for i, a in enumerate("xyz")} | {
+            f"view.{a}": maps.view[..., i] for i, a in enumerate("xyz")
+        }
         geometry |= {"label": maps.label, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
@@ -162,16 +168,31 @@ def normal_error(photo: Photo, pose: Pose) -> float:
     """Median angle over the true silhouette where both see the object, degrees."""
     truth, found = rasterise(photo.caster, photo.camera, photo.truth), rasterise(photo.given, photo.camera, pose)
     both = (truth.label > 0) & (found.label > 0)
-    return float(np.rad2deg(np.median(np.arccos(np.clip(np.sum(truth.normal[both] * found.normal[both], axis=1), -1, 1)))))
+    return float(
+        np.rad2deg(np.median(np.arccos(np.clip(np.sum(truth.normal[both] * found.normal[both], axis=1), -1, 1))))
+    )
 
 
 def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> dict:
     """What is reported of one photo."""
-    errors = {name: normal_error(photo, state.pose(photo.given)) for name, state in (("before", result.before), ("after", result.after))}
+    errors = {
+        name: normal_error(photo, state.pose(photo.given))
+        for name, state in (("before", result.before), ("after", result.after))
+    }
     errors["mesh"] = normal_error(photo, photo.truth)
     verdict = result.settled
-    each = {name: [*np.round(c.gain(verdict.candidates["found"]), 3).tolist(), round(c.score, 4), round(normal_error(photo, c.state.pose(photo.given)), 2)]
-            for name, c in verdict.candidates.items()} if verdict else {}
+    each = (
+        {
+            name: [
+                *np.round(c.gain(verdict.candidates["found"]), 3).tolist(),
+                round(c.score, 4),
+                round(normal_error(photo, c.state.pose(photo.given)), 2),
+            ]
+            for name, c in verdict.candidates.items()
+        }
+        if verdict
+        else {}
+    )
     return {"kind": kind, "seed": seed, "shape": photo.shape, **errors, "chosen": verdict and verdict.chosen,
             "ruled_out": verdict and verdict.ruled_out, "seconds": seconds, "candidates": each}  # fmt: skip
 
@@ -179,16 +200,23 @@ def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> 
 def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
     own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
-    return refined_photo(Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator))[0]
+    return refined_photo(
+        Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator)
+    )[0]
 
 
 def table(rows: list[dict]) -> str:
     """One line a kind: of photos changed, how many became better; normal errors before and after."""
-    lines = ["| case | photos | changed: better, worse | normal error before: median, worst (°) | after (°) | of the mesh alone (°) | s |", "|---|---:|---:|---:|---:|---:|---:|"]
+    lines = [
+        "| case | photos | changed: better, worse | normal error before: median, worst (°) | after (°) | of the mesh alone (°) | s |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
     for kind in dict.fromkeys(row["kind"] for row in rows):
         of = [row for row in rows if row["kind"] == kind]
         changed = [row["after"] - row["before"] for row in of if row["chosen"] not in (None, "found")]
-        before, after, mesh, seconds = (np.array([row[name] for row in of]) for name in ("before", "after", "mesh", "seconds"))
+        before, after, mesh, seconds = (
+            np.array([row[name] for row in of]) for name in ("before", "after", "mesh", "seconds")
+        )
         lines.append(
             f"| {kind} | {len(of)} | {sum(c < 0 for c in changed)}, {sum(c >= 0 for c in changed)} | {np.median(before):.2g}, {before.max():.2g} "
             f"| {np.median(after):.2g}, {after.max():.2g} | {np.median(mesh):.2g} | {np.median(seconds):.2g} |"
@@ -196,7 +224,9 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def main(sets: int = 2, kinds: str = ",".join(KINDS), true_materials: bool = False, out: Path = Path("build/bench/refine")) -> None:
+def main(
+    sets: int = 2, kinds: str = ",".join(KINDS), true_materials: bool = False, out: Path = Path("build/bench/refine")
+) -> None:
     operator, rows = reflection_operator("network"), []
     for kind in kinds.split(","):
         for seed in range(sets):

@@ -61,7 +61,10 @@ CHANGES = {"sure": as_sure, "unclipped": unclipped, "dropped": dropped}
 def splits_of(photos: Sequence[Observations], rotations: Rotations, change: str | None = None) -> list[Split]:
     """Every light's observations.  change: what is done to those that a solve may see; those asked for are the same whatever is done."""
     changed = [CHANGES[change](photo) for photo in photos] if change else photos
-    whole, seen = (blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations) for of in (photos, changed))
+    whole, seen = (
+        blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations)
+        for of in (photos, changed)
+    )
     return [_split(block, next(b for b in seen if b.name == block.name)) for block in whole]
 
 

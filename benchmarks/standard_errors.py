@@ -70,16 +70,23 @@ def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]
 
 def main(
     builds: Annotated[list[Path], typer.Argument(help="folders of results, such as build/eames")],
-    other: Annotated[Path | None, typer.Option(help="folder of another run of the same data set, instead of the truth")] = None,
+    other: Annotated[
+        Path | None, typer.Option(help="folder of another run of the same data set, instead of the truth")
+    ] = None,
 ) -> None:
     """Print the shares within one standard error, and the median deviation in standard errors."""
-    print(f"{'within one standard error (median deviation)':46} {'k_d':>12} {'k_s':>12} {'roughness':>12} {'light':>12}")
+    print(
+        f"{'within one standard error (median deviation)':46} {'k_d':>12} {'k_s':>12} {'roughness':>12} {'light':>12}"
+    )
     for build in builds:
         try:
             deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
         except InputError as error:
             raise SystemExit(f"{error}\nrun `make evaluate` first, and name folders of one data set") from None
-        print(f"{build!s:46} " + " ".join(f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})".rjust(12) for d in deviations))
+        print(
+            f"{build!s:46} "
+            + " ".join(f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})".rjust(12) for d in deviations)
+        )
 
 
 if __name__ == "__main__":

@@ -34,13 +34,17 @@ RADIANCE = """([mesh, photo, chosen, size]) => {
 START = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stops": 0}
 
 
-def shown(page, mesh: int, material: str, photo: str, view: dict | None = None, size: int = SIZE) -> Float[np.ndarray, "size size 4"]:
+def shown(
+    page, mesh: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
+) -> Float[np.ndarray, "size size 4"]:
     """The viewer's finished picture, radiance and coverage, the uppermost row first.  mesh: −1 is the ball;  view: see START"""
     chosen = {**START, **(view or {}), "material": material}
     return np.array(page.evaluate(RADIANCE, [mesh, photo, chosen, size])).reshape(size, size, 4)[::-1]
 
 
-def ball_seen(azimuth: float, elevation: float, size: int = SIZE) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
+def ball_seen(
+    azimuth: float, elevation: float, size: int = SIZE
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
     """Normals and views (y-up) of the pixels inside the ball's outline, as the viewer's camera sees it, and those pixels."""
     back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.cross([0, 1, 0], back) / np.hypot(back[0], back[2])
@@ -54,7 +58,13 @@ def ball_seen(azimuth: float, elevation: float, size: int = SIZE) -> tuple[Float
     return hit[inside], -ray[inside], inside
 
 
-def rendered(light: Lobes, material: Reflectance, normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], turn: float = 0.0) -> Float[np.ndarray, "n 3"]:
+def rendered(
+    light: Lobes,
+    material: Reflectance,
+    normals: Float[np.ndarray, "n 3"],
+    views: Float[np.ndarray, "n 3"],
+    turn: float = 0.0,
+) -> Float[np.ndarray, "n 3"]:
     """The same by the reflection operator.  light: in a camera's frame;  turn: of the light about the upright axis, radians"""
     c, s = np.cos(turn), np.sin(turn)
     turned = light.turned(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ YUP_FROM_CAMERA)
@@ -72,7 +82,10 @@ def main(build: Path) -> None:
     lights = read_lobes(build / "export/lobes.parquet")
     normals, views, inside = ball_seen(0.0, 0.0)
     with opened(build / "report/index.html", viewport={"width": 1440, "height": 900}) as (page, _):
-        photos = {p["name"]: p["light"] for p in page.evaluate("viewer.data.photos.map((p) => ({name: p.name, light: p.light}))")}
+        photos = {
+            p["name"]: p["light"]
+            for p in page.evaluate("viewer.data.photos.map((p) => ({name: p.name, light: p.light}))")
+        }
         page.evaluate("viewer.canvas.style.width = '64px'")
         rows = []
         for material, reflectance in materials.items():
@@ -80,7 +93,13 @@ def main(build: Path) -> None:
                 error(shown(page, -1, material, photo)[inside][:, :3], rendered(lights[light], reflectance, normals, views))
                 for photo, light in photos.items()
             ])  # fmt: skip
-            rows.append([material, f"{reflectance.roughness:.2f}", *(f"{100 * e:.2f} %" for e in np.percentile(errors, [50, 95, 100]))])
+            rows.append(
+                [
+                    material,
+                    f"{reflectance.roughness:.2f}",
+                    *(f"{100 * e:.2f} %" for e in np.percentile(errors, [50, 95, 100])),
+                ]
+            )
         errors_of = table(["material", "roughness", "median", "95th percentile", "worst"], rows)
         print(errors_of, flush=True)
         times = []

@@ -54,7 +54,9 @@ def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, " height
     return (edges[:-1] - edges[1:]) * 2 * np.pi / width
 
 
-def half_of_normal_and_view(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def half_of_normal_and_view(
+    normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 3"]:
     """The URM's `half` = (2(n·o)n − o + (0,0,−1)) / 2, as in the paper (not of unit length).
 
     >>> half_of_normal_and_view(FRONT, FRONT).tolist()

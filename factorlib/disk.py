@@ -63,11 +63,19 @@ def _closed(code: int, error: BaseException, folder: Path) -> InputError:
     folder = next((found for found in folders if not os.access(found, os.W_OK)), folders[0])
     free = shutil.disk_usage(folder).free
     cure = "give yourself the right to write there, or work in a copy elsewhere"
-    return InputError(f"{CLOSED[code]}: nothing can be written there ({free / 1e6:.1f} MB are free)", file=folder, cure=cure)
+    return InputError(
+        f"{CLOSED[code]}: nothing can be written there ({free / 1e6:.1f} MB are free)", file=folder, cure=cure
+    )
 
 
 def _folders(error: BaseException, folder: Path) -> list[Path]:
     """Those of the files that the error names (of a rename there are two), the given one where it names none; as far as they exist."""
-    names = [name for name in (getattr(error, "filename", None), getattr(error, "filename2", None)) if isinstance(name, str | bytes)]
+    names = [
+        name
+        for name in (getattr(error, "filename", None), getattr(error, "filename2", None))
+        if isinstance(name, str | bytes)
+    ]
     paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names] or [folder.absolute()]
-    return [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths]  # Path.is_dir raises where it may not look
+    return [
+        next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths
+    ]  # Path.is_dir raises where it may not look

@@ -21,7 +21,9 @@ class InputError(ValueError):
       did you mean 'red'?
     """
 
-    def __init__(self, found: str, *, file: str | PathLike | None = None, key: str | None = None, cure: str | None = None):
+    def __init__(
+        self, found: str, *, file: str | PathLike | None = None, key: str | None = None, cure: str | None = None
+    ):
         self.found, self.file, self.key, self.cure = found, file, key, cure
         super().__init__(found)
 

@@ -52,7 +52,9 @@ def pinned(project: dict) -> list[str]:
 
 def lock_text() -> str:
     """What requirements.lock should say."""
-    return HEAD + "".join(f"{line}\n" for line in pinned(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]))
+    return HEAD + "".join(
+        f"{line}\n" for line in pinned(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"])
+    )
 
 
 if __name__ == "__main__":

@@ -159,7 +159,9 @@ def _array(dtype: np.dtype, shape: tuple[int, ...], order: str, body: Place | by
     return np.frombuffer(data, dtype).reshape(shape, order=order).copy(order)
 
 
-def _part(owner: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], offset: int, strides: tuple[int, ...]) -> np.ndarray:
+def _part(
+    owner: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], offset: int, strides: tuple[int, ...]
+) -> np.ndarray:
     return np.ndarray(shape, dtype, owner.data if owner.flags.c_contiguous else owner.T.data, offset, strides)
 
 

@@ -22,7 +22,12 @@ MOST_BYTES = 8192  # of one value: what hides each of as many directions as visi
 
 
 def read_columns(
-    path: str | Path, what: str, needed: Iterable[str], optional: Iterable[str] = (), cure: str = "", most_rows: int = MOST_ROWS
+    path: str | Path,
+    what: str,
+    needed: Iterable[str],
+    optional: Iterable[str] = (),
+    cure: str = "",
+    most_rows: int = MOST_ROWS,
 ) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     """The columns by name, without nulls, and the metadata `factorlib`; what else stands in the file is not read.
 

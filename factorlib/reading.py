@@ -46,7 +46,13 @@ FAILURES = (
 COPY_AGAIN = "is it whole, and of the kind its suffix says? copy it again from where it came"
 MOST_BYTES = 1 << 30  # of a file that is read as a whole
 MOST_WORDS = 200  # characters of a parser's message
-KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
+KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
 CURES = {
     errno.EACCES: "give yourself the right to read it, and to enter the folders above it (chmod u+rX)",
     errno.EPERM: "give yourself the right to read it, and to enter the folders above it (chmod u+rX)",
@@ -60,7 +66,11 @@ CURES = {
 
 @contextmanager
 def reading(
-    what: str, file: str | os.PathLike | None, key: str | None = None, cure: str = COPY_AGAIN, also: tuple[type[Exception], ...] = ()
+    what: str,
+    file: str | os.PathLike | None,
+    key: str | None = None,
+    cure: str = COPY_AGAIN,
+    also: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
     """Whatever a parser raises within is raised as an InputError that names file and key; an InputError passes as it is.
 
@@ -90,7 +100,9 @@ def found_in(error: BaseException, what: str) -> str:
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
     words = one_line(str(error))
-    needs_type = isinstance(error, (LookupError, TypeError, AttributeError, AssertionError)) or not words  # says little without its name
+    needs_type = (
+        isinstance(error, (LookupError, TypeError, AttributeError, AssertionError)) or not words
+    )  # says little without its name
     said = ": ".join(part for part in (type(error).__name__ if needs_type else "", words) if part)
     return f"not readable as {what} ({said})"
 
@@ -123,7 +135,9 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
         found = os.stat(file)
         if not stat.S_ISREG(found.st_mode):
             kind = next((name for test, name in KINDS if test(found.st_mode)), "no plain file")
-            raise InputError(f"is {kind}, not a file", file=file, key=key, cure=f"put {what} there, or correct the path")
+            raise InputError(
+                f"is {kind}, not a file", file=file, key=key, cure=f"put {what} there, or correct the path"
+            )
         if not os.access(file, os.R_OK, effective_ids=os.access in os.supports_effective_ids):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     if most_bytes is not None and found.st_size > most_bytes:
@@ -173,7 +187,9 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # for whoever opens it to say
             os.stat(target)
     except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"is no path that can be followed ({one_line(getattr(error, 'strerror', None) or str(error))})") from error
+        raise ValueError(
+            f"is no path that can be followed ({one_line(getattr(error, 'strerror', None) or str(error))})"
+        ) from error
     if not where.is_relative_to(Path(folder).resolve()):
         raise ValueError("leads outside the dataset")
     return target

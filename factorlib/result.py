@@ -52,15 +52,29 @@ def load_result(folder: str | Path) -> Result:
 
     Raises InputError where there is none, it is not whole, or its data set is no longer where it was or has other names in it.
     """
-    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # those above too: a notebook runs in its own folder
-    found = next((path for place in places for path in (place / folder, place / "build" / folder) if os.path.isfile(path / MARK)), None)
+    places = [
+        Path(*k * [".."]) for k in range(len(Path.cwd().parts))
+    ]  # those above too: a notebook runs in its own folder
+    found = next(
+        (
+            path
+            for place in places
+            for path in (place / folder, place / "build" / folder)
+            if os.path.isfile(path / MARK)
+        ),
+        None,
+    )
     if found is None:
-        known = next(filter(None, (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)), None)
+        known = next(
+            filter(None, (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)), None
+        )
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
         raise InputError("there is no result here", file=folder, cure=cure)
     missing = [stage for stage in STAGES if not (found / stage).is_dir()]
     if missing:
-        raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=f"make export DATASET={found.name}")
+        raise InputError(
+            f"the result is not whole: {missing[0]} is missing", file=found, cure=f"make export DATASET={found.name}"
+        )
     dataset = read_dataset(_dataset_of(found))
     solved = SolvedSet(_inputs(found, dataset))
     _check_names(dataset, solved, found)
@@ -92,7 +106,9 @@ def _check_names(dataset: Dataset, solved: SolvedSet, folder: Path) -> None:
         if photo not in solved.poses:
             missing.append(f"photo {photo!r}")
         else:
-            missing += [f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in solved.poses[photo].objects]
+            missing += [
+                f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in solved.poses[photo].objects
+            ]
     if missing:
         found = f"the result is of an earlier {FILE}: it has no {', no '.join(missing)}"
         raise InputError(found, file=folder, cure=f"make all DATASET={dataset.folder.name}")
@@ -150,7 +166,13 @@ class Result:
         return Environment(read_rgb_exr(path).astype(float))
 
     def render(
-        self, view: str, azimuth: float = 0.0, elevation: float = 0.0, zoom: float = 1.0, width: int | None = None, samples: int = SAMPLES
+        self,
+        view: str,
+        azimuth: float = 0.0,
+        elevation: float = 0.0,
+        zoom: float = 1.0,
+        width: int | None = None,
+        samples: int = SAMPLES,
     ) -> Picture:
         """The objects of a photo, in its light, as its camera sees them or from another side.
 
@@ -161,9 +183,14 @@ class Result:
         photo = self._photo(view)
         _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
-        return Picture(traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)), self._solved.tone(photo))
+        return Picture(
+            traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)),
+            self._solved.tone(photo),
+        )
 
-    def relight(self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES) -> Picture:
+    def relight(
+        self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES
+    ) -> Picture:
         """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`.
 
         Raises InputError for an unknown object or photo, a file that is no light map, and numbers out of range.
@@ -174,7 +201,9 @@ class Result:
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        return Picture(traced, self._solved.tone(light) if isinstance(light, str) and light in self.photos else as_it_is)
+        return Picture(
+            traced, self._solved.tone(light) if isinstance(light, str) and light in self.photos else as_it_is
+        )
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
@@ -232,7 +261,9 @@ class Environment(msgspec.Struct, frozen=True):
 
     def rotate(self, degrees: float) -> Environment:
         """Turned about the upright axis: what was toward the viewer goes to the right (+x) at 90°."""
-        return Environment(turned_map(self.lat_long, rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))))
+        return Environment(
+            turned_map(self.lat_long, rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0])))
+        )
 
     def to_exr(self, path: str | Path) -> None:
         """Write it as OpenEXR's lat-long environment."""

@@ -26,7 +26,12 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
 from factorlib.wholefile import write_bytes
 
-SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18  # pixels of a photo's longer side, of a mesh, between pictures, and of a line of text
+SIDE, MESH_SIDE, MARGIN, HEAD = (
+    320,
+    240,
+    12,
+    18,
+)  # pixels of a photo's longer side, of a mesh, between pictures, and of a line of text
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 DISTANCE = 6.0  # of the camera from a mesh, in its radii
 HATCH = 8  # pixels from line to line
@@ -57,7 +62,14 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
     stored = open_photo(path, f"{key}.image")
     factor = max(1, -(-max(stored.size) // SIDE))
     image = picture(decoded(stored, photo.encoding, factor, path).radiance, 1.0)
-    labels = read_labels(photo.masks, lambda name: dataset.folder / name, dataset.spec.materials, stored.size, photo.image, f"{key}.masks")
+    labels = read_labels(
+        photo.masks,
+        lambda name: dataset.folder / name,
+        dataset.spec.materials,
+        stored.size,
+        photo.image,
+        f"{key}.masks",
+    )
     height, width = image.shape[:2]
     fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
     return image, Labels(labels.label[fewer], labels.left_out[fewer])
@@ -89,8 +101,13 @@ def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
 
 def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[np.ndarray, "k 3"]:
     """By label, distinct and near to what the photos show there; row 0 is the background's."""
-    pixels, labels = (np.concatenate(parts) for parts in zip(*((i.reshape(-1, 3), p.label.ravel()) for i, p in pictures), strict=True))
-    mean = [pixels[labels == k].mean(axis=0) / 255 if (labels == k).any() else np.full(3, 0.5) for k in range(1, len(names) + 1)]
+    pixels, labels = (
+        np.concatenate(parts) for parts in zip(*((i.reshape(-1, 3), p.label.ravel()) for i, p in pictures), strict=True)
+    )
+    mean = [
+        pixels[labels == k].mean(axis=0) / 255 if (labels == k).any() else np.full(3, 0.5)
+        for k in range(1, len(names) + 1)
+    ]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
     return np.array([PAPER, *(rgb_of(tags[name]) for name in names)], np.uint8)
 

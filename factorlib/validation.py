@@ -68,7 +68,9 @@ class Validation:
                 found.append(error)
         return found
 
-    def _checks(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> Iterator[tuple[str, Check]]:
+    def _checks(
+        self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path
+    ) -> Iterator[tuple[str, Check]]:
         spec = self.dataset.spec
         entries = spec.photos if photo is None else [self.dataset.photo(photo)]
         if slice_ == "photo":

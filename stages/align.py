@@ -28,12 +28,24 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import PhotoFacts, read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, RunnerUp, entry_of, read_poses, write_photo_poses
+from factorlib.results.poses import (
+    AS_IT_IS,
+    FILE,
+    CameraEntry,
+    ObjectEntry,
+    PhotoPoses,
+    RunnerUp,
+    entry_of,
+    read_poses,
+    write_photo_poses,
+)
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
-CURE_OF_EXTERNAL = "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
+CURE_OF_EXTERNAL = (
+    "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
+)
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
@@ -58,7 +70,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
     camera, known = camera_of(slice_, facts, name)
     check_given_poses(slice_, objects, name)
-    warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], inputs.facts["dataset.materials"], name)
+    warn_of_materials(
+        channels["label"], [each.caster.mesh.labels for each in objects], inputs.facts["dataset.materials"], name
+    )
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
     before = earlier_focal(earlier.camera, facts.factor) if earlier else None
     result = placed(objects, camera, known, name, params.search, before)
@@ -76,7 +90,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def objects_of(
-    slice_: schema.ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int = 1, earlier: PhotoPoses | None = None
+    slice_: schema.ObjectsSlice,
+    channels: dict,
+    inputs: Inputs,
+    params: Params,
+    factor: int = 1,
+    earlier: PhotoPoses | None = None,
 ) -> list[ObjectToPlace]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
@@ -102,7 +121,9 @@ def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace],
     """Raise InputError where a pose of dataset.yaml, or of its source of cameras, puts its object behind the camera."""
     for each, said in zip(objects, slice_.objects, strict=True):
         if each.pose is not None:
-            check_before_camera(each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source)
+            check_before_camera(
+                each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source
+            )
 
 
 def pose_of(obj: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
@@ -155,7 +176,13 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
         scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,
-        source=source if found is None else "refined" if found.earlier else "keypoints" if found.by_keypoints else "found",
+        source=source
+        if found is None
+        else "refined"
+        if found.earlier
+        else "keypoints"
+        if found.by_keypoints
+        else "found",
         score=found.score if found else None,
         runner_up=runner_up_entry(found, obj.caster),
         **msgspec.structs.asdict(trust),
@@ -169,7 +196,9 @@ def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
     if found is None or found.runner_up is None:
         return None
     other = found.runner_up
-    return RunnerUp(**entry_of(other.state.pose(caster)), score=other.score, normal_difference_deg=other.normal_difference_deg)
+    return RunnerUp(
+        **entry_of(other.state.pose(caster)), score=other.score, normal_difference_deg=other.normal_difference_deg
+    )
 
 
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
@@ -190,5 +219,11 @@ def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:
     """
     channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
     channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
-    channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": certainty, "back": maps.back}
+    channels |= {
+        "depth": maps.depth,
+        "label": maps.label,
+        "object": maps.object,
+        "confidence": certainty,
+        "back": maps.back,
+    }
     write_exr(path, channels)

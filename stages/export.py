@@ -74,11 +74,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_glb(out / f"{name}.glb", files.read.mesh(name, mesh), names, materials)
     progress(3, 4, "scenes")
     write_script(out / "scenes")
-    poses, max_depth = read_poses(inputs["align"] / "poses.json"), ALL_BOUNCES if table.model.interreflection else DIRECT
+    poses, max_depth = (
+        read_poses(inputs["align"] / "poses.json"),
+        ALL_BOUNCES if table.model.interreflection else DIRECT,
+    )
     for photo, light in lights.items():
         view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
         shapes = [
-            shape for obj in objects[photo].objects for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
+            shape
+            for obj in objects[photo].objects
+            for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
         ]
         exposure = np.array(exposures.get(photo, [1.0] * 3))
         environment = _environment(out, photo, light, lobes[light.illumination], exposure, params)
@@ -95,8 +100,12 @@ def _in_gauge(solved: Path, illuminations: set[str]) -> tuple[MaterialTable, dic
     factor = headroom_factor(table.materials)
     found = read_lobes(solved / "lobes.parquet")
     for name in sorted(illuminations - set(found)):
-        log.warning("illumination '%s' was not solved for, because no pixel in it was observed: it is written as black", name)
-    return table_in_gauge(table, factor), {name: found.get(name, no_lobes()).scaled(1 / factor) for name in sorted(illuminations)}
+        log.warning(
+            "illumination '%s' was not solved for, because no pixel in it was observed: it is written as black", name
+        )
+    return table_in_gauge(table, factor), {
+        name: found.get(name, no_lobes()).scaled(1 / factor) for name in sorted(illuminations)
+    }
 
 
 def _write_lights(out: Path, lobes: dict[str, Lobes], params: Params) -> None:
@@ -116,14 +125,20 @@ def _write_coverage(out: Path, solved: Path, lobes: dict[str, Lobes], params: Pa
     for name in lobes:
         if (file := solved / "coverage" / f"{name}.exr").exists():
             channels = read_exr(file)
-            write_rgb_exr(out / "coverage" / f"{name}.exr", sampled(np.stack([channels[c] for c in "RGB"], -1), directions), LAT_LONG)
+            write_rgb_exr(
+                out / "coverage" / f"{name}.exr",
+                sampled(np.stack([channels[c] for c in "RGB"], -1), directions),
+                LAT_LONG,
+            )
 
 
 def _mitsuba_map(light: Lobes, params: Params) -> np.ndarray:
     return mitsuba_map(light, params.mitsuba_height, 2 * params.mitsuba_height)
 
 
-def _environment(out: Path, photo: str, light: LightSlice, lobes: Lobes, exposure: np.ndarray, params: Params) -> Environment:
+def _environment(
+    out: Path, photo: str, light: LightSlice, lobes: Lobes, exposure: np.ndarray, params: Params
+) -> Environment:
     """A grey exposure is the scale of the illumination's map; a coloured one needs a map of the photo's own."""
     camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T
     if np.ptp(exposure) == 0:
@@ -147,7 +162,9 @@ class MeshFiles:
         self.read = MeshesOnce(inputs.file, materials, crease_deg)
         self._stems: dict[tuple, str] = {}
 
-    def shapes(self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]) -> list[Shape]:
+    def shapes(
+        self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]
+    ) -> list[Shape]:
         """One per material of the object."""
         mesh, stem = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), self._written(obj, meshes)
         place = np.eye(4)

@@ -56,7 +56,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses, slices = read_poses(inputs["align"] / FILE), inputs.facts["dataset.objects"]
     found: dict[str, list[Found]] = {}
     for photo in sorted(poses):
-        for mesh, one in sightings_of(photo, msgspec.convert(slices[photo], ObjectsSlice), poses[photo], inputs, params):
+        for mesh, one in sightings_of(
+            photo, msgspec.convert(slices[photo], ObjectsSlice), poses[photo], inputs, params
+        ):
             found.setdefault(mesh, []).append(one)
     report = {}
     for done, (mesh, sightings) in enumerate(sorted(found.items())):
@@ -64,14 +66,20 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         verdict = proportions([one.sighting for one in sightings], params)
         report[mesh] = fitted(verdict, sightings)
         if verdict.used:
-            log.warning("mesh '%s' fits better with its axes times %s", mesh, ", ".join(f"{f:.3f}" for f in verdict.fitted.factors))
+            log.warning(
+                "mesh '%s' fits better with its axes times %s",
+                mesh,
+                ", ".join(f"{f:.3f}" for f in verdict.fitted.factors),
+            )
             for one, state in zip(sightings, verdict.fitted.states, strict=True):
                 poses[one.photo] = placed(poses[one.photo], one, state, verdict.fitted.factors)
     write_json(out / "meshes.json", report)
     write_poses(out / FILE, poses)
 
 
-def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: Inputs, params: Params) -> Iterator[tuple[str, Found]]:
+def sightings_of(
+    photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: Inputs, params: Params
+) -> Iterator[tuple[str, Found]]:
     """(mesh, sighting) of every object whose pose was found, with its mask and the mesh as its file has it."""
     channels, facts = read_exr(inputs["masks"] / f"{photo}.exr"), read_photo_facts(inputs["masks"] / f"{photo}.json")
     height, width = channels["label"].shape
@@ -82,7 +90,9 @@ def sightings_of(photo: str, slice_: ObjectsSlice, entry: PhotoPoses, inputs: In
         found, mesh = entry.objects[obj.name], slice_.meshes[obj.mesh]
         if found.source not in SEARCHED or (found.silhouette_iou or 0.0) < params.least_iou:
             continue
-        read = read_mesh(inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.made_of, obj.materials, limits=NO_LIMITS)
+        read = read_mesh(
+            inputs.file(mesh.file), inputs.facts["dataset.materials"], mesh.made_of, obj.materials, limits=NO_LIMITS
+        )
         silhouette = silhouette_of_object(channels, number, read.labels, obj.mask is not None)
         state = state_of(found.pose, camera, scaled(read, found.scale))
         target = target_of(silhouette, read.labels, params.resolution, MARGIN)
@@ -104,7 +114,13 @@ def placed(entry: PhotoPoses, one: Found, state: State, factors: np.ndarray) -> 
     """The photo's entry of poses.json with an object's pose of the fitted mesh; its runner-up was of another mesh."""
     caster = Caster(scaled(one.sighting.mesh, factors))
     pose, seen = state.pose(caster), state.camera(one.sighting.camera)
-    camera = msgspec.structs.replace(entry.camera, focal_px=float(seen.focal)) if one.sighting.prior.sigma > 0 else entry.camera
+    camera = (
+        msgspec.structs.replace(entry.camera, focal_px=float(seen.focal))
+        if one.sighting.prior.sigma > 0
+        else entry.camera
+    )
     iou = silhouette_iou(one.silhouette, rasterise(caster, seen, pose).label)
     changed = {**entry_of(pose), "scale": tuple(factors.tolist()), "silhouette_iou": iou, "runner_up": None}
-    return PhotoPoses(camera, entry.objects | {one.object: msgspec.structs.replace(entry.objects[one.object], **changed)})
+    return PhotoPoses(
+        camera, entry.objects | {one.object: msgspec.structs.replace(entry.objects[one.object], **changed)}
+    )

@@ -47,7 +47,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     check_pixels(stored.size, params.most_megapixels, path, key)
     progress(0, 3, f"{name}: masks")  # before the photo: they say how far it is averaged down while it is read
     labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, f"photos[{name}].masks")
-    objects = read_objects([(o.name, o.mask) for o in facts.objects], inputs.file, stored.size, f"photos[{name}].objects")
+    objects = read_objects(
+        [(o.name, o.mask) for o in facts.objects], inputs.file, stored.size, f"photos[{name}].objects"
+    )
     factor = factor_of(labels, params)
     labels, objects = reduced(labels, factor, path, f"photos[{name}].masks"), box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
@@ -62,7 +64,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
 def factor_of(labels: Labels, params: Params) -> int:
     """The least by which the photo fits both of the bounds."""
     height, width = labels.label.shape
-    factor = max(least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame))
+    factor = max(
+        least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)
+    )
     return min(factor, height, width)
 
 
@@ -75,7 +79,9 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
     label[left_out] = 0
     if not label.any():
         found = f"averaged down {factor} × {factor}, no pixel shows mostly one material: the mask is made of specks"
-        raise InputError(found, file=path, key=key, cure='SET="masks.frame=…" with more pixels, or a mask of whole objects')
+        raise InputError(
+            found, file=path, key=key, cure='SET="masks.frame=…" with more pixels, or a mask of whole objects'
+        )
     return Labels(label, left_out)
 
 
@@ -84,9 +90,13 @@ def _valid(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:
     inside = labels.label > 0
     lost = int((inside & ~photo.finite).sum())
     if lost == int(inside.sum()):
-        raise InputError("every pixel in its mask is NaN or infinite", file=path, key=key, cure="render or develop the photo again")
+        raise InputError(
+            "every pixel in its mask is NaN or infinite", file=path, key=key, cure="render or develop the photo again"
+        )
     if lost:
-        log.warning("%s: %d of the %d pixels in its mask are NaN or infinite: they are not used", path, lost, int(inside.sum()))
+        log.warning(
+            "%s: %d of the %d pixels in its mask are NaN or infinite: they are not used", path, lost, int(inside.sum())
+        )
     return inside & photo.finite
 
 

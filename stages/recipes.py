@@ -80,8 +80,13 @@ def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path,
     """The same with other materials."""
     report(0)
     known, scene = results.known(recipe.table), results.scene(photo)
-    materials = {name: known[recipe.materials[name]] if name in recipe.materials else own for name, own in scene.materials.items()}
-    traced = Traced(traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples), results.tone(photo))
+    materials = {
+        name: known[recipe.materials[name]] if name in recipe.materials else own
+        for name, own in scene.materials.items()
+    }
+    traced = Traced(
+        traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples), results.tone(photo)
+    )
     _write(out / photo, traced.over(results.photo(photo)))
 
 
@@ -89,12 +94,18 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     """A further object on the ground of one that is there."""
     scene = results.scene(photo)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    polish = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness) if any(recipe.ground.specular) else None
+    polish = (
+        Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
+        if any(recipe.ground.specular)
+        else None
+    )
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
     if not ground.plane.seen_from_above:
         found = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
         raise InputError(found, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
-    known = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's alone
+    known = {
+        f"{NEW}{name}": material for name, material in results.known(recipe.table).items()
+    }  # the new object's alone
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
         spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)

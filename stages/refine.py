@@ -66,10 +66,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         photo |= {c: straightened(photo[c], tone.exponent, tone.pivot) for c in "RGB"}
     shadows = params.directions if table.model.self_shadowing else 0
     scene = scene_of(inputs, photo, entry, shadows)
-    pixels, operator = pixels_of(photo, known, params.pixels, params.seed), reflection_operator("network", weights=inputs["train"])
+    pixels, operator = (
+        pixels_of(photo, known, params.pixels, params.seed),
+        reflection_operator("network", weights=inputs["train"]),
+    )
     if pixels is None:
         log.warning("%s: too few pixels of known materials to tell poses by: they stay as they were found", name)
-    results = refined_photo(scene, pixels, Surfaces(materials, operator), params, lambda done, total: progress(done, total, name))
+    results = refined_photo(
+        scene, pixels, Surfaces(materials, operator), params, lambda done, total: progress(done, total, name)
+    )
     camera, objects = entry.camera, {}
     for (own, found), each, of in zip(entry.objects.items(), results, scene.objects, strict=True):
         objects[own] = decided(found, of, each, scene.camera)
@@ -87,12 +92,19 @@ def scene_of(inputs: Inputs, photo: dict, entry: PhotoPoses, shadows: int) -> Sc
         file = inputs.file(mesh.file)
         read = read_mesh(file, inputs.facts["dataset.materials"], mesh.made_of, own.materials, limits=NO_LIMITS)
         caster = Caster(scaled(read, found.scale))
-        silhouette, other = silhouette_of_object(photo, number, caster.mesh.labels, own.mask is not None), found.runner_up
+        silhouette, other = (
+            silhouette_of_object(photo, number, caster.mesh.labels, own.mask is not None),
+            found.runner_up,
+        )
         moves = found.source in SEARCHED
-        objects.append(PosedObject(caster, silhouette, found.pose, other.pose if other else None, moves, not found.left_out))
+        objects.append(
+            PosedObject(caster, silhouette, found.pose, other.pose if other else None, moves, not found.left_out)
+        )
     height, width = photo["label"].shape
     camera, facts = entry.camera.camera(width, height), read_photo_facts(inputs["masks"] / f"{inputs.photo}.json")
-    return Scene(camera, objects, prior_before(camera.focal, entry.camera.focal_source, facts.focal_px, width, height), shadows)
+    return Scene(
+        camera, objects, prior_before(camera.focal, entry.camera.focal_source, facts.focal_px, width, height), shadows
+    )
 
 
 def decided(entry: ObjectEntry, own: PosedObject, result: Refined, camera: Camera) -> ObjectEntry:
@@ -110,5 +122,7 @@ def decided(entry: ObjectEntry, own: PosedObject, result: Refined, camera: Camer
     turned = angle_between(result.after.rotation, result.before.rotation)
     moved = Moved(turned, normal_difference(own.caster, target, camera, result.before, result.after))
     found = verdict.candidates["found"]
-    candidates = {name: CandidateEntry(c.held_out_loss, *c.gain(found), c.score) for name, c in verdict.candidates.items()}
+    candidates = {
+        name: CandidateEntry(c.held_out_loss, *c.gain(found), c.score) for name, c in verdict.candidates.items()
+    }
     return msgspec.structs.replace(entry, refined=Refinement(verdict.chosen, verdict.ruled_out, moved, candidates))

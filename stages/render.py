@@ -94,7 +94,9 @@ def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False
     write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels) if disc else pixels)
 
 
-def _write_map(stem: Path, reflector: Reflector, material: Reflectance, normals: np.ndarray, exposure: float, size: int) -> None:
+def _write_map(
+    stem: Path, reflector: Reflector, material: Reflectance, normals: np.ndarray, exposure: float, size: int
+) -> None:
     """Radiance by normal, and which normals the photo shows: ringed in the PNG."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     radiance, observed = ball(reflector, material, size), observed_cells(normals, size)

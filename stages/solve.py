@@ -97,7 +97,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     earlier = _earlier(params, inputs, relative)
     problem = _problem(params, inputs, at_one_exposure(seen, relative))
     _warn(before_solving(names, seen.photos, problem.blocks))
-    answer = Answer(names, problem, _solved(params, problem, earlier, inputs, progress), relative, params.solver, earlier)
+    answer = Answer(
+        names, problem, _solved(params, problem, earlier, inputs, progress), relative, params.solver, earlier
+    )
     _write(out, answer, params)
 
 
@@ -109,10 +111,18 @@ def operator_of(params: Params) -> str:
 
 def _problem(params: Params, inputs: Inputs, seen: Observations) -> JointProblem:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    rotations = {photo: np.array(light.world_from_camera) for photo, light in lights.items() if light.world_from_camera is not None}
+    rotations = {
+        photo: np.array(light.world_from_camera)
+        for photo, light in lights.items()
+        if light.world_from_camera is not None
+    }
     noise = Noise(params.noise_absolute, params.noise_relative)
-    blocks = blocks_of_observations(seen, noise, held_out=params.held_out, world_from_camera=rotations, seed=params.seed)
-    return JointProblem(blocks, reflection_operator(operator_of(params), weights=inputs["train"]), Loss(prior=params.prior), inputs.map)
+    blocks = blocks_of_observations(
+        seen, noise, held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+    )
+    return JointProblem(
+        blocks, reflection_operator(operator_of(params), weights=inputs["train"]), Loss(prior=params.prior), inputs.map
+    )
 
 
 def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earlier | None:
@@ -120,11 +130,17 @@ def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earl
     if "start" not in inputs.folders:
         return None
     if params.solver != "bundle":
-        raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure="leave it out, or set solve.solver=bundle")
+        raise InputError(
+            f"the solver {params.solver} starts from nothing",
+            key="solve.start",
+            cure="leave it out, or set solve.solver=bundle",
+        )
     return read_earlier(inputs["start"]).beside(relative)
 
 
-def _solved(params: Params, problem: JointProblem, earlier: Earlier | None, inputs: Inputs, progress: Progress) -> Solution:
+def _solved(
+    params: Params, problem: JointProblem, earlier: Earlier | None, inputs: Inputs, progress: Progress
+) -> Solution:
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
@@ -132,7 +148,9 @@ def _solved(params: Params, problem: JointProblem, earlier: Earlier | None, inpu
     journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
     if params.solver == "few_lobes":
         few = FewLobes(**_own(params, LobeChoices))
-        return few_lobes(problem, one_lobe_each(len(names)), FewLobesRun(few, of_rounds(progress, few.rounds), journal=journal))
+        return few_lobes(
+            problem, one_lobe_each(len(names)), FewLobesRun(few, of_rounds(progress, few.rounds), journal=journal)
+        )
     choices = Choices(**_own(params, Choices))
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(choices, earlier) if earlier else choices
@@ -159,7 +177,9 @@ def _write(out: Path, answer: Answer, params: Params) -> None:
         write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
 
 
-def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
+def _uncertainty(
+    answer: Answer, problem: JointProblem, params: Params
+) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Standard errors of the materials, and relative ones of each light."""
     solution = answer.solution
     if solution.materials:
@@ -167,7 +187,9 @@ def _uncertainty(answer: Answer, problem: JointProblem, params: Params) -> tuple
             Posterior(of.sampled(params.observations, params.seed), fit, read_light_prior())
             for of, fit in ((sure_ones(problem), solution.materials), (problem, solution.lights))
         )
-        errors = in_gauge_of(of_materials.standard_errors(), solution.materials.point.materials, solution.point.materials)
+        errors = in_gauge_of(
+            of_materials.standard_errors(), solution.materials.point.materials, solution.point.materials
+        )
         return errors, of_lights.relative_standard_errors()
     errors = standard_errors(problem, solution.point)
     of_light = partial(relative_standard_errors, loss=problem.loss, sigma=errors.deviation)

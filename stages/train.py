@@ -65,7 +65,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
     try:
-        curves = {"diffuse": _diffuse(params, inputs, out, progress), "specular": _specular(params, inputs, out, progress)}
+        curves = {
+            "diffuse": _diffuse(params, inputs, out, progress),
+            "specular": _specular(params, inputs, out, progress),
+        }
     finally:
         torch.set_num_threads(threads)
     write_json(out / "accuracy.json", {part: table for part, (table, _) in curves.items()})
@@ -93,10 +96,16 @@ def _specular(params: Params, inputs: Inputs, out: Path, progress: Progress) -> 
 def _diffuse(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
     seen = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
     held_out = diffuse_samples(params.held_out, params.seed + 1_000_003)
-    schedule = Schedule(params.diffuse_steps, params.batch, params.rate, params.diffuse_width, params.diffuse_depth, params.seed)
+    schedule = Schedule(
+        params.diffuse_steps, params.batch, params.rate, params.diffuse_width, params.diffuse_depth, params.seed
+    )
     problem = diffuse_problem(held_out)
     layers, curve = train(
-        diffuse_problem(seen), problem, schedule, _report(progress, "diffuse", params.diffuse_steps), _checkpoint(inputs, "diffuse")
+        diffuse_problem(seen),
+        problem,
+        schedule,
+        _report(progress, "diffuse", params.diffuse_steps),
+        _checkpoint(inputs, "diffuse"),
     )
     write_layers(out / "diffuse.safetensors", layers, inputs="see factorlib.reflection.network.diffuse_features")
     return diffuse_table(problem.float().errors(layers), held_out.sharpness, held_out.nz), curve
@@ -110,7 +119,9 @@ def _report(progress: Progress, part: str, steps: int) -> Callable[[Step], None]
     def report(point: Step) -> None:
         """Errors of held-out samples at a step."""
         progress(
-            point.step, steps, f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)"
+            point.step,
+            steps,
+            f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)",
         )
 
     return report

@@ -67,7 +67,9 @@ def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, 
     """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
     found = read_photo_poses(inputs["align"] / f"{inputs.photo}.json")
     camera, occluders = found.camera.camera(shape[1], shape[0]), occluders_of(inputs, found.objects)
-    past = sight(occluders, camera, np.column_stack([seen.x, seen.y]), seen.normal, params.directions, params.cast_points)
+    past = sight(
+        occluders, camera, np.column_stack([seen.x, seen.y]), seen.normal, params.directions, params.cast_points
+    )
     return msgspec.structs.replace(seen, visibility=past.visibility, met=past.met) if past else seen
 
 
@@ -76,6 +78,8 @@ def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
     for thing in slice_.objects:
         entry = slice_.meshes[thing.mesh]
-        mesh = read_mesh(inputs.file(entry.file), inputs.facts["dataset.materials"], entry.made_of, thing.materials, limits=NO_LIMITS)
+        mesh = read_mesh(
+            inputs.file(entry.file), inputs.facts["dataset.materials"], entry.made_of, thing.materials, limits=NO_LIMITS
+        )
         meshes.append(scaled(mesh, poses[thing.name].scale))
     return Occluders(meshes, [poses[thing.name].pose for thing in slice_.objects])

@@ -45,7 +45,12 @@ def main(
     rows = []
     for rate in rates or RATES:
         found = tried(seed, side, rate)
-        numbers = (f"{np.mean(found.losses[-FLAT:]):.3g}", str(len(found.losses)), "yes" if found.flat else "no", f"{found.processor:.0f}")
+        numbers = (
+            f"{np.mean(found.losses[-FLAT:]):.3g}",
+            str(len(found.losses)),
+            "yes" if found.flat else "no",
+            f"{found.processor:.0f}",
+        )
         rows.append([f"{rate:g}", *numbers])
     print(table(["rate", "loss at the end", "steps", "flat", "processor, s"], rows))
 

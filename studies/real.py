@@ -52,10 +52,21 @@ def main(
     absent = [folder for folder in folders if not (folder / "dataset.yaml").is_file()]
     for folder in absent:
         print(f"{folder}: absent: nothing is measured of it")
-    rows = [row for folder in folders if folder not in absent for row in rows_of(folder.resolve().name, measured(folder))]
+    rows = [
+        row for folder in folders if folder not in absent for row in rows_of(folder.resolve().name, measured(folder))
+    ]
     if not rows:
         return
-    found = table(["set: photo", "DSSIM of the re-synthesis", "of flat colours", "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"], rows)
+    found = table(
+        [
+            "set: photo",
+            "DSSIM of the re-synthesis",
+            "of flat colours",
+            "PSNR, tone-mapped, of the re-synthesis (dB)",
+            "of flat colours",
+        ],
+        rows,
+    )
     print(found)
     if docs:
         refresh(DOCS, {PLACE: found})

@@ -46,7 +46,9 @@ MEASURES = {
 
 def perturbed(seen: Observations, rng: np.random.Generator) -> Observations:
     """The same observations, each radiance off by about `PERTURBED` of it."""
-    return msgspec.structs.replace(seen, radiance=seen.radiance * (1 + PERTURBED * rng.standard_normal(seen.radiance.shape)))
+    return msgspec.structs.replace(
+        seen, radiance=seen.radiance * (1 + PERTURBED * rng.standard_normal(seen.radiance.shape))
+    )
 
 
 def errors_of(case: Case, lights: dict[int, Light], time: int) -> dict[str, float]:
@@ -60,7 +62,12 @@ def errors_of(case: Case, lights: dict[int, Light], time: int) -> dict[str, floa
             write_observations(urm / f"{name}.parquet", perturbed(seen, rng) if time else seen)
         facts = {light_name(li): msgspec.to_builtins(LightSlice(light_name(li), None)) for li in case.lights}
         folders = {"urm": urm, "train": SHIPPED}
-        solve.main(solve.Params(), Inputs(folders, {"dataset.materials": case.material_names, "dataset.light": facts}), out, silent)
+        solve.main(
+            solve.Params(),
+            Inputs(folders, {"dataset.materials": case.material_names, "dataset.light": facts}),
+            out,
+            silent,
+        )
         return scored(case, truths, out, lights).score.values
 
 

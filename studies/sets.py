@@ -70,11 +70,19 @@ def shot_of(seed: int, materials: list[int], number: int, names: list[str]) -> S
         depth = (pose.rotation @ caster.centre + pose.translation)[2]
         aside = np.array([(SIDE * (k + 0.5) - width / 2) * depth / CAMERA.focal, 0.0, 0.0])
         label = np.full(len(caster.mesh.faces), names.index(SEVEN[m]) + 1, np.int16)
-        bodies.append((SEVEN[m], msgspec.structs.replace(caster.mesh, face_label=label), Pose(pose.rotation, pose.translation + aside)))
+        bodies.append(
+            (
+                SEVEN[m],
+                msgspec.structs.replace(caster.mesh, face_label=label),
+                Pose(pose.rotation, pose.translation + aside),
+            )
+        )
     return Shot(camera, bodies)
 
 
-def radiance_of(shot: Shot, seed: int, names: list[str], lit: Light, rng: np.random.Generator) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
+def radiance_of(
+    shot: Shot, seed: int, names: list[str], lit: Light, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
     """Radiance with noise, and the true normals; black beside the bodies."""
     maps, reflectances = rasterise(shot.meshes, shot.camera, shot.poses), materials_of(seed)
     picture = np.zeros(maps.normal.shape)
@@ -104,7 +112,11 @@ def write_set(out: Path, seed: int, entries: list[Entry]) -> None:
         poses[photo] = {name: pose for name, _, pose in shot.bodies}
     write_truth(out, {name: materials_of(seed)[name] for name in names}, poses)
     meshes = {name: {"file": f"meshes/{name}.obj", "material": names[0]} for name in BODIES}
-    write_yaml(out / "dataset.yaml", {"format": 1, "materials": names, "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}, COMMENT)
+    write_yaml(
+        out / "dataset.yaml",
+        {"format": 1, "materials": names, "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"},
+        COMMENT,
+    )
 
 
 def _photo_entry(photo: str, shot: Shot, meshes: list[str]) -> dict:
@@ -113,7 +125,13 @@ def _photo_entry(photo: str, shot: Shot, meshes: list[str]) -> dict:
         for (name, _, pose), mesh in zip(shot.bodies, meshes, strict=True)
     ]
     camera = {"focal_px": float(shot.camera.focal), "principal_point": [float(v) for v in shot.camera.centre]}
-    return {"name": photo, "image": f"photos/{photo}.exr", "masks": f"masks/{photo}.png", "camera": camera, "objects": objects}
+    return {
+        "name": photo,
+        "image": f"photos/{photo}.exr",
+        "masks": f"masks/{photo}.png",
+        "camera": camera,
+        "objects": objects,
+    }
 
 
 def main(

@@ -40,7 +40,9 @@ def against_the_paper(found: dict[str, Conclusion], page: str = "") -> str:
     for name, study in STUDIES.items():
         title = f"[{study.title}](#{study.title.lower().replace(' ', '-')})"
         new = name in found and (_full(found[name]) or not is_full(page, name))
-        rows.append([title, study.paper, answer_to_the_paper(found[name]) if new else _answer_on(page, title) or "not run"])
+        rows.append(
+            [title, study.paper, answer_to_the_paper(found[name]) if new else _answer_on(page, title) or "not run"]
+        )
     return table(["study", "the paper", "here"], rows)
 
 
@@ -81,7 +83,11 @@ def numbers(found: Conclusion) -> str:
 def conclusions(project: Studies) -> dict[str, Conclusion]:
     """Those of the studies of this scale that were run."""
     files = {name: project.build / name / "table.json" for name in STUDIES}
-    return {name: msgspec.convert(read_json(file), Conclusion, str_keys=True) for name, file in files.items() if file.is_file()}
+    return {
+        name: msgspec.convert(read_json(file), Conclusion, str_keys=True)
+        for name, file in files.items()
+        if file.is_file()
+    }
 
 
 def measuring(study: Study) -> list[str]:
@@ -111,7 +117,9 @@ def main(
     print("\n\n".join([everything, *parts.values()]))
     if docs:
         refresh(DOCS, {"conclusions": everything})
-        for name, part in parts.items() if not quick else [(n, part) for n, part in parts.items() if not is_full(page, n)]:
+        for name, part in (
+            parts.items() if not quick else [(n, part) for n, part in parts.items() if not is_full(page, n)]
+        ):
             refresh(DOCS, {name: part})
 
 

@@ -15,7 +15,12 @@ from factorlib.elementary import square_root
 
 ROOT = Path(__file__).resolve().parents[1]
 EMULATOR = shutil.which("qemu-x86_64")
-WIDEST = {"OPENBLAS_CORETYPE": "", "ATEN_CPU_CAPABILITY": "", "MKL_CBWR": "", "NPY_DISABLE_CPU_FEATURES": ""}  # what this processor has
+WIDEST = {
+    "OPENBLAS_CORETYPE": "",
+    "ATEN_CPU_CAPABILITY": "",
+    "MKL_CBWR": "",
+    "NPY_DISABLE_CPU_FEATURES": "",
+}  # what this processor has
 SOLVE = """
 import sys
 if sys.argv[1] == "fixed":
@@ -51,7 +56,9 @@ def solved(how: str, *emulator: str, **environment: str) -> str:
     """The hash of a brief solve in a process of its own."""
     set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES} | {"OMP_NUM_THREADS": "1"}
     set_ |= {name: value for name, value in environment.items() if value}
-    done = subprocess.run([*emulator, sys.executable, "-c", SOLVE, how], cwd=ROOT, env=set_, capture_output=True, text=True)
+    done = subprocess.run(
+        [*emulator, sys.executable, "-c", SOLVE, how], cwd=ROOT, env=set_, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 

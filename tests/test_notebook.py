@@ -46,10 +46,19 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(r
     monkeypatch.chdir(root / "docs")
     names = {}
     shown = [html for code in cells("code") if (html := run(code, names))]
-    assert [html[:4] for html in shown] == ["<p>.", "<img", "<img", "<img", "<img", "<img"] and "0.350 ± 0.100" in shown[0]
+    assert [html[:4] for html in shown] == [
+        "<p>.",
+        "<img",
+        "<img",
+        "<img",
+        "<img",
+        "<img",
+    ] and "0.350 ± 0.100" in shown[0]
     said = capsys.readouterr().out
     assert "roughness 0.350 ± 0.100" in said
-    assert [word in said for word in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'")] == [True] * 3
+    assert [word in said for word in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'")] == [
+        True
+    ] * 3
     assert sorted(path.name for path in (root / "docs").iterdir()) == ["chair.exr", "chair.png", "side.exr", "side.hdr"]
 
 

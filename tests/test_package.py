@@ -26,7 +26,10 @@ def names(requirements):
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
-OF_CLUSTERS = {ROOT / "factorlib" / name for name in ("parcel.py", *(f"runner/{module}.py" for module in ("blocks", "child", "cluster", "host")))}
+OF_CLUSTERS = {
+    ROOT / "factorlib" / name
+    for name in ("parcel.py", *(f"runner/{module}.py" for module in ("blocks", "child", "cluster", "host")))
+}
 
 
 def imported(files):
@@ -64,7 +67,12 @@ def installed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     source = folder / "source"
-    files = subprocess.run(["git", "ls-files", "--", "factorlib", "pyproject.toml", "README.md", "LICENSE"], cwd=ROOT, check=True, capture_output=True)
+    files = subprocess.run(
+        ["git", "ls-files", "--", "factorlib", "pyproject.toml", "README.md", "LICENSE"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     for name in files.stdout.decode().splitlines():
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)

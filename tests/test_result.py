@@ -60,7 +60,11 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
 def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder.parent.parent)
     assert factorlib.load_result("set").photos == factorlib.load_result("build/set").photos
-    for name, words in [("build/sett", "did you mean 'build/set'"), ("data/set", "build/set"), ("build/set/export", "build/set")]:
+    for name, words in [
+        ("build/sett", "did you mean 'build/set'"),
+        ("data/set", "build/set"),
+        ("build/set/export", "build/set"),
+    ]:
         with pytest.raises(InputError, match="there is no result here") as error:
             factorlib.load_result(name)
         assert words in str(error.value)
@@ -71,7 +75,9 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
 
 def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
     monkeypatch.chdir(folder.parent.parent / "data" / "set")
-    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(folder)
+    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(
+        folder
+    )
     with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
         factorlib.load_result("../../build/sets")
 
@@ -96,11 +102,23 @@ def renamed(file, old, new):
     "break_, words",
     [
         (lambda root: shutil.rmtree(root / "build/set/export"), ["export is missing", "make export DATASET=set"]),
-        (lambda root: (root / "data/set").rename(root / "data/moved"), ["data set 'data/set' is not there any more", "make all DATASET="]),
+        (
+            lambda root: (root / "data/set").rename(root / "data/moved"),
+            ["data set 'data/set' is not there any more", "make all DATASET="],
+        ),
         (lambda root: (root / "build/set/dataset.txt").write_text(""), ["dataset.txt", "is not there any more"]),
-        (lambda root: renamed(root / "data/set/dataset.yaml", '"unseen"', '"new"'), ["earlier dataset.yaml", "no material 'new'", "make all DATASET=set"]),
-        (lambda root: renamed(root / "data/set/dataset.yaml", '"name": "front"', '"name": "hall"'), ["no photo 'hall'"]),
-        (lambda root: renamed(root / "data/set/dataset.yaml", '"name": "chair"', '"name": "stool"'), ["no object 'front/stool', no object 'side/stool'"]),
+        (
+            lambda root: renamed(root / "data/set/dataset.yaml", '"unseen"', '"new"'),
+            ["earlier dataset.yaml", "no material 'new'", "make all DATASET=set"],
+        ),
+        (
+            lambda root: renamed(root / "data/set/dataset.yaml", '"name": "front"', '"name": "hall"'),
+            ["no photo 'hall'"],
+        ),
+        (
+            lambda root: renamed(root / "data/set/dataset.yaml", '"name": "chair"', '"name": "stool"'),
+            ["no object 'front/stool', no object 'side/stool'"],
+        ),
     ],
 )
 def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, break_, words):

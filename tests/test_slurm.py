@@ -55,7 +55,9 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
     script = cluster.job_script().replace(f"{LIBRARY}/.venv/bin/python", sys.executable)
     project = toy.make_project(tmp_path / "root")
     other = toy.copy(project, tmp_path / "beside")
-    job = subprocess.Popen(["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True)
+    job = subprocess.Popen(
+        ["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True
+    )
     try:
         settings = ["executor=dask", f"scheduler={cluster.scheduler_address}"]
         assert verbs.make(project, verbs.Wish("set", settings=settings)) == 0
@@ -79,4 +81,3 @@ def test_the_example_hands_the_run_its_schedulers_address_and_ends_as_the_run_do
     ((command, cwd),) = called
     assert command[:3] == ["make", "all", "DATASET=eames"] and cwd == LIBRARY
     assert re.fullmatch(r"SET=executor=dask scheduler=tcp://\S+:\d+ solve.lobes=64", command[3])
-

@@ -35,7 +35,9 @@ def main(
     jobs: Annotated[int, typer.Option(help="processes, one thread each")] = 1,
     docs: Annotated[bool, typer.Option(help="also refresh the tables of docs/align.md")] = False,
     out: Annotated[Path, typer.Option(help="folder to write to")] = ROOT / "build" / "bench" / "align",
-    real: Annotated[list[Path] | None, typer.Option(help="datasets of real photographs with reference_poses.json, instead")] = None,
+    real: Annotated[
+        list[Path] | None, typer.Option(help="datasets of real photographs with reference_poses.json, instead")
+    ] = None,
 ) -> None:
     if real:
         return real_photos(real, jobs, docs, out)
@@ -86,7 +88,9 @@ def real_said(row: dict) -> str:
 def said(row: dict) -> str:
     error = f"{row['normal_error_deg']:.2f}° ({row['of_the_mesh_deg']:.2f}° of the mesh), " if "right" in row else ""
     doubted = "; ".join(row["doubts"]) or "no doubt"
-    return f"{row['name']}: {error}score {row['score']:.4f}, {row['processor_s']:.1f} s, {row['memory_mb']} MB; {doubted}"
+    return (
+        f"{row['name']}: {error}score {row['score']:.4f}, {row['processor_s']:.1f} s, {row['memory_mb']} MB; {doubted}"
+    )
 
 
 if __name__ == "__main__":

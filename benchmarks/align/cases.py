@@ -65,12 +65,20 @@ def keys(views: int, seeds: int, kinds: tuple[str, ...], wrong_views: int) -> li
     330
     """
     counts = {kind: views if kind in RIGHT else wrong_views for kind in kinds}
-    return [(kind, shape, seed, n) for kind in kinds for seed in range(seeds) for shape in shapes.SHAPES for n in range(counts[kind])]
+    return [
+        (kind, shape, seed, n)
+        for kind in kinds
+        for seed in range(seeds)
+        for shape in shapes.SHAPES
+        for n in range(counts[kind])
+    ]
 
 
 def case(kind: str, shape: str, seed: int, number: int) -> Case:
     rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
-    camera, pose, label = photographed(shapes.mesh(shape), rng, TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS))
+    camera, pose, label = photographed(
+        shapes.mesh(shape), rng, TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
+    )
     given = shape
     if kind == "mirrored mask":
         label = label[:, ::-1]
@@ -103,7 +111,9 @@ def blot(label: np.ndarray, labels: tuple[int, ...], rng: np.random.Generator) -
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     y, x = y - rows.mean(), x - columns.mean()
     angle, order = np.arctan2(y, x), np.arange(1, 6)[:, None, None]
-    wave = np.sum(rng.normal(0, 0.35, (5, 1, 1)) / order**0.5 * np.sin(order * angle + rng.uniform(0, 6.3, (5, 1, 1))), axis=0)
+    wave = np.sum(
+        rng.normal(0, 0.35, (5, 1, 1)) / order**0.5 * np.sin(order * angle + rng.uniform(0, 6.3, (5, 1, 1))), axis=0
+    )
     inside = np.hypot(x, y) < np.sqrt(len(rows) / np.pi) * np.exp(wave)
     turn = rng.uniform(0, 2 * np.pi)
     return np.where(inside, np.where(np.cos(turn) * x + np.sin(turn) * y > 0, labels[-1], labels[0]), 0)
@@ -115,10 +125,16 @@ def write_set(folder: Path, made: list[Case]) -> None:
         (folder / name).mkdir(parents=True, exist_ok=True)
     meshes, photos, poses = {}, [], {}
     for each in made:
-        mesh, mesh_name = each.given_mesh(), f"{'rough_' if each.rough else ''}{each.given}{each.seed if each.rough else ''}"
+        mesh, mesh_name = (
+            each.given_mesh(),
+            f"{'rough_' if each.rough else ''}{each.given}{each.seed if each.rough else ''}",
+        )
         parts = {f"part{k}": (mesh.vertices, mesh.faces[mesh.face_label == k]) for k in mesh.labels}
         write_obj(folder / f"meshes/{mesh_name}.obj", parts)
-        meshes[mesh_name] = {"file": f"meshes/{mesh_name}.obj", "parts": {f"part{k}": f"material{k}" for k in mesh.labels}}
+        meshes[mesh_name] = {
+            "file": f"meshes/{mesh_name}.obj",
+            "parts": {f"part{k}": f"material{k}" for k in mesh.labels},
+        }
         lit = np.clip(-each.truth().normal[..., 2:], 0.02, 1) * np.array([0.5, 0.45, 0.4])
         write_photo(folder / f"photos/{each.name}.png", lit)
         write_labels(folder / f"masks/{each.name}.png", each.label)
@@ -133,8 +149,16 @@ def write_set(folder: Path, made: list[Case]) -> None:
             }
         )
         if each.kind in RIGHT:
-            poses[each.name] = {"object": {"rotation": each.pose.rotation.tolist(), "translation": each.pose.translation.tolist()}}
-    spec = {"format": 1, "materials": ["material1", "material2"], "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
+            poses[each.name] = {
+                "object": {"rotation": each.pose.rotation.tolist(), "translation": each.pose.translation.tolist()}
+            }
+    spec = {
+        "format": 1,
+        "materials": ["material1", "material2"],
+        "meshes": meshes,
+        "photos": photos,
+        "truth": "truth/truth.yaml",
+    }
     (folder / "truth/truth.yaml").write_text(yaml.safe_dump({"poses": poses}, sort_keys=False), encoding="utf-8")
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec, sort_keys=False), encoding="utf-8")
 

@@ -57,9 +57,15 @@ def measured(given: Case, search: Search = Search()) -> dict:
 
 def judged(row: dict) -> dict:
     """The row with its doubts, by the standards of now: a row of an earlier run need not be measured again."""
-    runner_up = None if row["runner_up_score"] is None else RunnerUp(None, row["runner_up_score"], row["runner_up_normals_deg"])
+    runner_up = (
+        None if row["runner_up_score"] is None else RunnerUp(None, row["runner_up_score"], row["runner_up_normals_deg"])
+    )
     trust = msgspec.convert({name: row[name] for name in Trust.__struct_fields__}, Trust)
-    return row | {"doubts": doubts(row["silhouette_iou"], row["label_agreement"], trust, Found(None, row["score"], 0.0, runner_up))}
+    return row | {
+        "doubts": doubts(
+            row["silhouette_iou"], row["label_agreement"], trust, Found(None, row["score"], 0.0, runner_up)
+        )
+    }
 
 
 def normal_error_deg(truth: Maps, found: Maps) -> float:

@@ -104,11 +104,16 @@ def _errors(dataset: Dataset, obj: ObjectEntry, size: tuple[int, int], entry: Ph
         "turn": Rotation.from_matrix(true_pose.rotation.T @ pose.rotation).as_rotvec().tolist(),
         "rotation_error_deg": angle_between(pose.rotation, true_pose.rotation),
         "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true_pose))),
-        "normal_error_deg": normal_error_deg(rasterise(caster, true_camera, true_pose), rasterise(caster, camera, pose)),
+        "normal_error_deg": normal_error_deg(
+            rasterise(caster, true_camera, true_pose), rasterise(caster, camera, pose)
+        ),
         "focal_ratio": camera.focal / true_camera.focal,
         "focal_source": entry.camera.focal_source,
         "reference_iou": reference.silhouette_iou,
-        **{name: getattr(found, name) for name in ("silhouette_iou", "label_agreement", "contour_error", "normal_stderr_deg", "doubts")},
+        **{
+            name: getattr(found, name)
+            for name in ("silhouette_iou", "label_agreement", "contour_error", "normal_stderr_deg", "doubts")
+        },
     }
 
 

@@ -27,8 +27,22 @@ Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], labe
 
 ROWS, COLUMNS = 100, 100
 ROUGH_TRIANGLES, WARP = 500, 0.03  # of the mesh's extent, the largest shift of a vertex
-BOXES = (((1.0, 0.45, 0.7), (0, 0, 0), 0.0), ((0.55, 0.5, 0.45), (-0.2, 0.42, 0.1), 0.5), ((0.3, 0.6, 0.25), (0.3, 0.3, -0.2), -0.3))
-BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34, -0.1), (0.30, -0.34), (0.2, -0.45), (0.0, -0.45))
+BOXES = (
+    ((1.0, 0.45, 0.7), (0, 0, 0), 0.0),
+    ((0.55, 0.5, 0.45), (-0.2, 0.42, 0.1), 0.5),
+    ((0.3, 0.6, 0.25), (0.3, 0.3, -0.2), -0.3),
+)
+BODY = (
+    (0.0, 0.5),
+    (0.20, 0.5),
+    (0.22, 0.45),
+    (0.17, 0.34),
+    (0.26, 0.15),
+    (0.34, -0.1),
+    (0.30, -0.34),
+    (0.2, -0.45),
+    (0.0, -0.45),
+)
 
 
 def blob() -> list[Part]:
@@ -51,7 +65,9 @@ def _bumpy(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
 def hook() -> list[Part]:
     t = np.linspace(0, 1, ROWS + 1)
     angle = 4.2 * t**1.3
-    curve = np.stack([0.5 * np.cos(angle), 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t), (0.5 - 0.3 * t) * np.sin(angle)], axis=1)
+    curve = np.stack(
+        [0.5 * np.cos(angle), 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t), (0.5 - 0.3 * t) * np.sin(angle)], axis=1
+    )
     return [tube(curve, np.interp(t, (0, 0.35, 1), (0.17, 0.11, 0.06)), 1)]
 
 
@@ -64,7 +80,11 @@ def jug() -> list[Part]:
     handle = np.stack([0.2 + 0.32 * np.sin(np.pi * t), 0.4 - 0.55 * t, 0 * t], axis=1)
     spout = np.stack([-0.05 * t, 0.02 + 0.4 * t**1.5, 0.2 + 0.36 * t], axis=1)
     body = revolved(np.array(BODY))
-    return [(body.vertices, body.faces, 1), tube(handle, np.full(24, 0.04), 2), tube(spout, np.linspace(0.1, 0.05, 24), 2)]
+    return [
+        (body.vertices, body.faces, 1),
+        tube(handle, np.full(24, 0.04), 2),
+        tube(spout, np.linspace(0.1, 0.05, 24), 2),
+    ]
 
 
 def chair() -> list[Part]:
@@ -108,7 +128,11 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
             faces.append((quad if sign > 0 else quad[:, ::-1]) + len(vertices) * len(u))
             vertices.append(points)
     cos, sin = np.cos(turn), np.sin(turn)
-    return np.concatenate(vertices) * size @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) + place, np.concatenate(faces), 1
+    return (
+        np.concatenate(vertices) * size @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) + place,
+        np.concatenate(faces),
+        1,
+    )
 
 
 @cache

@@ -27,7 +27,10 @@ def success(rows: list[dict]) -> str:
             if some:
                 errors = np.array([row["normal_error_deg"] for row in some])
                 floor = np.median([row["of_the_mesh_deg"] for row in some])
-                shares = _share(row["right"] for row in some), _share(bool(row["doubts"]) for row in some if row["right"])
+                shares = (
+                    _share(row["right"] for row in some),
+                    _share(bool(row["doubts"]) for row in some if row["right"]),
+                )
                 missed = _share(bool(row["doubts"]) for row in some if not row["right"])
                 quantiles = ", ".join(exact(float(q)) for q in np.quantile(errors, (0.5, 0.9, 1)))
                 body.append([f"{kind}, {shape or 'all'}", shares[0], quantiles, exact(float(floor)), shares[1], missed])
@@ -52,7 +55,8 @@ def time(rows: list[dict]) -> str:
         some = _of(rows, kind, None)
         if some:
             seconds = [
-                ", ".join(exact(float(q)) for q in np.quantile([r[key] for r in some], (0.5, 1))) for key in ("processor_s", "wall_s")
+                ", ".join(exact(float(q)) for q in np.quantile([r[key] for r in some], (0.5, 1)))
+                for key in ("processor_s", "wall_s")
             ]
             body.append([kind, *seconds, str(max(row["memory_mb"] for row in some))])
     return table(["case", "processor: median, worst (s)", "wall: median, worst (s)", "memory (MB)"], body)
@@ -71,7 +75,9 @@ def real_sets(rows: list[dict]) -> str:
         angles = [[row[key] for row in some] for key in ("normal_error_deg", "rotation_error_deg", "about_the_ray_deg")]
         cells = [f"{np.median(each):.1f}, {max(each):.1f}" for each in (*angles, left)]
         ratios = [row["focal_ratio"] for row in some]
-        seconds = f"{np.median([row['processor_s'] for row in some]):.0f}, {max(row['processor_s'] for row in some):.0f}"
+        seconds = (
+            f"{np.median([row['processor_s'] for row in some]):.0f}, {max(row['processor_s'] for row in some):.0f}"
+        )
         share = _share(bool(row["doubts"]) for row in some)
         spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
         body.append([" ".join(name), str(len(some)), *cells[:3], f"{common:.1f}", cells[3], spread, share, seconds])
@@ -83,7 +89,9 @@ def real_sets(rows: list[dict]) -> str:
 def real_photos(rows: list[dict]) -> str:
     body = []
     for row in rows:
-        iou = f"{row['silhouette_iou']:.3f}" + (f" ({row['reference_iou']:.3f})" if row["reference_iou"] is not None else "")
+        iou = f"{row['silhouette_iou']:.3f}" + (
+            f" ({row['reference_iou']:.3f})" if row["reference_iou"] is not None else ""
+        )
         degrees = [f"{row[name]:.1f}" for name in ("normal_error_deg", "rotation_error_deg", "about_the_ray_deg")]
         focal = f"{row['focal_ratio']:.2f} ({row['focal_source']})"
         times = f"{row['processor_s']:.0f}, {row['wall_s']:.0f}"

@@ -52,7 +52,10 @@ def measured(count: int, gradient_count: int = 512) -> dict:
 def bfloat16(specular, diffuse) -> dict:
     """Formulas and weights in bfloat16, inputs rounded to it, by torch."""
     operators = {name: operator for name in fast_names() if (operator := of_dtype(name, torch.bfloat16)) is not None}
-    return {name: {"specular": specular_errors(o, specular), "diffuse": diffuse_errors(o, diffuse)} for name, o in operators.items()}
+    return {
+        name: {"specular": specular_errors(o, specular), "diffuse": diffuse_errors(o, diffuse)}
+        for name, o in operators.items()
+    }
 
 
 def main(

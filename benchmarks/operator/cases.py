@@ -16,7 +16,12 @@ from torch import Tensor
 from factorlib.reflection import Operator
 from factorlib.reflection.lobe import lobe_integral
 
-ORDINARY = {"roughness": (0.1, 0.3, 0.6), "sharpness": (1.0, 10.0, 100.0, 1000.0), "no": (0.1, 0.4, 0.7, 0.95), "place": ("front",)}
+ORDINARY = {
+    "roughness": (0.1, 0.3, 0.6),
+    "sharpness": (1.0, 10.0, 100.0, 1000.0),
+    "no": (0.1, 0.4, 0.7, 0.95),
+    "place": ("front",),
+}
 CASES: dict[str, dict] = {
     "none: ordinary": {},
     "lobe behind the surface": {"place": ("behind",)},
@@ -62,7 +67,9 @@ class Pairs(msgspec.Struct, frozen=True):
 def case(name: str) -> Pairs:
     if name == ALL:
         together = list(CASES.values())
-        choices = {key: tuple(dict.fromkeys(v for c in [*together, ORDINARY] for v in c.get(key, ()))) for key in ORDINARY}
+        choices = {
+            key: tuple(dict.fromkeys(v for c in [*together, ORDINARY] for v in c.get(key, ()))) for key in ORDINARY
+        }
     else:
         choices = ORDINARY | CASES[name]
     return pairs(**choices)
@@ -89,7 +96,9 @@ def directions(place: str, n: Float[Tensor, "3"], o: Float[Tensor, "3"]) -> Floa
     z = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=g, dtype=torch.float64), dim=1)
     height = (z @ n).abs()[:, None] * n
     flat = z - (z @ n)[:, None] * n
-    return {"front": flat + height, "behind": flat - height, "horizon": torch.nn.functional.normalize(flat, dim=1)}[place]
+    return {"front": flat + height, "behind": flat - height, "horizon": torch.nn.functional.normalize(flat, dim=1)}[
+        place
+    ]
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -116,7 +125,9 @@ def found(operator: Operator, given: Pairs) -> Found:
         roughness, sharpness = torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype)
         response = operator.response(roughness, sharpness, no[rows], nz[rows, None], oz[rows, None])
         for name in response.__struct_fields__:
-            fields.setdefault(name, torch.empty(len(given), dtype=torch.float64))[rows] = getattr(response, name)[:, 0].double()
+            fields.setdefault(name, torch.empty(len(given), dtype=torch.float64))[rows] = getattr(response, name)[
+                :, 0
+            ].double()
         by_no, by_nz, by_oz = response.specular_by_no, response.specular_by_nz, response.specular_by_oz
         turns = ((z, n, by_nz), (z, o, by_oz)), ((o, n, by_no), (o, z, by_oz)), ((n, o, by_no), (n, z, by_nz))
         for k, parts in enumerate(turns):

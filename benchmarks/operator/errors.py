@@ -19,13 +19,18 @@ def specular_errors(operator: Operator, samples: Samples) -> dict:
     with torch.no_grad():
         value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
     return of_finite(
-        lambda kept: specular_table(((value - samples.value) / samples.scale())[kept], *(t[kept] for t in samples.inputs())), value
+        lambda kept: specular_table(
+            ((value - samples.value) / samples.scale())[kept], *(t[kept] for t in samples.inputs())
+        ),
+        value,
     )
 
 
 def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
     with torch.no_grad():
-        value = operator.diffuse(samples.sharpness[:, None].to(operator.dtype), samples.nz[:, None].to(operator.dtype))[:, 0].double()
+        value = operator.diffuse(samples.sharpness[:, None].to(operator.dtype), samples.nz[:, None].to(operator.dtype))[
+            :, 0
+        ].double()
     error = (value - samples.value) / samples.scale()
     return of_finite(lambda kept: diffuse_table(error[kept], samples.sharpness[kept], samples.nz[kept]), value)
 
@@ -49,6 +54,8 @@ def gradient_errors(operator: Operator, exact: list[Tensor], count: int) -> dict
 def gradients(operator: Operator, count: int) -> list[Tensor]:
     """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
     alpha, sharpness, no, nz, oz = specular_inputs(count, 5)
-    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), no, nz, oz)]
+    leaves = [
+        t.to(operator.dtype)[:, None].clone().requires_grad_() for t in (alpha.sqrt(), sharpness.log(), no, nz, oz)
+    ]
     value = operator.specular(leaves[0], leaves[1].exp(), *leaves[2:])
     return [t.detach()[:, 0].double() for t in (value, *torch.autograd.grad(value.sum(), leaves))]

@@ -40,7 +40,11 @@ def time_against_error(operators: dict[str, dict]) -> str:
     parts += axes(across, up, "value and all gradients, µs of one core per evaluation", "error |R − S| / (S + E/100)")
     for label, (median, p95) in errors.items():
         x, colour = across(times[label]), colour_of(label, list(operators))
-        parts += [path([(x, up(median)), (x, up(p95))], colour), dot(x, up(p95), colour, hollow=True), dot(x, up(median), colour)]
+        parts += [
+            path([(x, up(median)), (x, up(p95))], colour),
+            dot(x, up(p95), colour, hollow=True),
+            dot(x, up(median), colour),
+        ]
         parts.append(text(x, up(median) + 19, variant_of(label), "middle", "small"))
     return page(760, 456, parts)
 
@@ -69,7 +73,11 @@ def axes(across: LogAxis, up: LogAxis, x_label: str, y_label: str) -> list[str]:
         ]
     parts.append(line(across.start, up.start, across.end, up.start, "axis"))
     middle = (up.start + up.end) / 2
-    return [*parts, text((across.start + across.end) / 2, up.start + 34, x_label, "middle"), text(18, middle, y_label, "middle", turn=-90)]
+    return [
+        *parts,
+        text((across.start + across.end) / 2, up.start + 34, x_label, "middle"),
+        text(18, middle, y_label, "middle", turn=-90),
+    ]
 
 
 def percent(value: float) -> str:
@@ -82,8 +90,16 @@ def percent(value: float) -> str:
 
 def errors_by_input(operators: dict[str, dict]) -> str:
     """A panel per quantity: median (full) and p95 (hollow, dashed) of the specular error in its bins, of each float32 operator."""
-    shown = {label: row["specular"] for label, row in operators.items() if label.endswith("float32") and "specular" in row}
-    values = [b[q] for table in shown.values() for quantity in QUANTITIES for b in table[quantity].values() for q in ("median", "p95")]
+    shown = {
+        label: row["specular"] for label, row in operators.items() if label.endswith("float32") and "specular" in row
+    }
+    values = [
+        b[q]
+        for table in shown.values()
+        for quantity in QUANTITIES
+        for b in table[quantity].values()
+        for q in ("median", "p95")
+    ]
     low, high = 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values)))
     parts = [text(20, 22, "Error of the specular reflection by what is asked: |R − S| / (S + E/100)", css="title")]
     for k, quantity in enumerate(QUANTITIES):
@@ -96,13 +112,22 @@ def _panel(shown: dict[str, dict], quantity: str, up: LogAxis, left: float, labe
     bins = list(next(iter(shown.values()))[quantity])
     parts = [text(left, up.end - 10, quantity, css="title")]
     for value in up.decades():
-        parts += [line(left, up(value), left + 300, up(value), "grid"), text(left - 8, up(value) + 4, percent(value), "end", "soft small")]
+        parts += [
+            line(left, up(value), left + 300, up(value), "grid"),
+            text(left - 8, up(value) + 4, percent(value), "end", "soft small"),
+        ]
     parts.append(line(left, up.start, left + 300, up.start, "axis"))
     middles = [left + 300 * (k + 0.5) / len(bins) for k in range(len(bins))]
-    parts += [text(x, up.start + 16, name.replace(" to ", "–"), "middle", "soft small") for x, name in zip(middles, bins, strict=True)]
+    parts += [
+        text(x, up.start + 16, name.replace(" to ", "–"), "middle", "soft small")
+        for x, name in zip(middles, bins, strict=True)
+    ]
     for label, table in shown.items():
         colour = colour_of(label, labels)
         for measure, hollow in (("p95", True), ("median", False)):
             points = [(x, up(table[quantity][name][measure])) for x, name in zip(middles, bins, strict=True)]
-            parts += [path(points, colour, dashed=hollow), *(dot(x, y, colour, hollow=hollow, radius=3) for x, y in points)]
+            parts += [
+                path(points, colour, dashed=hollow),
+                *(dot(x, y, colour, hollow=hollow, radius=3) for x, y in points),
+            ]
     return parts

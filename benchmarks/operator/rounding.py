@@ -11,9 +11,16 @@ from factorlib.reflection import Operator
 
 def measures(given: Pairs, shown: dict[str, Operator], fast: dict[str, Operator], with_reference: bool) -> dict:
     """By label of `shown`; fast: the same operators in float32 and float64, by which rounding is measured."""
-    exactly = {name: found(fast[f"{name} float64"], given) for name in {label.split()[0] for label in shown} if f"{name} float64" in fast}
+    exactly = {
+        name: found(fast[f"{name} float64"], given)
+        for name in {label.split()[0] for label in shown}
+        if f"{name} float64" in fast
+    }
     true = _values(given) if with_reference else None
-    return {label: _measures(found(operator, given), exactly.get(label.split()[0]), true, given) for label, operator in shown.items()}
+    return {
+        label: _measures(found(operator, given), exactly.get(label.split()[0]), true, given)
+        for label, operator in shown.items()
+    }
 
 
 def _values(given: Pairs) -> dict[str, torch.Tensor]:
@@ -29,7 +36,10 @@ def _values(given: Pairs) -> dict[str, torch.Tensor]:
 def _measures(answer: Found, exactly: Found | None, true: dict | None, given: Pairs) -> dict:
     measures: dict = {"pairs": len(given), "finite": answer.finite()}
     if exactly is not None:
-        measures |= {"value_rounding": value_error(answer, exactly, given), "gradient_rounding": gradient_error(answer, exactly, given)}
+        measures |= {
+            "value_rounding": value_error(answer, exactly, given),
+            "gradient_rounding": gradient_error(answer, exactly, given),
+        }
     if true is not None:
         measures["value"] = value_error(answer, Found(true, answer.turning), given)
     return {k: float(f"{float(v.max()):.3g}") if torch.is_tensor(v) else v for k, v in measures.items()}

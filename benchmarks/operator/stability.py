@@ -38,7 +38,10 @@ def measured() -> dict:
     fast = variants(("float32", "float64"))
     shown = {label: operator for label, operator in fast.items() if "float64" not in label}
     rows = {name: measures(case(name), shown, fast, name != ALL) for name in (*CASES, ALL)}
-    by_law = {law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()} for law, measure in LAWS.items()}
+    by_law = {
+        law: {label: [float(f"{v:.4g}") for v in measure(o)] for label, o in shown.items()}
+        for law, measure in LAWS.items()
+    }
     return {"cases": rows, "laws": by_law}
 
 
@@ -49,14 +52,18 @@ def as_tables(result: dict) -> dict[str, str]:
     def cells(row: dict, *names: str) -> list[str]:
         return [" / ".join(exact(row[label][n]) if n in row[label] else "–" for n in names) for label in labels]
 
-    finite = {name: ["" if row[label]["finite"] else " **not finite**" for label in labels] for name, row in result["cases"].items()}
+    finite = {
+        name: ["" if row[label]["finite"] else " **not finite**" for label in labels]
+        for name, row in result["cases"].items()
+    }
     rounding = [
         [name, *(a + b for a, b in zip(cells(row, "value_rounding", "gradient_rounding"), finite[name], strict=True))]
         for name, row in result["cases"].items()
     ]
     values = [[name, *cells(row, "value")] for name, row in result["cases"].items() if name != ALL]
     by_law = [
-        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)] for law, row in result["laws"].items()
+        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in row[label]) for label in labels)]
+        for law, row in result["laws"].items()
     ]
     return {
         "stability": table(["changed", *head], rounding),

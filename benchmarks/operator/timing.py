@@ -22,7 +22,10 @@ REPEATS = 7
 def point(operator: Operator, rows: int, device: str = "cpu") -> tuple[Tensor, ...]:
     """Roughness, λ, n·o, n·z, o·z of random points under 64 lobes of sharpness .3 to 3000."""
     g = torch.Generator().manual_seed(0)
-    n, o, z = (torch.nn.functional.normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1) for k in (rows, rows, LOBES))
+    n, o, z = (
+        torch.nn.functional.normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1)
+        for k in (rows, rows, LOBES)
+    )
     o = torch.where(((n * o).sum(1) > 0)[:, None], o, -o)
     inputs = (torch.tensor(0.4), torch.logspace(-0.5, 3.5, LOBES), (n * o).sum(1), n @ z.T, o @ z.T)
     return tuple(t.to(device, operator.dtype) for t in inputs)
@@ -51,7 +54,9 @@ def microseconds(operators: dict[str, Operator], rows: Callable[[str], int]) -> 
                 start = time.process_time()
                 measure(operator, *inputs[label])
                 if repeat:
-                    taken.setdefault((label, name), []).append((time.process_time() - start) / (rows(label) * LOBES) * 1e6)
+                    taken.setdefault((label, name), []).append(
+                        (time.process_time() - start) / (rows(label) * LOBES) * 1e6
+                    )
     return {label: {name: _summary(taken[label, name]) for name in MEASURES} for label in operators}
 
 

@@ -73,12 +73,19 @@ def main(
     photos: Annotated[int, typer.Option(min=5)] = 50,
     materials: Annotated[int, typer.Option(min=5, max=254)] = 100,
     workers: Annotated[int, typer.Option(min=1, max=64)] = 2,
-    beside: Annotated[bool, typer.Option("--beside", help="run it in this machine's processes too, and compare the bytes")] = False,
-    docs: Annotated[bool, typer.Option("--docs", help="write the table of what was measured, and measure nothing")] = False,
+    beside: Annotated[
+        bool, typer.Option("--beside", help="run it in this machine's processes too, and compare the bytes")
+    ] = False,
+    docs: Annotated[
+        bool, typer.Option("--docs", help="write the table of what was measured, and measure nothing")
+    ] = False,
 ) -> None:
     """Measure one size, or write the table."""
     if docs:
-        sizes = [msgspec.json.decode(path.read_bytes(), type=Measured) for path in sorted(FOLDER.glob("*.json"), key=lambda path: int(path.stem))]
+        sizes = [
+            msgspec.json.decode(path.read_bytes(), type=Measured)
+            for path in sorted(FOLDER.glob("*.json"), key=lambda path: int(path.stem))
+        ]
         line = worked_out(sizes[-2], sizes[-1]) if len(sizes) > 1 else "(One size was measured; a line needs two.)"
         refresh(DOCS, {"scale": rows(sizes), "worked out": line})
         return
@@ -114,7 +121,10 @@ def measured(folder: Path, build: Path, workers: int, settings: list[str]) -> Me
         wall_seconds=round(seconds, 1),
         most_mb=round(watch.most_mb),
         costs=costs,
-        stages={name: _cost([event for event in done if event["stage"] == name]) for name in dict.fromkeys(event["stage"] for event in done)},
+        stages={
+            name: _cost([event for event in done if event["stage"] == name])
+            for name in dict.fromkeys(event["stage"] for event in done)
+        },
         spread=next(event for event in done if event["stage"] == "solve").get("spread", {"tasks": 0}),
         store_mb=round(sum(path.stat().st_size for path in files) / 2**20, 1),
         store_files=len(files),
@@ -122,7 +132,11 @@ def measured(folder: Path, build: Path, workers: int, settings: list[str]) -> Me
 
 
 def _cost(events: list[dict[str, Any]]) -> Cost:
-    return Cost(round(sum(event["cpu_seconds"] for event in events), 1), max(event["memory_mb"] for event in events), len(events))
+    return Cost(
+        round(sum(event["cpu_seconds"] for event in events), 1),
+        max(event["memory_mb"] for event in events),
+        len(events),
+    )
 
 
 def kept(build: Path) -> dict[str, bytes]:
@@ -139,15 +153,21 @@ def cluster(logs: Path, workers: int) -> Iterator[str]:
         def started(name: str, *words: str) -> Path:
             """The log of a process that ends with the cluster."""
             stream = ends.enter_context(open(logs / f"{name}.log", "wb"))
-            process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream, env={**QUIET, **os.environ})
+            process = subprocess.Popen(
+                [sys.executable, "-m", *words], cwd=ROOT, stdout=stream, stderr=stream, env={**QUIET, **os.environ}
+            )
             ends.callback(process.wait)
             ends.callback(process.terminate)
             return logs / f"{name}.log"
 
-        log = started("scheduler", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        log = started(
+            "scheduler", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"
+        )
         address = _said(log, r"Scheduler at:\s+(tcp://\S+)")
         for number in range(workers):
-            log = started(f"worker-{number}", "factorlib", "worker", address, "--cores", "1", "--local-directory", str(logs))
+            log = started(
+                f"worker-{number}", "factorlib", "worker", address, "--cores", "1", "--local-directory", str(logs)
+            )
             _said(log, r"(Registered to):")
         yield address
 
@@ -165,7 +185,9 @@ def rows(sizes: list[Measured]) -> str:
     """The table of all sizes that were measured."""
     lines = {
         "steps": lambda m: str(sum(stage.processes for stage in m.stages.values())),
-        "masks, align, urm: processor s": lambda m: exact(sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")), 3),
+        "masks, align, urm: processor s": lambda m: exact(
+            sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")), 3
+        ),
         "solve: processor s": lambda m: exact(m.stages["solve"].cpu_seconds, 3),
         "of these in blocks": lambda m: exact(m.spread["cpu_seconds"], 3),
         "solve: peak memory of its process, MB": lambda m: exact(m.stages["solve"].peak_mb, 3),
@@ -175,7 +197,9 @@ def rows(sizes: list[Measured]) -> str:
         "workers' own: processor s": lambda m: exact(m.costs["workers"].cpu_seconds, 3),
         "the run's own: processor s": lambda m: exact(m.costs["run"].cpu_seconds, 3),
         "all three, ms a task": lambda m: exact(1e3 * m.overhead_seconds / m.tasks, 2),
-        "all three, of all processor s": lambda m: f"{100 * m.overhead_seconds / sum(c.cpu_seconds for c in m.costs.values()):.1f} %",
+        "all three, of all processor s": lambda m: (
+            f"{100 * m.overhead_seconds / sum(c.cpu_seconds for c in m.costs.values()):.1f} %"
+        ),
         "scheduler's memory, MB": lambda m: exact(m.costs["scheduler"].peak_mb, 3),
         "a worker's own memory, MB": lambda m: exact(m.costs["workers"].peak_mb, 3),
         "the run's memory, MB": lambda m: exact(m.costs["run"].peak_mb, 3),
@@ -183,7 +207,9 @@ def rows(sizes: list[Measured]) -> str:
         "each time, all maps together": lambda m: exact(m.spread["bytes_sent"] / 2**20, 3),
         "back from blocks, MB": lambda m: exact(m.spread["bytes_back"] / 2**20, 3),
         "store, MB": lambda m: exact(m.store_mb, 3),
-        "bytes as in processes of this machine": lambda m: {True: "yes", False: "NO", None: "not compared"}[m.same_bytes],
+        "bytes as in processes of this machine": lambda m: {True: "yes", False: "NO", None: "not compared"}[
+            m.same_bytes
+        ],
     }
     return table(["photos", *(str(m.photos) for m in sizes)], [[name, *map(of, sizes)] for name, of in lines.items()])
 
@@ -194,9 +220,13 @@ MANY = 100_000
 def worked_out(small: Measured, large: Measured) -> str:
     """The table for MANY photos, by the straight line through the two largest sizes that were measured."""
     lines = {
-        "masks, align, urm: processor hours": lambda m: sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")) / 3600,
+        "masks, align, urm: processor hours": lambda m: (
+            sum(m.stages[name].cpu_seconds for name in ("masks", "align", "urm")) / 3600
+        ),
         "solve: processor hours": lambda m: m.stages["solve"].cpu_seconds / 3600,
-        "of these in its own process, one after the other": lambda m: (m.stages["solve"].cpu_seconds - m.spread["cpu_seconds"]) / 3600,
+        "of these in its own process, one after the other": lambda m: (
+            (m.stages["solve"].cpu_seconds - m.spread["cpu_seconds"]) / 3600
+        ),
         "memory of its own process, GB": lambda m: m.stages["solve"].peak_mb / 1024,
         "scheduler: processor hours": lambda m: m.costs["scheduler"].cpu_seconds / 3600,
         "scheduler's memory, GB": lambda m: m.costs["scheduler"].peak_mb / 1024,
@@ -209,7 +239,9 @@ def worked_out(small: Measured, large: Measured) -> str:
         "files in the store, millions": lambda m: m.store_files / 1e6,
     }
     head = [f"{MANY:,} photos", f"from {small.photos} and {large.photos}"]
-    return table(head, [[name, exact(_at(of(small), of(large), small.photos, large.photos), 2)] for name, of in lines.items()])
+    return table(
+        head, [[name, exact(_at(of(small), of(large), small.photos, large.photos), 2)] for name, of in lines.items()]
+    )
 
 
 def _at(small: float, large: float, few: int, more: int) -> float:

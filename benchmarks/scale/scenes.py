@@ -62,7 +62,9 @@ def write_set(folder: Path, photos: int, materials: int, seed: int = 0) -> None:
 
 def drawn_material(rng: np.random.Generator) -> TrueMaterial:
     """k_d and k_s with k_d + k_s < .9, roughness between .15 and .7."""
-    return TrueMaterial(tuple(rng.uniform(0.05, 0.6, 3).tolist()), (float(rng.uniform(0.03, 0.3)),) * 3, float(rng.uniform(0.15, 0.7)))
+    return TrueMaterial(
+        tuple(rng.uniform(0.05, 0.6, 3).tolist()), (float(rng.uniform(0.03, 0.3)),) * 3, float(rng.uniform(0.15, 0.7))
+    )
 
 
 def drawn_light(rng: np.random.Generator) -> Lobes:
@@ -72,14 +74,20 @@ def drawn_light(rng: np.random.Generator) -> Lobes:
     sharpness = np.exp(rng.uniform(*np.log(SHARPNESS), count))
     sharpness[0] = 0.5
     energy = rng.uniform(0.3, 1.0, (count, 1)) * rng.uniform(0.6, 1.0, (count, 3))
-    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), sharpness, energy * np.maximum(sharpness, 1.0)[:, None] / count)
+    return Lobes(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        sharpness,
+        energy * np.maximum(sharpness, 1.0)[:, None] / count,
+    )
 
 
 def ball() -> Mesh:
     """The unit ball in 1,280 triangles, with its own normals."""
     coarse = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.asarray(coarse.vertices)
-    return Mesh(vertices, np.asarray(coarse.faces, dtype=np.int32), vertices, np.ones(len(coarse.faces), dtype=np.int16))
+    return Mesh(
+        vertices, np.asarray(coarse.faces, dtype=np.int32), vertices, np.ones(len(coarse.faces), dtype=np.int16)
+    )
 
 
 def ball_at(place: int) -> Ball:
@@ -100,7 +108,9 @@ def centre_of(place: int) -> float:
     return (place - (BALLS - 1) / 2) * PITCH * DISTANCE / FOCAL
 
 
-def _write_photo(folder: Path, name: str, labels: list[int], materials: list[TrueMaterial], light: Lobes, operator: Operator) -> None:
+def _write_photo(
+    folder: Path, name: str, labels: list[int], materials: list[TrueMaterial], light: Lobes, operator: Operator
+) -> None:
     radiance, label = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH), np.uint8)
     for place, (number, material) in enumerate(zip(labels, materials, strict=True)):
         ball, columns = ball_at(place), slice(place * PITCH, (place + 1) * PITCH)
@@ -114,7 +124,17 @@ def _write_photo(folder: Path, name: str, labels: list[int], materials: list[Tru
 def _entry(name: str, materials: list[str]) -> dict[str, Any]:
     upright = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     objects = [
-        {"name": f"ball{k}", "mesh": material, "pose": {"rotation": upright, "translation": [centre_of(k), 0.0, DISTANCE]}}
+        {
+            "name": f"ball{k}",
+            "mesh": material,
+            "pose": {"rotation": upright, "translation": [centre_of(k), 0.0, DISTANCE]},
+        }
         for k, material in enumerate(materials)
     ]
-    return {"name": name, "image": f"photos/{name}.exr", "masks": f"masks/{name}.png", "camera": {"focal_px": FOCAL}, "objects": objects}
+    return {
+        "name": name,
+        "image": f"photos/{name}.exr",
+        "masks": f"masks/{name}.png",
+        "camera": {"focal_px": FOCAL},
+        "objects": objects,
+    }

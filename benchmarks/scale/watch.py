@@ -46,7 +46,11 @@ class Watch:
         costs: dict[str, Cost] = {}
         for role, cpu, peak in self._seen.values():
             cost = costs.setdefault(role, Cost())
-            cost.cpu_seconds, cost.peak_mb, cost.processes = cost.cpu_seconds + cpu, max(cost.peak_mb, peak), cost.processes + 1
+            cost.cpu_seconds, cost.peak_mb, cost.processes = (
+                cost.cpu_seconds + cpu,
+                max(cost.peak_mb, peak),
+                cost.processes + 1,
+            )
         return costs
 
     def _look_often(self) -> None:

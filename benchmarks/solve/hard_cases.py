@@ -83,14 +83,21 @@ def lamps(seed: int, lobes: int = 3) -> Light:
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(lobes, 3)) + FRONT
     log_sharpness = np.concatenate([[np.log(0.5)], np.log(60.0) * rng.uniform(0.5, 1, lobes - 1)])
-    weight = rng.lognormal(0, 0.3, (lobes, 1)) * rng.lognormal(0, 0.1, (lobes, 3)) * np.exp(log_sharpness * 0.8)[:, None]
+    weight = (
+        rng.lognormal(0, 0.3, (lobes, 1)) * rng.lognormal(0, 0.1, (lobes, 3)) * np.exp(log_sharpness * 0.8)[:, None]
+    )
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
 
 
 def light(*lobes: tuple[tuple[float, float, float], float, float]) -> Light:
     """Of grey lobes (axis, sharpness, weight)."""
     axis, sharpness, weight = (np.array(column, dtype=float) for column in zip(*lobes, strict=True))
-    return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.log(sharpness), np.repeat(weight[:, None], 3, 1), np.zeros(1))
+    return Light(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        np.log(sharpness),
+        np.repeat(weight[:, None], 3, 1),
+        np.zeros(1),
+    )
 
 
 ROOMS = [lamps(seed) for seed in range(5)]
@@ -113,7 +120,9 @@ def observed(truth: Materials, lights: Sequence[Light], shown: Sequence[Sequence
         materials=NAMES[: len(truth)], photos=names, illuminations=names,
     )  # fmt: skip
     radiance = seen.radiance.copy()
-    for block, lobes in zip(blocks_of_observations(seen, Noise()), lights, strict=True):  # their rows are those of `parts`
+    for block, lobes in zip(
+        blocks_of_observations(seen, Noise()), lights, strict=True
+    ):  # their rows are those of `parts`
         radiance[photo == names.index(block.name)] = Illumination(block, lobes, truth, OPERATOR).radiance()
     return msgspec.structs.replace(seen, radiance=radiance)
 
@@ -154,7 +163,10 @@ def perturbed(perturbation: Callable[[Observations, int], Observations]) -> Call
 
 def of_brightness(factor: float) -> Callable[[int], Case]:
     def of(seed: int) -> Case:
-        seen, clean = (msgspec.structs.replace(o, radiance=o.radiance * factor) for o in (ORDINARY(seed).seen, ORDINARY(seed).clean))
+        seen, clean = (
+            msgspec.structs.replace(o, radiance=o.radiance * factor)
+            for o in (ORDINARY(seed).seen, ORDINARY(seed).clean)
+        )
         return Case(seen, clean, TWO)
 
     return of
@@ -171,12 +183,20 @@ def with_wrong_normals(seen: Observations, seed: int) -> Observations:
 
 
 def with_noise_on_normals(degrees: float) -> Callable[[int], Case]:
-    return perturbed(lambda seen, seed: tilted(seen, degrees * np.abs(np.random.default_rng(seed).normal(size=len(seen))), seed + 1))
+    return perturbed(
+        lambda seen, seed: tilted(seen, degrees * np.abs(np.random.default_rng(seed).normal(size=len(seen))), seed + 1)
+    )
 
 
 def with_invalid(seen: Observations, seed: int) -> Observations:
     radiance, normal, view = seen.radiance.copy(), seen.normal.copy(), seen.view.copy()
-    radiance[::11, 0], radiance[1::11, 1], radiance[2::11, 2], normal[3::11, 0], view[4::11] = np.nan, np.inf, -np.inf, np.nan, 0
+    radiance[::11, 0], radiance[1::11, 1], radiance[2::11, 2], normal[3::11, 0], view[4::11] = (
+        np.nan,
+        np.inf,
+        -np.inf,
+        np.nan,
+        0,
+    )
     return msgspec.structs.replace(seen, radiance=radiance, normal=normal, view=view)
 
 
@@ -232,15 +252,29 @@ BOUNDS = {
     "1 material × 5 lights": Bound(0.013, 0.019, 0.0063, ("by convention only. A photo",)),
     "5 materials × 1 light": Bound(0.0082, 0.0097, 0.0035),
     "unconnected: 2 × 1 and 3 × 1": Bound(0.0093, 0.025, 0.0045),
-    "flat objects": Bound(None, None, 0.0025, ("'red' is flat", "'green' is flat", "roughness of material 'red' cannot be determined")),
+    "flat objects": Bound(
+        None, None, 0.0025, ("'red' is flat", "'green' is flat", "roughness of material 'red' cannot be determined")
+    ),
     "an object of 30 pixels": Bound(None, None, 0.037, ("30 observation(s)", "by convention only")),
     "a single pixel": Bound(None, None, 0.0074, ("1 observation(s)", "'red' is flat")),
-    "all Lambertian": Bound(0.0049, None, 0.0097, ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined")),
-    "all mirror-like: roughness .1": Bound(0.0044, 0.017, 0.0052, may_say="the least the model knows: it may be smoother"),
-    "a black material": Bound(0.0055, 0.0068, 0.0049, ("'red' is so dark", "roughness of material 'red' cannot be determined")),
+    "all Lambertian": Bound(
+        0.0049,
+        None,
+        0.0097,
+        ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined"),
+    ),
+    "all mirror-like: roughness .1": Bound(
+        0.0044, 0.017, 0.0052, may_say="the least the model knows: it may be smoother"
+    ),
+    "a black material": Bound(
+        0.0055, 0.0068, 0.0049, ("'red' is so dark", "roughness of material 'red' cannot be determined")
+    ),
     "a light of one point": Bound(0.017, 0.0039, 0.0042),
     "constant light": Bound(
-        None, None, 0.0043, ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined")
+        None,
+        None,
+        0.0043,
+        ("roughness of material 'red' cannot be determined", "roughness of material 'green' cannot be determined"),
     ),
     "radiances × 10⁻⁴": Bound(0.0044, 0.022, 0.0048),
     "radiances × 10⁴": Bound(0.0044, 0.022, 0.0048),
@@ -262,7 +296,10 @@ BOUNDS = {
 
 def answered(given: Case, options: FewLobes = QUICK, operator: Operator = OPERATOR) -> Answer:
     """The answer, compared with the clean observations."""
-    problem, names = JointProblem(blocks_of_observations(given.seen, Noise(), seed=options.seed), operator), given.seen.materials
+    problem, names = (
+        JointProblem(blocks_of_observations(given.seen, Noise(), seed=options.seed), operator),
+        given.seen.materials,
+    )
     said = undetermined_by_observations(names, problem.blocks)
     solution = few_lobes(problem, from_nothing(len(given.truth)), Run(options))
     found, materials = solution.point, solution.point.materials
@@ -278,7 +315,9 @@ def of_random_starts(given: Case, count: int = 10, options: FewLobes = QUICK) ->
     random = np.random.default_rng(0)
     starts = [(random.uniform(0.15, 0.9), random.uniform(0.05, 0.6)) for _ in range(count)]
     return [
-        answered(given, msgspec.structs.replace(options, start_roughness=roughness, start_specular_share=share, seed=seed))
+        answered(
+            given, msgspec.structs.replace(options, start_roughness=roughness, start_specular_share=share, seed=seed)
+        )
         for seed, (roughness, share) in enumerate(starts)
     ]
 
@@ -307,6 +346,10 @@ def radiance_error(problem: JointProblem, solution: Solution, clean: Observation
     names, relative, point = [block.name for block in problem.blocks], [], solution.point
     for true in blocks_of_observations(clean, Noise()):
         i = names.index(true.name)
-        found = Illumination(true, point.lights[i], point.materials, problem.operator).radiance() * problem.blocks[i].unit / true.unit
+        found = (
+            Illumination(true, point.lights[i], point.materials, problem.operator).radiance()
+            * problem.blocks[i].unit
+            / true.unit
+        )
         relative.append((found - true.radiance) / (true.radiance + 1))
     return float(np.sqrt(np.mean(np.concatenate(relative) ** 2)))

@@ -44,16 +44,26 @@ class Joint:
             self._set(parameters, pair)
             seed = 2 * (number * len(self.parameters) + k)
             image = self.mi.render(
-                self.scenes[pair], parameters, integrator=self.integrator, spp=SPP, spp_grad=SPP, seed=seed, seed_grad=seed + 1
+                self.scenes[pair],
+                parameters,
+                integrator=self.integrator,
+                spp=SPP,
+                spp_grad=SPP,
+                seed=seed,
+                seed_grad=seed + 1,
             )
-            scale = self.mi.TensorXf(np.repeat(self.mask[..., None], 3, 2).astype(np.float32) / self.spheres.pairs[pair].peak)
+            scale = self.mi.TensorXf(
+                np.repeat(self.mask[..., None], 3, 2).astype(np.float32) / self.spheres.pairs[pair].peak
+            )
             squares = dr.square((image - self.mi.TensorXf(self.shown[pair])) * scale)
             loss = dr.sum(squares, axis=None) / (3.0 * float(self.mask.sum()))
             dr.backward(loss / len(self.parameters))
             losses.append(float(np.array(loss).item()))
         self.optimiser.step()
         for name in self.optimiser.keys():  # noqa: SIM118
-            low, high = ROUGHNESS if name.endswith("roughness") else (1e-4, 1e6 if name in self.spheres.illuminations else 1.0)
+            low, high = (
+                ROUGHNESS if name.endswith("roughness") else (1e-4, 1e6 if name in self.spheres.illuminations else 1.0)
+            )
             self.optimiser[name] = dr.clip(self.optimiser[name], low, high)
         return losses
 
@@ -67,6 +77,8 @@ class Joint:
 
     def materials(self) -> Materials:
         def of(kind: str) -> np.ndarray:
-            return np.array([np.array(self.optimiser[f"{name} {kind}"], dtype=float).reshape(-1) for name in self.spheres.materials])
+            return np.array(
+                [np.array(self.optimiser[f"{name} {kind}"], dtype=float).reshape(-1) for name in self.spheres.materials]
+            )
 
         return Materials(of("diffuse"), of("specular"), of("roughness")[:, 0])

@@ -46,7 +46,9 @@ def block(name: str, light: Light, materials: Materials, shown, operator, size: 
     )  # fmt: skip
     radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
-    return msgspec.structs.replace(empty, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled))
+    return msgspec.structs.replace(
+        empty, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled)
+    )
 
 
 def factor_between(found: Materials, true: Materials) -> np.ndarray:

@@ -52,4 +52,6 @@ def lit(block: Block, light: Light, materials: Materials, operator: Operator) ->
     """The block with the radiance of its light, mean 1."""
     radiance = Illumination(block, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
-    return msgspec.structs.replace(block, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled))
+    return msgspec.structs.replace(
+        block, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled)
+    )

@@ -89,7 +89,9 @@ def candidates(caster: Caster, silhouette: Silhouette, camera: Camera, density: 
         turn = looking_along(direction)
         for template, focal in _templates(caster, labels, turn, distance, area, cut):
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
-            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(density.rolls, -1)
+            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(
+                density.rolls, -1
+            )
             best = errors.argmin(axis=1)
             error = 1 + errors[np.arange(density.rolls), best] / area
             shift = np.stack([best % GRID, best // GRID], axis=1)
@@ -100,11 +102,18 @@ def candidates(caster: Caster, silhouette: Silhouette, camera: Camera, density: 
 
 
 def _cost_images(
-    silhouette: Silhouette, labels: Sequence[int], middle: Float[np.ndarray, "2"], pixel: float, angles: Float[np.ndarray, " rolls"]
+    silhouette: Silhouette,
+    labels: Sequence[int],
+    middle: Float[np.ndarray, "2"],
+    pixel: float,
+    angles: Float[np.ndarray, " rolls"],
 ) -> tuple[np.ndarray, float]:
     """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
-    sums = [_block_means(np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)), step) for label in labels]
+    sums = [
+        _block_means(np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)), step)
+        for label in labels
+    ]
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
@@ -163,7 +172,9 @@ def _apart(found: list, keep: int, apart_deg: float) -> list:
     return chosen
 
 
-def _state(found: tuple, caster: Caster, camera: Camera, middle: Float[np.ndarray, "2"], pixel: float, distance: float) -> State:
+def _state(
+    found: tuple, caster: Caster, camera: Camera, middle: Float[np.ndarray, "2"], pixel: float, distance: float
+) -> State:
     """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
     _, turn, angle, shift, focal = found
     cos, sin = np.cos(angle), np.sin(angle)

@@ -49,7 +49,10 @@ def turns(maps: Maps) -> Float[np.ndarray, "h w"]:
     """turn of (1), in radians, over those of the 3 × 3 pixels that see a mesh."""
     seen = (maps.label > 0).astype(float)
     share = np.maximum(uniform_filter(seen, 3, mode="constant"), 1e-12)
-    mean = np.stack([uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)], axis=-1) / share[..., None]
+    mean = (
+        np.stack([uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)], axis=-1)
+        / share[..., None]
+    )
     return np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=-1), 0)) * seen
 
 
@@ -64,7 +67,10 @@ def depth_jumps(maps: Maps) -> np.ndarray:
         first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
         both = seen[first] & seen[second]
         step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
-        jump = both & (((step > limit) & (step > STEEPER * _least_beside(step, axis))) | (maps.object[first] != maps.object[second]))
+        jump = both & (
+            ((step > limit) & (step > STEEPER * _least_beside(step, axis)))
+            | (maps.object[first] != maps.object[second])
+        )
         result[first] |= jump
         result[second] |= jump
     return result

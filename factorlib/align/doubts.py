@@ -29,7 +29,9 @@ class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Share of what the runner-up leaves unexplained that the pose found must explain; below, the pose is doubtful."""
 
 
-def doubts(iou: float, agreement: float, trust: Trust, found: Found | None, standards: Standards = Standards()) -> list[str]:
+def doubts(
+    iou: float, agreement: float, trust: Trust, found: Found | None, standards: Standards = Standards()
+) -> list[str]:
     """One sentence per standard missed; `found` is None for a pose that was given."""
     reasons = []
     if iou < standards.least_iou:
@@ -37,13 +39,21 @@ def doubts(iou: float, agreement: float, trust: Trust, found: Found | None, stan
     if agreement < standards.least_agreement:
         reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
     if trust.contour_error > standards.most_contour_error:
-        reasons.append(f"half of the contours of mesh and mask lie {trust.contour_error:.1%} of the mask's extent apart, or more")
+        reasons.append(
+            f"half of the contours of mesh and mask lie {trust.contour_error:.1%} of the mask's extent apart, or more"
+        )
     if trust.normal_stderr_deg is not None and trust.normal_stderr_deg > standards.most_normal_stderr_deg:
         reasons.append(f"the mask tells normals to {trust.normal_stderr_deg:.1f}° only")
     if found and trust.mirrored_score is not None and 1 - trust.mirrored_score < (1 - found.score) / 2:
-        reasons.append(f"the mirror image of the mask fits better ({trust.mirrored_score:.3f}, {found.score:.3f}): was it mirrored?")
+        reasons.append(
+            f"the mirror image of the mask fits better ({trust.mirrored_score:.3f}, {found.score:.3f}): was it mirrored?"
+        )
     other = found.runner_up if found else None
-    if other and other.normal_difference_deg > DIFFERENT_DEG and found.score - other.score < least_lead(other.score, standards):
+    if (
+        other
+        and other.normal_difference_deg > DIFFERENT_DEG
+        and found.score - other.score < least_lead(other.score, standards)
+    ):
         reasons.append(
             f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well ({other.score:.3f}, {found.score:.3f})"
         )

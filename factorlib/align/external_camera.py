@@ -18,8 +18,14 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
     Raises InputError where the photo is not the image at another size: it was cropped, turned or squeezed.
     """
     across, down = _scale(external, width, height, photo)
-    centre = (width / 2, height / 2) if external.principal_point is None else (external.principal_point[0] * across, external.principal_point[1] * down)
-    if external.size is None and not all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre)):
+    centre = (
+        (width / 2, height / 2)
+        if external.principal_point is None
+        else (external.principal_point[0] * across, external.principal_point[1] * down)
+    )
+    if external.size is None and not all(
+        INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre)
+    ):
         raise _refused(
             external, photo, f"its principal point ({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels",
             "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose of its objects)",
@@ -39,8 +45,15 @@ def _scale(external: ExternalCamera, width: int, height: int, photo: str) -> tup
     found = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{size[1]:g}"
     if _is_resized(size[::-1], width, height):
         cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
-        raise _refused(external, photo, f"{found}: it was made of the photo before its EXIF orientation was applied", cure)
-    raise _refused(external, photo, f"{found}: it was cropped or squeezed", "give the image itself, or the same at another size, and masks of it")
+        raise _refused(
+            external, photo, f"{found}: it was made of the photo before its EXIF orientation was applied", cure
+        )
+    raise _refused(
+        external,
+        photo,
+        f"{found}: it was cropped or squeezed",
+        "give the image itself, or the same at another size, and masks of it",
+    )
 
 
 def _is_resized(size: tuple[float, float], width: int, height: int) -> bool:

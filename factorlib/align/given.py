@@ -41,7 +41,9 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
         )  # fmt: skip
 
 
-def warn_of_materials(label: Float[np.ndarray, "h w"], of_objects: Iterable[Sequence[int]], materials: Sequence[str], photo: str) -> None:
+def warn_of_materials(
+    label: Float[np.ndarray, "h w"], of_objects: Iterable[Sequence[int]], materials: Sequence[str], photo: str
+) -> None:
     """Of materials of the mask that no object of the photo has: their pixels get no normals and are not used.
 
     of_objects: labels of the materials of each object

@@ -28,7 +28,9 @@ class Keypoints(msgspec.Struct, frozen=True):
     point: Float[np.ndarray, "n 3"]
 
 
-def state_of_keypoints(keypoints: Keypoints, caster: Caster, camera: Camera, prior: FocalPrior, photo: str, name: str) -> State:
+def state_of_keypoints(
+    keypoints: Keypoints, caster: Caster, camera: Camera, prior: FocalPrior, photo: str, name: str
+) -> State:
     """The state in which most keypoints agree.  Raises InputError where fewer than LEAST_AGREEING do.
 
     camera: its focal length is the prior's; it is replaced only where nothing was known and LEAST_FOR_FOCAL are given.
@@ -42,7 +44,9 @@ def state_of_keypoints(keypoints: Keypoints, caster: Caster, camera: Camera, pri
             rigid = found["cam_from_world"]
             rotation = rigid.rotation.matrix()
             translation = caster.radius * rigid.translation - rotation @ caster.centre
-            return state_of(Pose(rotation, translation), msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster)
+            return state_of(
+                Pose(rotation, translation), msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster
+            )
     raise InputError(
         f"only {agreeing} of the {len(keypoints.pixel)} keypoints of '{name}' agree on a pose", file="dataset.yaml", key=f"{photo}.{name}.keypoints",
         cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: is each pixel (x, y) beside its own point?",

@@ -21,7 +21,10 @@ def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhou
     picture[seen] = 0.6 * picture[seen] + 0.4 * tint[seen]
     picture[~silhouette.known] = 0.7 * picture[~silhouette.known] + 0.3 * np.array([0.4, 0.5, 0.7])
     width = max(1, round(max(seen.shape) / 600))
-    for contour, colour in ((outline(np.maximum(silhouette.label, 0)), MASK), (outline(maps.label + 1000 * maps.object), MESH)):
+    for contour, colour in (
+        (outline(np.maximum(silhouette.label, 0)), MASK),
+        (outline(maps.label + 1000 * maps.object), MESH),
+    ):
         picture[binary_dilation(contour, iterations=width) if width > 1 else contour] = colour
     return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 

@@ -148,7 +148,9 @@ def _found_before(obj: ObjectToPlace, camera: Camera, sigma: float, search: Sear
     return msgspec.structs.replace(found, runner_up=other)
 
 
-def _judged(obj: ObjectToPlace, camera: Camera, found: Found, source: str | None, photo: str, search: Search) -> tuple[Found, str]:
+def _judged(
+    obj: ObjectToPlace, camera: Camera, found: Found, source: str | None, photo: str, search: Search
+) -> tuple[Found, str]:
     """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
     if source != "exif":
         return found, "estimated"
@@ -168,12 +170,19 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, source: str | None
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in objects if t.pose and t.silhouette.inside.any()]
+    fixed = [
+        (t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200))
+        for t in objects
+        if t.pose and t.silhouette.inside.any()
+    ]
 
     def misfit(log_focal: float) -> float:
         """Minus the sum of overlaps (IoU) with the focal length exp(log_focal)."""
         trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
-        return -sum(labelled_iou(target.silhouette, rasterise(caster, target.camera(trial), pose).label) for caster, pose, target in fixed)
+        return -sum(
+            labelled_iou(target.silhouette, rasterise(caster, target.camera(trial), pose).label)
+            for caster, pose, target in fixed
+        )
 
     grid = np.log(camera.focal) + np.linspace(-1.6, 1.6, 33)
     best = grid[int(np.argmin([misfit(g) for g in grid]))]

@@ -148,11 +148,15 @@ def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[n
     moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, SHAPES)
     point = arms + state.middle()
     slope = point[:, :2] / point[:, 2:]
-    by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (np.exp(state.log_focal) / point[:, 2])[:, None, None]
+    by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (np.exp(state.log_focal) / point[:, 2])[
+        :, None, None
+    ]
     return np.concatenate([state.jacobian(arms), by_shape], axis=-1)
 
 
-def joint_step(each: Sequence[tuple[Sighting, Equations]]) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
+def joint_step(
+    each: Sequence[tuple[Sighting, Equations]],
+) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
     """The damped step of d, and the sightings' own steps."""
     shared, pull, own = np.diag(DAMPING[7:]), np.zeros(2), []
     for one, equations in each:

@@ -110,7 +110,10 @@ class Equations(msgspec.Struct, frozen=True):
 
 
 def normal_equations(
-    seen: Rendered, target: Target, prior: FocalPrior, jacobian_of: Callable[[State, np.ndarray], np.ndarray] = State.jacobian
+    seen: Rendered,
+    target: Target,
+    prior: FocalPrior,
+    jacobian_of: Callable[[State, np.ndarray], np.ndarray] = State.jacobian,
 ) -> Equations:
     """The contours' residuals by all unknowns, robustly weighted, with the prior of the focal length.
 
@@ -157,7 +160,8 @@ def contour_of(seen: Rendered, name: int) -> tuple[Float[np.ndarray, "n 2"], Flo
 def _mesh_to_mask(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     place = points.T[::-1] - 0.5
     distance, slope_x, slope_y = (
-        map_coordinates(image, place, order=1, mode="nearest") for image in (region.distance, region.slope[..., 0], region.slope[..., 1])
+        map_coordinates(image, place, order=1, mode="nearest")
+        for image in (region.distance, region.slope[..., 0], region.slope[..., 1])
     )
     return distance, slope_x[:, None] * jacobian[:, 0] + slope_y[:, None] * jacobian[:, 1]
 

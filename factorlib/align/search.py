@@ -103,15 +103,25 @@ def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPri
         kept = states[: keep if others else effort * keep]
         target = target_of(silhouette, caster.mesh.labels, resolution, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
-        states = [result.state for result in ranked if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)]
+        states = [
+            result.state
+            for result in ranked
+            if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
+        ]
         others = ranked + others
-    rivals = _rivals(ranked[0], others[len(ranked) :], search.rivals)  # refined anew: scores of different resolutions do not compare
-    ranked = _distinct(ranked + [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals], prior)
+    rivals = _rivals(
+        ranked[0], others[len(ranked) :], search.rivals
+    )  # refined anew: scores of different resolutions do not compare
+    ranked = _distinct(
+        ranked + [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals], prior
+    )
     best = ranked[0]
     return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
 
 
-def found_near(caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()) -> Found:
+def found_near(
+    caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()
+) -> Found:
     """The pose refined from `start`, at the two finest resolutions; `start` itself where that leads far off."""
     camera, state = msgspec.structs.replace(camera, focal=prior.focal), start
     for steps, resolution, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
@@ -123,14 +133,18 @@ def found_near(caster: Caster, silhouette: Silhouette, camera: Camera, start: St
     return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
 
 
-def found_before(caster: Caster, silhouette: Silhouette, camera: Camera, state: State, log_focal_sigma: float, search: Search) -> Found:
+def found_before(
+    caster: Caster, silhouette: Silhouette, camera: Camera, state: State, log_focal_sigma: float, search: Search
+) -> Found:
     """An earlier answer as it is, without a runner-up, scored anew at the finest resolution."""
     target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     score = refined(caster, target, camera, state, FocalPrior(camera.focal, 0.0), 0).score
     return Found(state, score, log_focal_sigma, None, earlier=True)
 
 
-def with_focal_free(caster: Caster, silhouette: Silhouette, camera: Camera, found: Found, prior: FocalPrior, search: Search) -> Found:
+def with_focal_free(
+    caster: Caster, silhouette: Silhouette, camera: Camera, found: Found, prior: FocalPrior, search: Search
+) -> Found:
     """The pose found, refined once more under another `prior` of the focal length."""
     target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
     result = refined(caster, target, camera, found.state, prior, 2 * search.steps[-1])
@@ -157,7 +171,9 @@ def _rivals(best: Refined, others: list[Refined], count: int) -> list[Refined]:
     """The first `count` of `others` that are turned by more than DISTINCT_DEG against the best and each other."""
     rivals: list[Refined] = []
     for other in others:
-        distinct = all(angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals))
+        distinct = all(
+            angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals)
+        )
         if distinct and len(rivals) < count:
             rivals.append(other)
     return rivals
@@ -166,7 +182,9 @@ def _rivals(best: Refined, others: list[Refined], count: int) -> list[Refined]:
 def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:
     for other in others:
         if angle_between(other.state.rotation, best.state.rotation) > DISTINCT_DEG:
-            return RunnerUp(other.state, other.score, normal_difference(caster, target, camera, best.state, other.state))
+            return RunnerUp(
+                other.state, other.score, normal_difference(caster, target, camera, best.state, other.state)
+            )
     return None
 
 

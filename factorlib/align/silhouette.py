@@ -39,7 +39,9 @@ def silhouette_of_photo(channels: Mapping[str, Float[np.ndarray, "h w"]]) -> Sil
     return Silhouette(label)
 
 
-def silhouette_of_object(channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool) -> Silhouette:
+def silhouette_of_object(
+    channels: Mapping[str, Float[np.ndarray, "h w"]], number: int, labels: Sequence[int], own_mask: bool
+) -> Silhouette:
     """Of object `number` (from 1), whose mesh carries `labels`.
 
     With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object

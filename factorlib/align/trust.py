@@ -47,11 +47,15 @@ def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
         return Trust(1.0)
     target = target_of(silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
     if found is None:
-        return Trust(contour_error(caster, target, placed.camera, state_of(placed.poses[number], placed.camera, caster)))
+        return Trust(
+            contour_error(caster, target, placed.camera, state_of(placed.poses[number], placed.camera, caster))
+        )
     return Trust(
         contour_error(caster, target, placed.camera, found.state),
         normal_stderr_deg(caster, target, placed.camera, found.state, placed.prior),
-        mirrored_score(caster, silhouette, placed.camera, placed.prior) if found.score < FITS_TO_A_PIXEL and not found.by_keypoints else None,
+        mirrored_score(caster, silhouette, placed.camera, placed.prior)
+        if found.score < FITS_TO_A_PIXEL and not found.by_keypoints
+        else None,
     )
 
 
@@ -62,7 +66,9 @@ def contour_error(caster: Caster, target: Target, camera: Camera, state: State) 
         points = contour_of(seen, name)[0]
         distances.append(np.abs(map_coordinates(region.distance, points.T[::-1] - 0.5, order=1, mode="nearest")))
         if len(region.contour):
-            distances.append(cKDTree(points).query(region.contour)[0] if len(points) else np.full(len(region.contour), target.extent))
+            distances.append(
+                cKDTree(points).query(region.contour)[0] if len(points) else np.full(len(region.contour), target.extent)
+            )
     every = np.concatenate(distances)
     return float(np.median(every) / target.extent) if len(every) else 1.0
 
@@ -86,7 +92,9 @@ def _move(direction: Float[np.ndarray, " n"], precision: float) -> Float[np.ndar
     return np.append(length * direction, np.zeros(7 - len(direction)))
 
 
-def mirrored_score(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = QUICK) -> float:
+def mirrored_score(
+    caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = QUICK
+) -> float:
     """The best score for the photo with left and right exchanged."""
     centre = (camera.width - camera.centre[0], camera.centre[1])
     mirror = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))

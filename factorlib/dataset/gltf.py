@@ -141,7 +141,9 @@ class Header(msgspec.Struct, frozen=True):
 
 def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
     """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
-    text = _json_chunk(file, key, most_bytes) if file.suffix.lower() == ".glb" else read_bytes(file, WHAT, key, most_bytes)
+    text = (
+        _json_chunk(file, key, most_bytes) if file.suffix.lower() == ".glb" else read_bytes(file, WHAT, key, most_bytes)
+    )
     if text.count(b",") > MOST_VALUES:
         cure = "export the geometry alone, with its data in a .bin file or as .glb"
         raise InputError(f"its header has more than {MOST_VALUES:,} values", file=file, key=key, cure=cure)
@@ -152,7 +154,9 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
         raise InputError(found, file=file, key=key, cure="export it again, as glTF 2.0")
     packed = [name for name in COMPRESSED if name in header.extensionsRequired]
     if packed:
-        raise InputError(f"its meshes are compressed ({packed[0]})", file=file, key=key, cure="export it without compression")
+        raise InputError(
+            f"its meshes are compressed ({packed[0]})", file=file, key=key, cure="export it without compression"
+        )
     return header
 
 

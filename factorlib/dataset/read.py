@@ -35,7 +35,9 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
-        raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name")
+        raise InputError(
+            f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name"
+        )
     spec = read_yaml(file, DatasetFile)
     check_dataset(spec, file)
     companions, external = _companions(spec, file), {}

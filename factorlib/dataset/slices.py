@@ -68,7 +68,9 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     camera = photo.camera or schema.Camera()
-    facts = schema.ObjectsSlice(camera=camera, objects=photo.objects, meshes=meshes, external=dataset.external.get(photo.name))
+    facts = schema.ObjectsSlice(
+        camera=camera, objects=photo.objects, meshes=meshes, external=dataset.external.get(photo.name)
+    )
     files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
     return facts, files + _object_masks(photo)
 
@@ -113,7 +115,11 @@ def _fields_of_photo(facts: dict[str, Any], photo: str) -> dict[str, Any]:
 
 
 def _fields_of_set(facts: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for key, part in facts.items() for name, value in _fields(part, "the folder's name" if key == "name" else key).items()}
+    return {
+        name: value
+        for key, part in facts.items()
+        for name, value in _fields(part, "the folder's name" if key == "name" else key).items()
+    }
 
 
 def _fields(value: Any, name: str) -> dict[str, Any]:

@@ -45,7 +45,10 @@ class Answer(msgspec.Struct, frozen=True):
     def material_table(self, errors: StandardErrors) -> table.MaterialTable:
         """The content of materials.json."""
         materials, stderr = _rows(self.solution.point.materials), _errors(self.names, errors)
-        solved = {name: table.solved(table.Reflectance(*row), stderr[name]) for name, row in zip(self.names, materials, strict=True)}
+        solved = {
+            name: table.solved(table.Reflectance(*row), stderr[name])
+            for name, row in zip(self.names, materials, strict=True)
+        }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
         absolute = self.solution.interreflection.kept
@@ -54,7 +57,9 @@ class Answer(msgspec.Struct, frozen=True):
 
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""
-        return Uncertainty(errors.deviation, _errors(self.names, errors), GAUGE + ABSOLUTE * self.solution.interreflection.kept)
+        return Uncertainty(
+            errors.deviation, _errors(self.names, errors), GAUGE + ABSOLUTE * self.solution.interreflection.kept
+        )
 
     def lights(self) -> dict[str, Lobes]:
         """By illumination, in scene radiance."""
@@ -68,7 +73,11 @@ class Answer(msgspec.Struct, frozen=True):
     def found_exposures(self) -> dict[str, float]:
         """Factor of each photo beside what its EXIF says."""
         lights = zip(self.problem.blocks, self.solution.point.lights, strict=True)
-        return {photo: float(np.exp(light.log_exposure[k])) for block, light in lights for k, photo in enumerate(block.photos)}
+        return {
+            photo: float(np.exp(light.log_exposure[k]))
+            for block, light in lights
+            for k, photo in enumerate(block.photos)
+        }
 
     def model(self) -> table.Model:
         """What was decided of the model, and by what."""
@@ -104,7 +113,9 @@ class Answer(msgspec.Struct, frozen=True):
         if self.earlier is None:
             return msgspec.UNSET
         materials = set(self.names) & set(self.earlier.table.materials)
-        return table.Started(sorted(materials), sorted({block.name for block in self.problem.blocks} & set(self.earlier.lights)))
+        return table.Started(
+            sorted(materials), sorted({block.name for block in self.problem.blocks} & set(self.earlier.lights))
+        )
 
 
 def _rows(materials: Materials) -> list[tuple[list[float], list[float], float]]:

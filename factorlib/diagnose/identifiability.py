@@ -37,7 +37,9 @@ def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block]) 
 
     names: of all materials;  a material that no block shows is left out
     """
-    said = [f"illumination '{b.name}' is black in every photo: it tells nothing" for b in blocks if (b.radiance <= 0).all()]
+    said = [
+        f"illumination '{b.name}' is black in every photo: it tells nothing" for b in blocks if (b.radiance <= 0).all()
+    ]
     for m, name in enumerate(names):
         shown = [(block, block.material == m) for block in blocks if (block.material == m).any()]
         said += _of_material(name, shown) if shown else []
@@ -84,7 +86,9 @@ def _alone(name: str, lights: Sequence[str]) -> str:
     return said + " that shows another material too would help"
 
 
-def undetermined_by_answer(names: Sequence[str], blocks: Sequence[Block], found: Materials, errors: Materials) -> list[str]:
+def undetermined_by_answer(
+    names: Sequence[str], blocks: Sequence[Block], found: Materials, errors: Materials
+) -> list[str]:
     """What the data left open, by the standard `errors` of what was `found`, as sentences; of materials that are seen."""
     seen = sorted({int(m) for block in blocks for m in np.unique(block.material)})
     return [sentence for m in seen for sentence in _of_answer(names[m], _row(found, m), _row(errors, m))]
@@ -132,7 +136,7 @@ def unlikely_curves(blocks: Sequence[Block], lights: Sequence[Light]) -> list[st
     """Tone curves that have run toward the bounds of what cameras do, as sentences."""
     return [
         f"the tone curves of illumination '{block.name}' have exponents of {', '.join(f'{g:.2g}' for g in np.exp(light.log_tone))}, "
-        "more than a camera does: something else is wrong there, as normals or `encoding`. SET=\"solve.tone=off\" goes without them"
+        'more than a camera does: something else is wrong there, as normals or `encoding`. SET="solve.tone=off" goes without them'
         for block, light in zip(blocks, lights, strict=True)
         if beyond_cameras(light)
     ]
@@ -147,7 +151,9 @@ def tinted_alike(names: Sequence[str], blocks: Sequence[Block], lights: Sequence
     for _, illuminations in connected_components(blocks, len(names)):
         if not illuminations or is_free(blocks, illuminations):
             continue
-        sums = np.array([light.energy.sum(0) for block, light in zip(blocks, lights, strict=True) if block.name in illuminations])
+        sums = np.array(
+            [light.energy.sum(0) for block, light in zip(blocks, lights, strict=True) if block.name in illuminations]
+        )
         level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
         if np.abs(level - level[1]).max() > TINTED:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))

@@ -58,7 +58,9 @@ class Posterior:
         """Standard error of every material unknown."""
         materials, blocks = self.materials, self.problem.blocks
         size, widths = 7 * len(materials), np.tile(WIDTHS, len(materials))
-        by_log = 1 / np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(-1)  # ∂ log k/∂k
+        by_log = 1 / np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))]).reshape(
+            -1
+        )  # ∂ log k/∂k
         information, scores = np.diag(widths**-2.0), []  # nothing is less known than its range says
         for system in self.systems(with_scores=True):
             places, k = system.places, len(system.places)
@@ -68,7 +70,11 @@ class Posterior:
             scores.append(np.zeros((len(system.scores), size)))
             scores[-1][:, places] = (system.scores[:, :k] - system.scores[:, k:] @ taken_up) * by_log[places]
         inverse = inverse_of(information)
-        covariances = inverse, sandwich(inverse, np.vstack(scores), 1.0), sandwich(inverse, np.array([s.sum(0) for s in scores]), 1.0)
+        covariances = (
+            inverse,
+            sandwich(inverse, np.vstack(scores), 1.0),
+            sandwich(inverse, np.array([s.sum(0) for s in scores]), 1.0),
+        )
         variances = [np.diag(in_gauge(covariance, materials, blocks)) for covariance in covariances]
         deviation = residual_deviation(self.problem, self.fit.point)
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
@@ -80,7 +86,9 @@ class Posterior:
         """By illumination, over the light's mean radiance: a small lat-long map in the frame of the exported ones, at most LARGEST."""
         directions = (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
         maps = {}
-        for block, light, system in zip(self.problem.blocks, self.fit.point.lights, self.systems(with_scores=False), strict=True):
+        for block, light, system in zip(
+            self.problem.blocks, self.fit.point.lights, self.systems(with_scores=False), strict=True
+        ):
             p, errors = len(light), np.empty((len(directions), 3))
             covariance = positive_definite_inverse(system.light_hessian[: 3 * p, : 3 * p]).matrix
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))

@@ -75,7 +75,11 @@ def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
     information, widths = system.schur_complement(point), np.tile(WIDTHS, count)
     inverse = inverse_of(information / sigma**2 + np.diag(widths**-2.0))  # nothing is less known than its range says
     by_cell = system.reduced_scores(point)
-    covariances = inverse, sandwich(inverse, np.vstack(by_cell), sigma), sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma)
+    covariances = (
+        inverse,
+        sandwich(inverse, np.vstack(by_cell), sigma),
+        sandwich(inverse, np.array([s.sum(0) for s in by_cell]), sigma),
+    )
     variances = [np.diag(in_gauge(covariance, materials, problem.blocks)) for covariance in covariances]
     errors = np.minimum(np.sqrt(np.max(variances, axis=0).clip(0)), widths).reshape(-1, 7)
     return StandardErrors(Materials(errors[:, :3], errors[:, 3:6], errors[:, 6]), sigma)
@@ -86,7 +90,9 @@ def clustered_equations(illumination: Illumination, loss: Loss) -> NormalEquatio
     return normal_equations(illumination, loss, clusters_of(illumination.block))
 
 
-def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float) -> Float[np.ndarray, "k k"]:
+def sandwich(
+    inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float
+) -> Float[np.ndarray, "k k"]:
     """(1) from scores that lights were eliminated from, one a row, as wide as Student's t asks for so few clusters."""
     count = len(scores)
     if count < 2:
@@ -100,7 +106,9 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
     return robust_deviation(np.concatenate(problem.residuals(point)))
 
 
-def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]) -> Float[np.ndarray, "k k"]:
+def in_gauge(
+    covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block]
+) -> Float[np.ndarray, "k k"]:
     """The covariance where the sum of each component and channel that has a free factor is fixed."""
     for members, illuminations in connected_components(blocks, len(materials)):
         for channel in range(3) if is_free(blocks, illuminations) else ():
@@ -112,7 +120,10 @@ def in_gauge(covariance: Float[np.ndarray, "k k"], materials: Materials, blocks:
 def _gauge_projection(materials: Materials, members: Sequence[int], channel: int) -> Float[np.ndarray, "7m 7m"]:
     direction, fixed = np.zeros(7 * len(materials)), np.zeros(7 * len(materials))
     for m in members:
-        direction[7 * m + channel], direction[7 * m + 3 + channel] = materials.diffuse[m, channel], materials.specular[m, channel]
+        direction[7 * m + channel], direction[7 * m + 3 + channel] = (
+            materials.diffuse[m, channel],
+            materials.specular[m, channel],
+        )
         fixed[[7 * m + channel, 7 * m + 3 + channel]] = 1
     return np.eye(len(direction)) - np.outer(direction, fixed) / (fixed @ direction)
 

@@ -26,7 +26,9 @@ def unseen_materials(names: Sequence[str], blocks: Sequence[Block]) -> list[str]
     """Materials that no photo shows; names: of all materials, in the order of their numbers."""
     observed = {int(m) for block in blocks for m in np.unique(block.material)}
     return [
-        f"material '{name}' is observed in no photo: its reflectance is only a guess" for m, name in enumerate(names) if m not in observed
+        f"material '{name}' is observed in no photo: its reflectance is only a guess"
+        for m, name in enumerate(names)
+        if m not in observed
     ]
 
 
@@ -41,7 +43,9 @@ def unlinked_sets(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
     linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
     if len(linked) < 2:
         return []
-    groups = "; ".join(f"{', '.join(lights)} (with {', '.join(names[m] for m in members)})" for members, lights in linked)
+    groups = "; ".join(
+        f"{', '.join(lights)} (with {', '.join(names[m] for m in members)})" for members, lights in linked
+    )
     return [
         f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
         "A photo that shows a material of each would link them"

@@ -99,7 +99,9 @@ def lookup_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.nd
     return Lookup(at(below), at(below + 1), level - below)
 
 
-def radiance_toward(light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+def radiance_toward(
+    light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 3"]:
     """Radiance averaged over about `solid_angle` steradians around unit `direction`."""
     return lookup_toward(direction, solid_angle).of(light)
 
@@ -210,7 +212,9 @@ def _visible_normals(cos_o: Float[np.ndarray, "n 1"], alpha: float) -> Float[np.
     along = (1 - lift) * np.sqrt(1 - across**2) + lift * along
     up = np.sqrt(np.maximum(1 - across**2 - along**2, 0))
     # basis of the stretched view v = (sin, 0, cos): t1 = (0, 1, 0), t2 = v × t1 = (−cos, 0, sin)
-    half = np.stack([alpha * (-cos * along + sin * up), alpha * across, np.maximum(sin * along + cos * up, 1e-9)], axis=-1)
+    half = np.stack(
+        [alpha * (-cos * along + sin * up), alpha * across, np.maximum(sin * along + cos * up, 1e-9)], axis=-1
+    )
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 

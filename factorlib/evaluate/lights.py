@@ -142,7 +142,10 @@ def _scored_view(
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
     factors = [gauge_factors(pictures, true, whites) for pictures in (found, constant)]
     return {
-        n: {g: ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors))) for g in GAUGES}
+        n: {
+            g: ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors)))
+            for g in GAUGES
+        }
         for i, n in enumerate(names)
     }
 
@@ -159,8 +162,13 @@ def _part(view: str, seen: Bool[np.ndarray, " t"] | None) -> slice | np.ndarray 
 
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
     views = [v for v in _views() if any(v in s for s in scored)]
-    return {v: ScoredLight(*(_mean_error([getattr(s[v], k) for s in scored if v in s]) for k in ("estimate", "null"))) for v in views}
+    return {
+        v: ScoredLight(*(_mean_error([getattr(s[v], k) for s in scored if v in s]) for k in ("estimate", "null")))
+        for v in views
+    }
 
 
 def _mean_error(errors: list[LightError]) -> LightError:
-    return LightError(*(round(float(np.mean([getattr(e, f) for e in errors])), 9) for f in LightError.__struct_fields__))
+    return LightError(
+        *(round(float(np.mean([getattr(e, f) for e in errors])), 9) for f in LightError.__struct_fields__)
+    )

@@ -72,7 +72,9 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
     return (similar / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(axis=-1) * mask
 
 
-def picture_errors(estimate: Picture, truth: Picture, regions: dict[str, Mask], white: float) -> dict[str, PictureError]:
+def picture_errors(
+    estimate: Picture, truth: Picture, regions: dict[str, Mask], white: float
+) -> dict[str, PictureError]:
     """The errors of each region; the SSIM window sees the union of the regions.  Empty regions are left out."""
     regions = {name: region for name, region in regions.items() if region.any()}
     if not regions:
@@ -94,11 +96,18 @@ def mean_error(errors: list[PictureError]) -> PictureError | None:
     """The mean of each number (of dB, for PSNR); None of none."""
     if not errors:
         return None
-    return PictureError(*(round(float(np.mean([getattr(e, f) for e in errors])), 6) for f in PictureError.__struct_fields__))
+    return PictureError(
+        *(round(float(np.mean([getattr(e, f) for e in errors])), 6) for f in PictureError.__struct_fields__)
+    )
 
 
 def _error_in(
-    region: Mask, estimate: np.ndarray, truth: np.ndarray, shown: tuple[np.ndarray, np.ndarray], ssim: np.ndarray, white: float
+    region: Mask,
+    estimate: np.ndarray,
+    truth: np.ndarray,
+    shown: tuple[np.ndarray, np.ndarray],
+    ssim: np.ndarray,
+    white: float,
 ) -> PictureError:
     return PictureError(
         psnr_linear_db=psnr(estimate[region], truth[region], white),

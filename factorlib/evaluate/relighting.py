@@ -92,7 +92,10 @@ def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]
     def gauged(i: int, gauge: str) -> Kinds:
         """The errors of ball i in one gauge."""
         shown = zip(KINDS, kinds, factors)
-        return {k: picture_error(_disc(p[i] * f[gauge][i], inside), _disc(true[i], inside), inside, whites[i]) for k, p, f in shown}
+        return {
+            k: picture_error(_disc(p[i] * f[gauge][i], inside), _disc(true[i], inside), inside, whites[i])
+            for k, p, f in shown
+        }
 
     return [RelitBall(o, 1 / w, {g: gauged(i, g) for g in GAUGES}) for i, (o, w) in enumerate(zip(observed, whites))]
 

@@ -49,7 +49,9 @@ def compare_relit_set(
         return None
     worst = min(scores, key=scores.__getitem__)
     mean, null = (round(float(np.mean(v)), 6) for v in (list(scores.values()), nulls))
-    return RelitSet(len(scores), mean, scores[worst], null, *worst, set_factor((estimates[m], truths[m]) for m in names))
+    return RelitSet(
+        len(scores), mean, scores[worst], null, *worst, set_factor((estimates[m], truths[m]) for m in names)
+    )
 
 
 def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
@@ -59,7 +61,9 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
     (2.0, 1.0, 1.0)
     """
-    both = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)  # [m, recovered or true, k_d or k_s, channel]
+    both = np.array(
+        [[(m.diffuse, m.specular) for m in pair] for pair in pairs], float
+    )  # [m, recovered or true, k_d or k_s, channel]
     found, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
     logs = [np.log(t[kept]) - np.log(f[kept]) for f, t in zip(found, true) for kept in [(f > 0) & (t > 0)]]
     return tuple(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)

@@ -45,10 +45,18 @@ SYNTHETIC = (
     Bound("materials.worst_specular", "≤", 0.038, "", "specular, worst material and channel, relative"),
     Bound("resynthesis.worst_psnr_linear_db", "≥", 35.0, "dB", "re-synthesis, worst photo, no gauge, linear"),
     Bound("resynthesis.worst_psnr_tonemapped_db", "≥", 40.4, "dB", "re-synthesis, worst photo, no gauge, tone-mapped"),
-    Bound("relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db", "≥", 38.0, "dB", "relit balls, one scalar per set"),
+    Bound(
+        "relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db",
+        "≥",
+        38.0,
+        "dB",
+        "relit balls, one scalar per set",
+    ),
     Bound("light.mean.channel_per_photo.mirror.estimate.rmse", "≤", 0.276, "", "mirror sphere, of the truth's RMS"),
     Bound("light.mean.channel_per_photo.glossy.estimate.rmse", "≤", 0.076, "", "glossy sphere, of the truth's RMS"),
-    Bound("light.mean.channel_per_photo.lambertian.estimate.rmse", "≤", 0.005, "", "Lambertian sphere, of the truth's RMS"),
+    Bound(
+        "light.mean.channel_per_photo.lambertian.estimate.rmse", "≤", 0.005, "", "Lambertian sphere, of the truth's RMS"
+    ),
 )
 
 
@@ -88,7 +96,13 @@ def table_text(rows: list[Row]) -> str:
 def _cells(row: Row) -> tuple[str, str, str, str, str]:
     unit = f" {row.bound.unit}" if row.bound.unit else ""
     value = "missing" if row.value is None else f"{row.value:.4g}{unit}"
-    return row.bound.meaning, value, f"{row.bound.sense} {row.bound.limit:g}{unit}", "yes" if row.ok else "NO", row.bound.path
+    return (
+        row.bound.meaning,
+        value,
+        f"{row.bound.sense} {row.bound.limit:g}{unit}",
+        "yes" if row.ok else "NO",
+        row.bound.path,
+    )
 
 
 def main(path: str) -> int:

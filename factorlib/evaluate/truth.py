@@ -25,7 +25,9 @@ def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
         raise InputError(found, file=path, key=key, cure="render the map again")
     if radiance.min() < LEAST * np.abs(radiance).mean(dtype=float):
         found = f"a radiance of {radiance.min():.4g} is less than 0"
-        raise InputError(found, file=path, key=key, cure="give linear radiance: was a filter with negative lobes used? cut it at 0")
+        raise InputError(
+            found, file=path, key=key, cure="give linear radiance: was a filter with negative lobes used? cut it at 0"
+        )
     return radiance
 
 

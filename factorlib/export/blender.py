@@ -37,11 +37,18 @@ class ExposedMap(msgspec.Struct, frozen=True):
 
 def write_script(folder: str | Path) -> None:
     """Write blender.py, which builds the scenes that `write_scene_json` writes to the same folder."""
-    write_text(Path(folder) / "blender.py", files("factorlib.export").joinpath("blender.py.txt").read_text(encoding="utf-8"))
+    write_text(
+        Path(folder) / "blender.py", files("factorlib.export").joinpath("blender.py.txt").read_text(encoding="utf-8")
+    )
 
 
 def write_scene_json(
-    path: str | Path, view: View, shapes: Sequence[Shape], materials: Mapping[str, Reflectance], light: ExposedMap, max_depth: int
+    path: str | Path,
+    view: View,
+    shapes: Sequence[Shape],
+    materials: Mapping[str, Reflectance],
+    light: ExposedMap,
+    max_depth: int,
 ) -> None:
     """Write a photo's scene; of `materials` those that shapes name."""
     used = sorted({shape.material for shape in shapes})
@@ -49,11 +56,20 @@ def write_scene_json(
         "camera": view,
         "shapes": [_shape(shape) for shape in shapes],
         "materials": {name: materials[name] for name in used},
-        "light": {"file": light.file, "exposure": light.exposure.tolist(), "camera_from_light": light.camera_from_light.tolist()},
+        "light": {
+            "file": light.file,
+            "exposure": light.exposure.tolist(),
+            "camera_from_light": light.camera_from_light.tolist(),
+        },
         "max_depth": max_depth,
     }
     write_json(path, scene)
 
 
 def _shape(shape: Shape) -> dict[str, Any]:
-    return {"name": shape.name, "file": shape.file, "material": shape.material, "cam_from_object": shape.cam_from_object.tolist()}
+    return {
+        "name": shape.name,
+        "file": shape.file,
+        "material": shape.material,
+        "cam_from_object": shape.cam_from_object.tolist(),
+    }

@@ -37,7 +37,9 @@ def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Map
         visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-    data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=lambda tree: _set_materials(tree, materials))
+    data = scene.export(
+        file_type="glb", include_normals=True, tree_postprocessor=lambda tree: _set_materials(tree, materials)
+    )
     write_bytes(path, data)
 
 
@@ -54,6 +56,10 @@ def gltf_material(material: Reflectance) -> dict[str, Any]:
     base = np.array(material.diffuse) / (1 - brightest)
     colour = np.array(material.specular) / (DIELECTRIC * brightest) if brightest > 0 else np.ones(3)
     return {
-        "pbrMetallicRoughness": {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness},
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [*base.tolist(), 1.0],
+            "metallicFactor": 0.0,
+            "roughnessFactor": material.roughness,
+        },
         "extensions": {EXTENSION: {"specularFactor": brightest, "specularColorFactor": colour.tolist()}},
     }

@@ -66,7 +66,9 @@ def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
     return [in_the_sky, *(in_lamp(material, model, normals, np.array(lamp)) for lamp in LAMPS.values())]
 
 
-def in_lamp(material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+def in_lamp(
+    material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 3"]:
     """f · n·i · π for a lamp far away in the direction `lamp`."""
     view, light = np.array([0.0, 0.0, 1.0]), lamp / np.linalg.norm(lamp)
     half = (view + light) / np.linalg.norm(view + light)

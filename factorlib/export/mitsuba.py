@@ -56,7 +56,9 @@ class Environment(msgspec.Struct, frozen=True):
     camera_from_light: Float[np.ndarray, "3 3"]
 
 
-def scene_xml(view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT) -> str:
+def scene_xml(
+    view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT
+) -> str:
     """The scene as XML; `materials` are those that shapes name, by name."""
     scene = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": max_depth}.items():
@@ -100,7 +102,9 @@ def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:
     near, far = clip_distances(shapes)
     field = float(np.degrees(2 * np.arctan(w / (2 * view.focal_px))))
     _values(sensor, float={"fov": field, **offset, "near_clip": near, "far_clip": far}, string={"fov_axis": "x"})
-    ET.SubElement(ET.SubElement(sensor, "transform", name="to_world"), "lookat", origin="0, 0, 0", target="0, 0, -1", up="0, 1, 0")
+    ET.SubElement(
+        ET.SubElement(sensor, "transform", name="to_world"), "lookat", origin="0, 0, 0", target="0, 0, -1", up="0, 1, 0"
+    )
     film = ET.SubElement(sensor, "film", type="hdrfilm")
     _values(film, integer={"width": w, "height": h}, string={"pixel_format": "rgb", "component_format": "float32"})
     ET.SubElement(film, "rfilter", type="box")

@@ -35,7 +35,9 @@ UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # what a unit of the poses is i
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
-def write_usd_scene(path: str | Path, view: View, shapes: Sequence[Shape], materials: Mapping[str, Reflectance], light: ExposedMap) -> None:
+def write_usd_scene(
+    path: str | Path, view: View, shapes: Sequence[Shape], materials: Mapping[str, Reflectance], light: ExposedMap
+) -> None:
     """Write a photo's scene; of `materials` those that shapes name.  A shape's file has a twin by `write_usd_mesh`."""
     write_text(path, scene_text(view, shapes, materials, light))
 
@@ -46,7 +48,9 @@ def scene_text(view: View, shapes: Sequence[Shape], materials: Mapping[str, Refl
     scene = [*_camera(view, shapes), *_light(light), *_materials(materials, named), *_objects(shapes, named)]
     film = ["rel camera = </scene/camera>", f"uniform int2 resolution = ({view.width}, {view.height})"]
     about = ['defaultPrim = "scene"', UP_AXIS[0], 'renderSettingsPrimPath = "/Render/photo"', UP_AXIS[1]]
-    return _layer(about, [*_prim('Xform "scene"', scene), *_prim('Scope "Render"', _prim('RenderSettings "photo"', film))])
+    return _layer(
+        about, [*_prim('Xform "scene"', scene), *_prim('Scope "Render"', _prim('RenderSettings "photo"', film))]
+    )
 
 
 def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -149,9 +153,15 @@ def _material(name: str, identifier: str, material: Reflectance) -> list[str]:
         if np.ndim(value):
             shader.append(f"color3f inputs:{key} = {_tuple(value)}")
         else:
-            shader.append(f"int inputs:{key} = {value}" if isinstance(value, int) else f"float inputs:{key} = {_number(value)}")
+            shader.append(
+                f"int inputs:{key} = {value}" if isinstance(value, int) else f"float inputs:{key} = {_number(value)}"
+            )
     surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
-    return _prim(f'Material "{identifier}"', [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])], _shown(name))
+    return _prim(
+        f'Material "{identifier}"',
+        [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])],
+        _shown(name),
+    )
 
 
 def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
@@ -164,13 +174,19 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
         place = np.eye(4)
         place[:3, :3] = YUP_FROM_CAMERA
         parts = [line for shape in objects[name] for line in _part(shape, materials[shape.material])]
-        lines += _prim(f'Xform "{identifier}"', [*_transform(place @ objects[name][0].cam_from_object), *parts], _shown(name))
+        lines += _prim(
+            f'Xform "{identifier}"', [*_transform(place @ objects[name][0].cam_from_object), *parts], _shown(name)
+        )
     return _prim('Scope "objects"', lines)
 
 
 def _part(shape: Shape, material: str) -> list[str]:
     file = f"./{PurePosixPath(shape.file).with_suffix(SUFFIX)}"
-    about = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_shown(shape.material), f"prepend references = {_asset(file)}"]
+    about = [
+        'prepend apiSchemas = ["MaterialBindingAPI"]',
+        *_shown(shape.material),
+        f"prepend references = {_asset(file)}",
+    ]
     return _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], about)
 
 
@@ -201,7 +217,11 @@ def _shown(name: str) -> list[str]:
 
 
 def _string(text: str) -> str:
-    return '"' + "".join(ESCAPES.get(c, c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else c) for c in text) + '"'
+    return (
+        '"'
+        + "".join(ESCAPES.get(c, c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else c) for c in text)
+        + '"'
+    )
 
 
 def _asset(path: str) -> str:

@@ -90,7 +90,9 @@ def mtlx(material: Reflectance, angles: Angles) -> Parts:
 def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
     """The standard surface of `factorlib.export.materialx`, whose F is 1: there E · (1 + (1 − E)/E) = 1."""
     brighter = 1 / albedo(material.alpha, angles.no)
-    return _parts(angles, material.diffuse, np.multiply.outer(brighter, material.specular), correlated(material.alpha, angles))
+    return _parts(
+        angles, material.diffuse, np.multiply.outer(brighter, material.specular), correlated(material.alpha, angles)
+    )
 
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
@@ -167,14 +169,18 @@ def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "
     """From the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
-    specular = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
+    specular = (
+        entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
+    )
     f90 = specular["specularFactor"]
     f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
     return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
 
 
-def _parts(angles: Angles, diffuse: np.ndarray | tuple, specular: np.ndarray | tuple, visibility: Float[np.ndarray, "*n"]) -> Parts:
+def _parts(
+    angles: Angles, diffuse: np.ndarray | tuple, specular: np.ndarray | tuple, visibility: Float[np.ndarray, "*n"]
+) -> Parts:
     """diffuse: an albedo;  specular: F."""
     shape = (*angles.no.shape, 3)
     return Parts(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))

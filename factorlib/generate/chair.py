@@ -78,7 +78,10 @@ def shell(across: int, along: int) -> Part:
     s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
     u, v = s * np.sqrt(1 - SHAPE.corners * t**2 / 2), t * np.sqrt(1 - SHAPE.corners * s**2 / 2)
     middle, step = middle_surface(u, v), 1e-4
-    normal = np.cross(middle_surface(u + step, v) - middle_surface(u - step, v), middle_surface(u, v - step) - middle_surface(u, v + step))
+    normal = np.cross(
+        middle_surface(u + step, v) - middle_surface(u - step, v),
+        middle_surface(u, v - step) - middle_surface(u, v + step),
+    )
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
     upper, lower = middle + normal * SHAPE.thickness / 2, middle - normal * SHAPE.thickness / 2
     border = ring(*u.shape)
@@ -145,7 +148,13 @@ def legs(sides: int, rings: int, radii: tuple[float, float, float] = SHAPE.leg_r
     return np.concatenate([d[0] for d in dowels]), np.concatenate([d[1] + offset for d, offset in zip(dowels, first)])
 
 
-def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: tuple[float, float, float], sides: int, rings: int) -> Part:
+def dowel(
+    start: Float[np.ndarray, "3"],
+    end: Float[np.ndarray, "3"],
+    radii: tuple[float, float, float],
+    sides: int,
+    rings: int,
+) -> Part:
     """A closed round rod of radius `radii` at its start, middle and end."""
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(axis, [0.3, 0.2, 1.0])
@@ -159,5 +168,8 @@ def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: tup
     tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
     last = rings * sides
     right = np.roll(index, -1, axis=1)
-    caps = [np.stack([np.full(sides, last), index[0], right[0]], -1), np.stack([np.full(sides, last + 1), right[-1], index[-1]], -1)]
+    caps = [
+        np.stack([np.full(sides, last), index[0], right[0]], -1),
+        np.stack([np.full(sides, last + 1), right[-1], index[-1]], -1),
+    ]
     return np.concatenate([points.reshape(-1, 3), [start, end]]), np.concatenate([tube, *caps])[:, ::-1]

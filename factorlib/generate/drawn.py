@@ -23,7 +23,9 @@ MATERIALS = {
 }
 
 
-def drawn_materials(rng: np.random.Generator, spread: float, about: dict[str, Material] = MATERIALS) -> dict[str, Material]:
+def drawn_materials(
+    rng: np.random.Generator, spread: float, about: dict[str, Material] = MATERIALS
+) -> dict[str, Material]:
     """The materials of `about`, each number times exp(spread · normal), within k_d + k_s ≤ 0.95."""
     drawn = {}
     for name, material in about.items():
@@ -41,7 +43,12 @@ def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
 
 
 def drawn_light(
-    number: int, world_from_camera: Float[np.ndarray, "3 3"], lat_longs: Sequence[Path], rng: np.random.Generator, rows: int, spp: int
+    number: int,
+    world_from_camera: Float[np.ndarray, "3 3"],
+    lat_longs: Sequence[Path],
+    rng: np.random.Generator,
+    rows: int,
+    spp: int,
 ) -> Float[np.ndarray, "h w 3"]:
     """The light of photo `number`, in the camera's y-up frame: daylight for the first, rooms for the others.
 
@@ -55,7 +62,9 @@ def drawn_light(
     return light_seen(scene, rigid(turn, (0, 0, 0)), rows, spp, seed)
 
 
-def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int) -> SceneDict:
+def surroundings(
+    number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, sky_rows: int
+) -> SceneDict:
     """Light number 0 is a street by day, the others rooms with as many lamps as their number.
 
     The sun stands behind the camera, to its left or right.
@@ -63,4 +72,6 @@ def surroundings(number: int, world_from_camera: Float[np.ndarray, "3 3"], rng: 
     if number:
         return lights.room(rng, windows=2, lamps=number)
     forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-    return lights.daylight(rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70), rows=sky_rows)
+    return lights.daylight(
+        rng, rng.uniform(30, 50), forward + 180 + rng.choice([-1, 1]) * rng.uniform(35, 70), rows=sky_rows
+    )

@@ -90,7 +90,12 @@ SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
 
 
 def generate(
-    out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
+    out: Path,
+    seed: int,
+    lat_longs: Sequence[Path],
+    parameters: Parameters,
+    progress: Progress,
+    shots: Sequence[Shot] = SET.shots,
 ) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
@@ -131,10 +136,15 @@ class Scene(msgspec.Struct, frozen=True):
         return {name: Pose(matrix[:3, :3], matrix[:3, 3]) for name, matrix in matrices.items()}
 
 
-def laid_out(shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, spread: float, parameters: Parameters) -> Scene:
+def laid_out(
+    shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, spread: float, parameters: Parameters
+) -> Scene:
     """Camera, chairs and surroundings of a shot; a spread turns the chairs and moves the camera."""
     yaw = rng.uniform(0, 360)
-    distance, eye = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1)), shot.eye + 0.15 * spread * rng.uniform(-1, 1)
+    distance, eye = (
+        shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1)),
+        shot.eye + 0.15 * spread * rng.uniform(-1, 1),
+    )
     facing = shot.facing_deg + 40 * spread * rng.uniform(-1, 1)
     level = look(0, yaw)
     down = np.degrees(np.arctan2(eye - SET.middle, distance))
@@ -159,21 +169,33 @@ def surroundings(
         ground = {} if parameters.distant else {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
         return {"light": envmap(light), **ground}
     if shot.sun:
-        return lights.daylight(rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows)
+        return lights.daylight(
+            rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows
+        )
     return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
 
 
-def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict[str, Any]:
+def write_shot(
+    out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int
+) -> dict[str, Any]:
     """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry."""
     shot, order, poses = scene.shot, list(materials), list(scene.poses().values())
-    meshes = [labelled(chair(), {"shell": order.index(colour) + 1, "legs": order.index("wood") + 1}) for colour in shot.chairs]
+    meshes = [
+        labelled(chair(), {"shell": order.index(colour) + 1, "legs": order.index("wood") + 1}) for colour in shot.chairs
+    ]
     labels = folder.labels_of(meshes, scene.camera, poses)
     light = light_at_chairs(scene, parameters, seed)
     around = distant(light, scene) if parameters.distant else scene.surroundings
     depth = 2 if parameters.direct else -1
-    radiance = traced(around | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, depth)
+    radiance = traced(
+        around | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, depth
+    )
     exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT))
-    folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, shot.focal_35mm if shot.focal_known_from == "exif" else None)
+    folder.write_photo(
+        out / f"photos/{shot.name}.jpg",
+        radiance * exposure,
+        shot.focal_35mm if shot.focal_known_from == "exif" else None,
+    )
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
     for name, mask in own_masks(scene, meshes, poses).items():
         folder.write_labels(out / name, np.where(mask, 255, 0))
@@ -196,7 +218,14 @@ def light_at_chairs(scene: Scene, parameters: Parameters, seed: int) -> Float[np
     """The surroundings' light at the chairs' middle, without the chairs; where light is direct but not distant, what shines by itself."""
     depth = 1 if parameters.direct and not parameters.distant else -1
     place = (0, SET.middle - EYE, 0)
-    return light_seen(scene.surroundings, rigid(world_from_light(scene), place), parameters.light_rows, parameters.light_spp, seed, depth)
+    return light_seen(
+        scene.surroundings,
+        rigid(world_from_light(scene), place),
+        parameters.light_rows,
+        parameters.light_spp,
+        seed,
+        depth,
+    )
 
 
 def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material]) -> dict[str, Any]:
@@ -235,15 +264,31 @@ def entry(scene: Scene, exact: bool) -> dict[str, Any]:
         posed = {"pose": folder.pose_entry(pose)} if exact else {}
         objects.append({"name": name, "mesh": "chair", "materials": {"shell": colour}, **mask, **posed})
     camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if exact or shot.focal_known_from == "given" else {}
-    return {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png", **camera, "objects": objects}
+    return {
+        "name": shot.name,
+        "image": f"photos/{shot.name}.jpg",
+        "masks": f"masks/{shot.name}.png",
+        **camera,
+        "objects": objects,
+    }
 
 
 def write_records(
-    out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]], parameters: Parameters
+    out: Path,
+    materials: dict[str, Material],
+    photos: list[dict],
+    poses: dict[str, dict[str, Pose]],
+    parameters: Parameters,
 ) -> None:
     """dataset.yaml and truth/truth.yaml."""
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
-    record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
+    record = {
+        "format": 1,
+        "materials": list(materials),
+        "meshes": meshes,
+        "photos": photos,
+        "truth": "truth/truth.yaml",
+    }
     command = f"python -m factorlib.generate eames{parameters.options}"
     folder.write_yaml(out / "dataset.yaml", record, f"Generated (rendered, not photographed): {command}")
     folder.write_truth(out, materials, poses)

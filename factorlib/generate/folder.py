@@ -24,7 +24,9 @@ from factorlib.wholefile import write_text
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
 
 
-def write_photo(path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None, quality: int = 95) -> None:
+def write_photo(
+    path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None, quality: int = 95
+) -> None:
     """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, EXIF focal if given)."""
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
@@ -99,7 +101,9 @@ def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[
 def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
     """Where each object fills at least half of the pixel."""
     number = _subpixels(meshes, camera, poses).object
-    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS].reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
+    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS].reshape(
+        camera.height, SUBPIXELS, camera.width, SUBPIXELS
+    )
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
@@ -112,7 +116,9 @@ def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Map
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
     """Of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
     reach = SUBPIXELS + 2
-    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
+    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))[
+        SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS
+    ]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
     windows = windows[:height, :width].reshape(height, width, -1)
     low, high = windows.min(axis=-1), windows.max(axis=-1)
@@ -148,12 +154,21 @@ def yaml_text(value: dict[str, Any], indent: int = 0) -> str:
 def _flow(item: Any) -> str:
     if isinstance(item, (list, tuple)):
         return "[" + ", ".join(map(_flow, item)) + "]"
-    return str(round(item, 6)) if isinstance(item, float) and abs(item) >= 1e-4 else "0.0" if isinstance(item, float) else str(item)
+    return (
+        str(round(item, 6))
+        if isinstance(item, float) and abs(item) >= 1e-4
+        else "0.0"
+        if isinstance(item, float)
+        else str(item)
+    )
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
     """cam_from_object as dataset.yaml and truth.yaml write it."""
-    return {"rotation": [[round(float(v), 6) for v in row] for row in pose.rotation], "translation": [float(v) for v in pose.translation]}
+    return {
+        "rotation": [[round(float(v), 6) for v in row] for row in pose.rotation],
+        "translation": [float(v) for v in pose.translation],
+    }
 
 
 def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Mapping[str, Pose]]) -> None:
@@ -164,4 +179,8 @@ def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Map
         "normals": {name: f"truth/{name}_normal.exr" for name in poses},
         "poses": {photo: {name: pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
     }
-    write_yaml(out / "truth/truth.yaml", truth, "What the photos were made of; lights in the units of their photos, seen from the objects")
+    write_yaml(
+        out / "truth/truth.yaml",
+        truth,
+        "What the photos were made of; lights in the units of their photos, seen from the objects",
+    )

@@ -26,10 +26,19 @@ SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real 
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
-TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}  # about x, about y, of +z
+TURNS = {
+    "+x": (0, 90),
+    "-x": (0, -90),
+    "+z": (0, 0),
+    "-z": (0, 180),
+    "+y": (-90, 0),
+    "-y": (90, 0),
+}  # about x, about y, of +z
 
 
-def daylight(rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> SceneDict:
+def daylight(
+    rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256
+) -> SceneDict:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
     elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
@@ -55,7 +64,9 @@ def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> SceneDict:
     return block(place, size, np.degrees(angle), vivid(rng))
 
 
-def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> SceneDict:
+def room(
+    rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0
+) -> SceneDict:
     """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
@@ -73,7 +84,9 @@ def room(rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: 
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        scene[f"window_{k}"] = wall(side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day)
+        scene[f"window_{k}"] = wall(
+            side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day
+        )
     for k in range(lamps):
         place = [
             rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]),
@@ -124,11 +137,15 @@ def wall(
     return shape if glow is None else shape | {"emitter": {"type": "area", "radiance": rgb(glow)}}
 
 
-def block(
-    place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour
-) -> SceneDict:
+def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour) -> SceneDict:
     """A box of half sizes `half` about `place`, turned about y."""
-    to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg)).scale([*map(float, half)])
+    to_world = (
+        mitsuba()
+        .ScalarTransform4f()
+        .translate([*map(float, place)])
+        .rotate([0, 1, 0], float(turn_deg))
+        .scale([*map(float, half)])
+    )
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
@@ -137,9 +154,13 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     radiance = read_photo(path, "linear").radiance.astype(float)
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows:
-        raise InputError(f"{columns} × {rows} pixels is no lat-long map", file=path, cure="its width must be twice its height")
+        raise InputError(
+            f"{columns} × {rows} pixels is no lat-long map", file=path, cure="its width must be twice its height"
+        )
     finer = max(1, rows // height)
     if rows % height:
-        raise InputError(f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows")
+        raise InputError(
+            f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows"
+        )
     radiance = radiance.reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

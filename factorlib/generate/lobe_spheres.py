@@ -53,20 +53,31 @@ def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 
-def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator, progress: Progress = lambda done, total: None) -> Pixels:
+def rendered(
+    spheres: Spheres, pixels: int, rng: np.random.Generator, progress: Progress = lambda done, total: None
+) -> Pixels:
     """`pixels` random pixels of each sphere, by Mitsuba; equal generators give equal bytes on one machine."""
     rows = []
-    for k, (axis, sharpness, roughness) in enumerate(zip(spheres.axis, spheres.sharpness, spheres.roughness, strict=True)):
+    for k, (axis, sharpness, roughness) in enumerate(
+        zip(spheres.axis, spheres.sharpness, spheres.roughness, strict=True)
+    ):
         normal = _normals(axis, sharpness, alpha_of_roughness(roughness), pixels, rng)
         light, sensor = _envmap(axis, sharpness), _sensor(normal)
         lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
-        glossy = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha_of_roughness(roughness))}
+        glossy = {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha": float(alpha_of_roughness(roughness)),
+        }
         rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (lambertian, glossy))))
         progress(k + 1, len(spheres.axis))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _normals(axis: Float[np.ndarray, "3"], sharpness: float, alpha: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+def _normals(
+    axis: Float[np.ndarray, "3"], sharpness: float, alpha: float, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "m 3"]:
     """Normals that the camera sees, the even ones and those of the highlight in turn.
 
     A normal's change turns the mirror direction twice as much: the highlight's are spread by √(α²/2 + 1/λ), half of what
@@ -99,12 +110,16 @@ def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
     film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
     rays = {f"ray{k:05d}": ray | {"origin": (point + FRONT).tolist()} for k, point in enumerate(normal)}
-    return mitsuba().load_dict({"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False)
+    return mitsuba().load_dict(
+        {"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False
+    )
 
 
 def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, " m"]:
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
     ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})
-    scene = mi.load_dict({"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}, parallel=False)
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}, parallel=False
+    )
     return np.array(mi.render(scene, seed=seed, spp=SPP), dtype=np.float64)[0, :, 0]

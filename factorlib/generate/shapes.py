@@ -76,7 +76,9 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
 
 
-def closed_grid(points: Float[np.ndarray, "r c 3"], top: Float[np.ndarray, "3"], bottom: Float[np.ndarray, "3"]) -> Mesh:
+def closed_grid(
+    points: Float[np.ndarray, "r c 3"], top: Float[np.ndarray, "3"], bottom: Float[np.ndarray, "3"]
+) -> Mesh:
     """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)

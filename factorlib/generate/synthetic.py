@@ -107,12 +107,16 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
-def placements(shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float) -> dict[str, Pose]:
+def placements(
+    shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float
+) -> dict[str, Pose]:
     """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
     poses = {}
     for placed in shot.placed:
         turn = rotation_of_vector(np.array([0, placed.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
-        tilt = rotation_of_vector(np.array([placed.tilt[0], 0, placed.tilt[1]]) + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3))
+        tilt = rotation_of_vector(
+            np.array([placed.tilt[0], 0, placed.tilt[1]]) + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3)
+        )
         poses[name_of(placed)] = Pose(world_from_camera.T @ tilt @ turn, np.array([placed.x, 0.02, DISTANCE]))
     return poses
 
@@ -125,10 +129,14 @@ def name_of(placed: Placed) -> str:
 def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> dict:
     """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry of dataset.yaml."""
     shot, meshes, poses = scene.shot, scene.meshes, scene.poses
-    camera = Camera(parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2))
+    camera = Camera(
+        parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2)
+    )
     order = list(scene.materials)
     labelled = [
-        msgspec.structs.replace(meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16))
+        msgspec.structs.replace(
+            meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16)
+        )
         for p in shot.placed
     ]
     labels = folder.labels_of(labelled, camera, list(poses.values()))
@@ -137,7 +145,9 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_labels(out / f"masks/{shot.name}.png", labels)
     folder.write_light(out / f"truth/{shot.name}_light.exr", scene.light * exposure)
-    folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal)
+    folder.write_normals(
+        out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal
+    )
     return entry(shot, poses, parameters)
 
 
@@ -149,11 +159,17 @@ def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndar
     silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
-        entry = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation))
+        entry = shape(
+            meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation)
+        )
         own = nearest == number
         columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
         alone = rendered(
-            {"shape": entry, "light": envmap(scene.light)}, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2
+            {"shape": entry, "light": envmap(scene.light)},
+            sensor(camera, world, columns),
+            spp,
+            100 * seed + number,
+            max_depth=2,
         )
         radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
     return radiance
@@ -179,10 +195,20 @@ def entry(shot: Shot, poses: dict[str, Pose], parameters: Parameters) -> dict:
     }  # fmt: skip
 
 
-def write_records(out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]]) -> None:
+def write_records(
+    out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]]
+) -> None:
     """dataset.yaml and truth/truth.yaml."""
     used = {name_of(placed): placed for shot in SHOTS for placed in shot.placed}
-    meshes = {name: {"file": f"meshes/{placed.shape}.ply", "material": placed.material} for name, placed in used.items()}
-    record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos, "truth": "truth/truth.yaml"}
+    meshes = {
+        name: {"file": f"meshes/{placed.shape}.ply", "material": placed.material} for name, placed in used.items()
+    }
+    record = {
+        "format": 1,
+        "materials": list(materials),
+        "meshes": meshes,
+        "photos": photos,
+        "truth": "truth/truth.yaml",
+    }
     folder.write_yaml(out / "dataset.yaml", record, "Generated: python -m factorlib.generate synthetic")
     folder.write_truth(out, materials, poses)

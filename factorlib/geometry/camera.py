@@ -81,4 +81,6 @@ def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "
     False
     """
     finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
-    return bool(finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)
+    return bool(
+        finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0
+    )

@@ -36,7 +36,9 @@ def mirror_directions(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray,
     return 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
 
 
-def mirror_cells(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, " n"]:
+def mirror_cells(
+    normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float
+) -> Int[np.ndarray, " n"]:
     """Number of the cell in which each observation's mirror direction lies; cells are cubes with sides of length `size`."""
     return np.floor((mirror_directions(normal, view) + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
 

@@ -88,7 +88,9 @@ class Occluders:
         place = np.where(found, depth, 0.0)[:, None] * along + self.lift[face][:, None] * normal
         return Points(place, normal, found)
 
-    def seen_from(self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]) -> Sight:
+    def seen_from(
+        self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]
+    ) -> Sight:
         """What the points see along `directions` (camera frame, unit)."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)

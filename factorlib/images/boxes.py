@@ -31,7 +31,9 @@ def whole_boxes(picture: Shaped[np.ndarray, "h w *c"], factor: int) -> Shaped[np
     return inner.reshape(rows, factor, columns, factor, *picture.shape[2:])
 
 
-def box_sum(picture: Shaped[np.ndarray, "h w *c"], factor: int, kind: type = np.float64) -> Shaped[np.ndarray, "i j *c"]:
+def box_sum(
+    picture: Shaped[np.ndarray, "h w *c"], factor: int, kind: type = np.float64
+) -> Shaped[np.ndarray, "i j *c"]:
     """Sums over boxes, in the type `kind`."""
     return whole_boxes(picture, factor).sum(1, dtype=kind).sum(2, dtype=kind)
 
@@ -44,7 +46,9 @@ def box_mean(
     radiance: 0 where not finite.  Sums are float64: the mean of equal values is that value.
     """
     if finite.all():
-        return (box_sum(radiance, factor) / factor**2).astype(np.float32), np.ones([n // factor for n in finite.shape], bool)
+        return (box_sum(radiance, factor) / factor**2).astype(np.float32), np.ones(
+            [n // factor for n in finite.shape], bool
+        )
     count = box_sum(finite, factor, np.int64)
     return (box_sum(radiance, factor) / np.maximum(count, 1)[..., None]).astype(np.float32), count > 0
 

@@ -26,7 +26,12 @@ def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str
     pixels = np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), oiio.FLOAT)
     spec.channelnames = names
-    for name, value in {"compression": "zip", "DateTime": FIXED_DATE, "Software": "factorlib", **(attributes or {})}.items():
+    for name, value in {
+        "compression": "zip",
+        "DateTime": FIXED_DATE,
+        "Software": "factorlib",
+        **(attributes or {}),
+    }.items():
         spec.attribute(name, value)
     write_image(path, spec, pixels)
 
@@ -55,5 +60,7 @@ def read_rgb_exr(path: str | Path) -> Float[np.ndarray, "h w 3"]:
     channels = read_exr(path)
     missing = [name for name in "RGB" if name not in channels]
     if missing:
-        raise InputError(f"has no channel {missing[0]}, only {', '.join(channels)}", file=path, cure="an RGB image is expected")
+        raise InputError(
+            f"has no channel {missing[0]}, only {', '.join(channels)}", file=path, cure="an RGB image is expected"
+        )
     return np.stack([channels[name] for name in "RGB"], axis=-1)

@@ -96,7 +96,9 @@ def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path)
     )  # fmt: skip
 
 
-def _strips(stored: Stored, factor: int, path: str | Path) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
+def _strips(
+    stored: Stored, factor: int, path: str | Path
+) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
     """Whole rows of boxes, some at a time: which rows of boxes, the codes in them, and where these are clipped.
 
     Boxes count from the displayed corner, so what is left over lies at the other end of an axis that display turns round.
@@ -143,5 +145,7 @@ def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.nd
 def _warn_of_profile(profile: str, path: str | Path) -> None:
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         log.warning(
-            "%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours", path, profile
+            "%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours",
+            path,
+            profile,
         )

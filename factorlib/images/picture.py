@@ -17,7 +17,9 @@ PERCENTILE = 99.0
 
 
 def exposure_of(
-    radiance: Float[np.ndarray, "*batch 3"], where: Bool[np.ndarray, "*batch"] | None = None, percentile: float = PERCENTILE
+    radiance: Float[np.ndarray, "*batch 3"],
+    where: Bool[np.ndarray, "*batch"] | None = None,
+    percentile: float = PERCENTILE,
 ) -> float:
     """The factor that takes the `percentile` of each pixel's brightest channel, over `where`, to white.
 

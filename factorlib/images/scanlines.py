@@ -43,7 +43,9 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
     )
 
 
-def _reader(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None) -> Rows:
+def _reader(
+    source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None
+) -> Rows:
     first, picked = min(colours), [c - min(colours) for c in colours]
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
@@ -54,7 +56,9 @@ def _reader(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], p
     return _of_tiles(source, spec, colours, path, key) if spec.tile_width else rows
 
 
-def _of_tiles(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None) -> Rows:
+def _of_tiles(
+    source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int], path: str | Path, key: str | None
+) -> Rows:
     """A file of tiles has no scanlines: it is in memory as a whole, in its own type."""
     cached: list[np.ndarray] = []
 
@@ -70,7 +74,9 @@ def _of_tiles(source: oiio.ImageInput, spec: oiio.ImageSpec, colours: list[int],
 def _checked(source: oiio.ImageInput, pixels: np.ndarray | None, path: str | Path, key: str | None) -> np.ndarray:
     error = source.geterror()
     if pixels is None or "Premature end" in error:
-        raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure="copy it again from where it came")
+        raise InputError(
+            f"truncated or damaged ({one_line(error)})", file=path, key=key, cure="copy it again from where it came"
+        )
     if error:
         log.warning("%s: %s", path, one_line(error))
     return pixels
@@ -83,5 +89,7 @@ def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[in
         return [names.index(name) for name in "RGB"]
     colours = [index for index in range(len(names)) if index != spec.alpha_channel and names[index] != "Z"]
     if len(colours) != 1:
-        raise InputError(f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer")
+        raise InputError(
+            f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer"
+        )
     return 3 * colours

@@ -27,14 +27,18 @@ def lat_long_of_lobes(lobes: Lobes, height: int, width: int) -> Map:
     result = np.zeros((height, width, 3))
     lobes = lobes.turned(YUP_FROM_CAMERA)
     row, column = lat_long_of_direction(lobes.axis)
-    for theta, phi, sharpness, weight in zip(np.pi * row, 2 * np.pi * column, lobes.sharpness, lobes.weight, strict=True):
+    for theta, phi, sharpness, weight in zip(
+        np.pi * row, 2 * np.pi * column, lobes.sharpness, lobes.weight, strict=True
+    ):
         if weight.any():
             rows, columns, mean = _texel_means(theta, phi, sharpness, height, width)
             result[rows[:, None], columns] += mean[..., None] * weight
     return result
 
 
-def _texel_means(theta_z: float, phi_z: float, sharpness: float, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _texel_means(
+    theta_z: float, phi_z: float, sharpness: float, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows [r], columns [c] that a unit lobe reaches, and its means there [r, c]; φ counts from the left edge."""
     tall, wide = np.pi / height, 2 * np.pi / width
     node, share = gauss_nodes(LEAST_NODES + int(NODES_PER_WIDTH * max(tall, wide) * np.sqrt(sharpness)))

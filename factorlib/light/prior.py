@@ -100,7 +100,10 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return precision, float(log_determinant)
 
     def likeliest_factors(
-        self, directions: Float[np.ndarray, "p 3"], log_radiance: Float[np.ndarray, "3 p"], covariance: Float[np.ndarray, "3p 3p"]
+        self,
+        directions: Float[np.ndarray, "p 3"],
+        log_radiance: Float[np.ndarray, "3 p"],
+        covariance: Float[np.ndarray, "3p 3p"],
     ) -> list[float]:
         """The s_k² of a light that is known as a Gaussian, u with its covariance: one step of expectation maximisation of (4)."""
         p, factors = len(directions), []
@@ -108,7 +111,9 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for k, row in enumerate(MIX):
             inverse, y = _inverse(self.covariance(k, directions))[0], row @ log_radiance
             spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
-            factors.append(float((self.freedom[k] + y @ inverse @ y + np.sum(inverse * spread)) / (self.freedom[k] + p)))
+            factors.append(
+                float((self.freedom[k] + y @ inverse @ y + np.sum(inverse * spread)) / (self.freedom[k] + p))
+            )
         return factors
 
 

@@ -33,7 +33,9 @@ FLOOR = 1e-4  # of a map's mean radiance: what is darker than that is noise of t
 UP = np.array([0.0, 1.0, 0.0])  # of a lat-long map
 # log of variance, decay (radians), nugget, level, degrees of freedom: where the search starts, and where it must stay
 START = np.log([1.0, 0.7, 0.05, 0.1, 5.0])
-BOUNDS = [(np.log(low), np.log(high)) for low, high in ((1e-4, 1e2), (0.03, 12.0), (1e-5, 1e1), (1e-5, 1e2), (0.5, 1e4))]
+BOUNDS = [
+    (np.log(low), np.log(high)) for low, high in ((1e-4, 1e2), (0.03, 12.0), (1e-5, 1e1), (1e-5, 1e2), (0.5, 1e4))
+]
 WEIGHTINGS = 10  # times that β and w are found from each other: far more than they need
 DIGITS = 4  # significant ones of what is shipped
 
@@ -52,7 +54,10 @@ def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n
     total = np.bincount(cell, area, len(cells))
     if not total.all():
         raise ValueError(f"{height} × {width} texels are too few for {len(cells)} cells")
-    return np.stack([np.bincount(cell, area * channel, len(cells)) for channel in lat_long.reshape(-1, 3).T], axis=-1) / total[:, None]
+    return (
+        np.stack([np.bincount(cell, area * channel, len(cells)) for channel in lat_long.reshape(-1, 3).T], axis=-1)
+        / total[:, None]
+    )
 
 
 def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
@@ -61,12 +66,16 @@ def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
     return np.einsum("kc,mnc->kmn", MIX, np.log(np.maximum(means, floor)))
 
 
-def fitted(logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, start: LightPrior | None = None) -> LightPrior:
+def fitted(
+    logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, start: LightPrior | None = None
+) -> LightPrior:
     """The prior of greatest likelihood of `logs`, y of some maps in unit directions `cells` of the maps' frame (+y is up).
 
     profile: whether the mean depends on elevation;  start: where to begin the search
     """
-    found = [_fitted_one(k, logs[k], cells, profile, START if start is None else _log_parameters(start, k)) for k in range(3)]
+    found = [
+        _fitted_one(k, logs[k], cells, profile, START if start is None else _log_parameters(start, k)) for k in range(3)
+    ]
     (variance, decay, nugget, level, freedom), coefficients = np.exp([t for t, _ in found]).T, [b for _, b in found]
     return LightPrior(
         tuple(variance.tolist()), tuple(np.degrees(decay).tolist()), tuple(level.tolist()), tuple(nugget.tolist()),
@@ -75,11 +84,17 @@ def fitted(logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, st
 
 
 def _log_parameters(prior: LightPrior, k: int) -> Float[np.ndarray, "5"]:
-    return np.log([prior.variance[k], np.radians(prior.decay_deg[k]), prior.nugget[k], prior.level[k], prior.freedom[k]])
+    return np.log(
+        [prior.variance[k], np.radians(prior.decay_deg[k]), prior.nugget[k], prior.level[k], prior.freedom[k]]
+    )
 
 
 def _fitted_one(
-    k: int, values: Float[np.ndarray, "m n"], cells: Float[np.ndarray, "n 3"], profile: bool, start: Float[np.ndarray, "5"]
+    k: int,
+    values: Float[np.ndarray, "m n"],
+    cells: Float[np.ndarray, "n 3"],
+    profile: bool,
+    start: Float[np.ndarray, "5"],
 ) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "3"]]:
     """t of y_k, and its profile."""
     design = np.hstack([legendre(cells @ UP)[:, : 3 * int(profile)], np.ones((len(cells), int(k == 0)))])
@@ -92,7 +107,10 @@ def _fitted_one(
 
 
 def _cost(
-    t: Float[np.ndarray, "5"], angle: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"]
+    t: Float[np.ndarray, "5"],
+    angle: Float[np.ndarray, "n n"],
+    design: Float[np.ndarray, "n q"],
+    values: Float[np.ndarray, "m n"],
 ) -> tuple[float, Float[np.ndarray, "5"], Float[np.ndarray, " q"]]:
     """−log L per map, its gradient by t, and β: equations (1) to (3)."""
     variance, decay, nugget, level, freedom = np.exp(t)
@@ -105,14 +123,30 @@ def _cost(
     square = np.sum(solved * residual, axis=1)
     slope = 0.5 * (inverse - (weight[:, None] * solved).T @ solved / len(values))
     by_freedom = (
-        np.log1p(square / freedom) - weight * square / freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
+        np.log1p(square / freedom)
+        - weight * square / freedom
+        - digamma((freedom + count) / 2)
+        + digamma(freedom / 2)
+        + count / freedom
     )
-    gradient = [np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope), level * slope.sum()]
-    return -_log_density(factor[0], square, freedom).mean(), np.array([*gradient, freedom * by_freedom.mean() / 2]), beta
+    gradient = [
+        np.sum(slope * alike),
+        np.sum(slope * alike * angle) / decay,
+        nugget * np.trace(slope),
+        level * slope.sum(),
+    ]
+    return (
+        -_log_density(factor[0], square, freedom).mean(),
+        np.array([*gradient, freedom * by_freedom.mean() / 2]),
+        beta,
+    )
 
 
 def _weighted_means(
-    inverse: Float[np.ndarray, "n n"], design: Float[np.ndarray, "n q"], values: Float[np.ndarray, "m n"], freedom: float
+    inverse: Float[np.ndarray, "n n"],
+    design: Float[np.ndarray, "n q"],
+    values: Float[np.ndarray, "m n"],
+    freedom: float,
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " m"]]:
     """β, and the weight of each map: equation (2).  d is quadratic in β, so what is summed over cells is summed once."""
     count, weight = values.shape[1], np.ones(len(values))
@@ -124,10 +158,17 @@ def _weighted_means(
     return beta, weight
 
 
-def _log_density(root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"], freedom: float) -> Float[np.ndarray, " m"]:
+def _log_density(
+    root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"], freedom: float
+) -> Float[np.ndarray, " m"]:
     """Of Student's t: `root` is the lower Cholesky factor of K, `square` is d."""
     count = len(root)
-    constant = gammaln((freedom + count) / 2) - gammaln(freedom / 2) - count / 2 * np.log(np.pi * freedom) - np.log(np.diag(root)).sum()
+    constant = (
+        gammaln((freedom + count) / 2)
+        - gammaln(freedom / 2)
+        - count / 2 * np.log(np.pi * freedom)
+        - np.log(np.diag(root)).sum()
+    )
     return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
@@ -149,7 +190,9 @@ def white_noise(prior: LightPrior) -> LightPrior:
     return msgspec.structs.replace(prior, variance=(0.0, 0.0, 0.0), nugget=nugget)
 
 
-def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"], progress: Progress = lambda done, total: None) -> LeaveOneOut:
+def leave_one_out(
+    logs: Logs, cells: Float[np.ndarray, "n 3"], progress: Progress = lambda done, total: None
+) -> LeaveOneOut:
     """Each map under a prior fitted to the others, and under two nulls fitted to them."""
     whole, flat = fitted(logs, cells), fitted(logs, cells, profile=False)
     maps, scores = logs.shape[1], []
@@ -173,5 +216,9 @@ def rounded(prior: LightPrior) -> LightPrior:
     names = ("variance", "decay_deg", "level", "nugget", "freedom")
     numbers = {name: tuple(map(short, getattr(prior, name))) for name in names}
     profile = tuple(tuple(map(short, each)) for each in prior.profile)
-    scores = prior.leave_one_out and LeaveOneOut(*(round(score, 1) for score in msgspec.structs.astuple(prior.leave_one_out)))
-    return msgspec.structs.replace(prior, **numbers, profile=profile, cell_deg=short(prior.cell_deg), leave_one_out=scores)
+    scores = prior.leave_one_out and LeaveOneOut(
+        *(round(score, 1) for score in msgspec.structs.astuple(prior.leave_one_out))
+    )
+    return msgspec.structs.replace(
+        prior, **numbers, profile=profile, cell_deg=short(prior.cell_deg), leave_one_out=scores
+    )

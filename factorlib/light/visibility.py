@@ -25,7 +25,9 @@ from torch import Tensor
 from factorlib.elementary import product, square_root
 
 FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
-LEAST = 1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
+LEAST = (
+    1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
+)
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -69,7 +71,9 @@ def highlight_weights(
     return weight, (by_square - weight * by_square.sum(1, keepdim=True)) * (4 * roughness**3)
 
 
-def kernel(directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, " p"]) -> Float[Tensor, "k p"]:
+def kernel(
+    directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, " p"]
+) -> Float[Tensor, "k p"]:
     """L of the equations: lobes at the directions, widened, and no less than e^FAINTEST."""
     distance = torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist")
     return torch.exp((-0.5 * widened(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
@@ -80,7 +84,9 @@ def widened(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
 
-def seen_share(visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]) -> Float[Tensor, "n p"]:
+def seen_share(
+    visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]
+) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
     return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
 
@@ -111,5 +117,9 @@ def seen(
     below = whole[:, :p] + LEAST
     share = (passed[:, :p] + LEAST) / below
     slopes = [(passed[:, k * p : (k + 1) * p] - share * whole[:, k * p : (k + 1) * p]) / below for k in (1, 2, 3)]
-    rough = None if by_roughness is None else (product(visibility * by_roughness, lobes) - share * product(by_roughness, lobes)) / below
+    rough = (
+        None
+        if by_roughness is None
+        else (product(visibility * by_roughness, lobes) - share * product(by_roughness, lobes)) / below
+    )
     return Seen(share, *slopes, rough)

@@ -78,7 +78,9 @@ class Block(msgspec.Struct, frozen=True):
 
     def with_noise(self, noise: Noise) -> Block:
         """The same observations, which are expected to be off by as much as another noise model says."""
-        return msgspec.structs.replace(self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise)
+        return msgspec.structs.replace(
+            self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
+        )
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""

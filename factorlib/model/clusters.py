@@ -12,7 +12,9 @@ HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out 
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
-def held_out_by_cells(cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int) -> Bool[np.ndarray, " n"]:
+def held_out_by_cells(
+    cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int
+) -> Bool[np.ndarray, " n"]:
     """Which observations are held out: all of randomly chosen cells, a `share` of the cells, but never all of a material.
 
     Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would

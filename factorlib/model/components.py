@@ -27,9 +27,14 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
     shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
     first, second = np.array(shown, dtype=int).reshape(-1, 2).T
     size = materials + len(blocks)
-    _, label = components_of_graph(coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False)
+    _, label = components_of_graph(
+        coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False
+    )
     members = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
     return sorted(
-        Component(tuple(n for n in nodes if n < materials), tuple(sorted(blocks[n - materials].name for n in nodes if n >= materials)))
+        Component(
+            tuple(n for n in nodes if n < materials),
+            tuple(sorted(blocks[n - materials].name for n in nodes if n >= materials)),
+        )
         for nodes in members
     )

@@ -31,7 +31,9 @@ RULE = (
     "per connected component: channel factors make the geometric means over lights of their summed lobe energies grey (after the prior of Wang et al.); "
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
-DETERMINED = "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
+DETERMINED = (
+    "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
+)
 
 
 def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:

@@ -106,7 +106,10 @@ class Illumination(msgspec.Struct, frozen=True):
             return diffuse, specular, responses
         for m in np.unique(self.block.material).tolist():
             rows, of = self.table.rows(m), self.table.at(m, float(roughness[m]))
-            diffuse[rows], specular[rows] = of.diffuse @ weight.astype(np.float32), of.specular @ weight.astype(np.float32)
+            diffuse[rows], specular[rows] = (
+                of.diffuse @ weight.astype(np.float32),
+                of.specular @ weight.astype(np.float32),
+            )
             responses.append((m, rows, of))
         return diffuse, specular, responses
 
@@ -135,9 +138,13 @@ class Illumination(msgspec.Struct, frozen=True):
             of = block.material[rows] == m
             response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
             response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
-        scale = block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows]) * self.exposure[rows]
+        scale = (
+            block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows]) * self.exposure[rows]
+        )
         kd, ks = materials.diffuse[block.material[rows]], materials.specular[block.material[rows]]
-        return np.stack([scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)])
+        return np.stack(
+            [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
+        )
 
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
@@ -147,10 +154,17 @@ class Illumination(msgspec.Struct, frozen=True):
         pull = np.sqrt(counts * loss.trust(residual) / temperature)
         scale = pull * block.precision
         rising = scale * slope_at(shown.radiance, light, block.photo)  # ∂r/∂ℓ
-        by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), exponents(light, block.photo)) if len(light.log_tone) else None
+        by_tone = (
+            scale * by_log_exponent(np.maximum(shown.linear, 0), exponents(light, block.photo))
+            if len(light.log_tone)
+            else None
+        )
         lit = shown.linear
         if block.bounced is not None:
-            sent = materials.diffuse[block.material] * block.bounced[:, :3] + materials.specular[block.material] * block.bounced[:, 3:]
+            sent = (
+                materials.diffuse[block.material] * block.bounced[:, :3]
+                + materials.specular[block.material] * block.bounced[:, 3:]
+            )
             lit = lit - sent
         photos = np.eye(len(light.log_exposure))[block.photo]
         for m, rows, of in shown.responses:

@@ -69,7 +69,9 @@ def _by_bin(
     expected = near.T @ radiance / near.sum(0)[:, None]
     own, bins = cosine.argmax(1), cosine.shape[1]
     total = np.bincount(own, weight, bins)
-    mean = np.column_stack([np.bincount(own, weight * r, bins) for r in radiance.T]) / np.maximum(total, 1e-300)[:, None]
+    mean = (
+        np.column_stack([np.bincount(own, weight * r, bins) for r in radiance.T]) / np.maximum(total, 1e-300)[:, None]
+    )
     count = np.bincount(own, minlength=bins)[:, None]
     return (count * mean + PSEUDO * expected) / (count + PSEUDO)
 

@@ -21,7 +21,9 @@ class Noise(msgspec.Struct, frozen=True):
         """σ of one pixel."""
         return np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
 
-    def precision(self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    def precision(
+        self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3"]:
         """√weight/σ of observations, their weights limited."""
         limited = weight / (1 + weight / self.most_weight)
         return np.sqrt(limited)[:, None] / self.sigma(radiance)

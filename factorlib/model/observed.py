@@ -44,9 +44,14 @@ def blocks_of_observations(
     """
     seen = usable(observations)
     if len(seen) == 0:
-        raise InputError("no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap")
+        raise InputError(
+            "no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap"
+        )
     if (seen.radiance <= 0).all():
-        raise InputError("every observation is black", cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks")
+        raise InputError(
+            "every observation is black",
+            cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
+        )
     how = _How(noise, held_out, world_from_camera or {}, seed)
     blocks = [
         _block(seen.take(seen.illumination == i), name, how)
@@ -60,7 +65,9 @@ def usable(observations: Observations) -> Observations:
     """The observations whose radiance and directions are finite, whose directions are not zero, and whose weight is positive."""
     vectors = np.stack([observations.radiance, observations.normal, observations.view])
     directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
-    return observations.take(np.isfinite(vectors).all((0, 2)) & directed & (observations.weight > 0) & np.isfinite(observations.weight))
+    return observations.take(
+        np.isfinite(vectors).all((0, 2)) & directed & (observations.weight > 0) & np.isfinite(observations.weight)
+    )
 
 
 def _block(seen: Observations, name: str, how: _How) -> Block:
@@ -87,7 +94,9 @@ def _visibility(
     if seen.visibility is None or (seen.visibility == 255).all():
         return None, None
     directions = fibonacci_sphere(seen.visibility.shape[1])
-    frames = [np.eye(3) if rotations.get(photo) is None else np.asarray(rotations[photo], dtype=float) for photo in photos]
+    frames = [
+        np.eye(3) if rotations.get(photo) is None else np.asarray(rotations[photo], dtype=float) for photo in photos
+    ]
     return seen.visibility, np.stack([directions @ frame.T for frame in frames])
 
 

@@ -35,7 +35,10 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     def illuminations(self, point: Point) -> list[Illumination]:
         """Each block with its light; raises ValueError where there is not one light per block."""
-        return [Illumination(b, light, point.materials, self.operator) for b, light in zip(self.blocks, point.lights, strict=True)]
+        return [
+            Illumination(b, light, point.materials, self.operator)
+            for b, light in zip(self.blocks, point.lights, strict=True)
+        ]
 
     def radiance(self, point: Point) -> list[Float[np.ndarray, "n 3"]]:
         """What every observation should show, block by block, in the block's unit."""
@@ -88,7 +91,9 @@ class JointProblem(msgspec.Struct, frozen=True):
     def with_effects(self, shadows: bool, bounces: bool) -> JointProblem:
         """The same observations, as if meshes cast no shadows, or as if what hides the light were black."""
         blocks = self.blocks if bounces else [block.without_bounces() for block in self.blocks]
-        return msgspec.structs.replace(self, blocks=blocks if shadows else [block.without_shadows() for block in blocks])
+        return msgspec.structs.replace(
+            self, blocks=blocks if shadows else [block.without_shadows() for block in blocks]
+        )
 
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""

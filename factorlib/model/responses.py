@@ -36,9 +36,7 @@ def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular
     return exposure * (diffuse * by_diffuse + specular * by_specular)
 
 
-def diffuse_response(
-    block: Block, rows: Rows, lobes: UnitLobes, operator: Operator
-) -> Float[np.ndarray, "n p"]:
+def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Operator) -> Float[np.ndarray, "n p"]:
     """D at `rows`; float64."""
     sharpness, nz = (_tensor(v, operator) for v in (lobes.sharpness, block.normal[rows] @ lobes.axis.T))
     with torch.no_grad():
@@ -69,21 +67,35 @@ class UnitReflection(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: torch.autograd.function.FunctionCtx, operator: Operator, roughness: Tensor, log_sharpness: Tensor, *cosines: Tensor
+        ctx: torch.autograd.function.FunctionCtx,
+        operator: Operator,
+        roughness: Tensor,
+        log_sharpness: Tensor,
+        *cosines: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
         no, nz, oz = cosines
         inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), no, nz, oz)]
         response = operator.response(*inputs)
         r = {name: getattr(response, name).to(nz.dtype) for name in response.__struct_fields__}
-        slopes = ("specular_by_roughness", "diffuse_by_log_sharpness", "specular_by_log_sharpness", "diffuse_by_nz", "specular_by_nz")
+        slopes = (
+            "specular_by_roughness",
+            "diffuse_by_log_sharpness",
+            "specular_by_log_sharpness",
+            "diffuse_by_nz",
+            "specular_by_nz",
+        )
         ctx.save_for_backward(*(r[name] for name in (*slopes, "specular_by_oz")))
         return r["diffuse"], r["specular"]
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
+    ) -> tuple[Tensor | None, ...]:
         """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
-        by_roughness, diffuse_by_sharpness, specular_by_sharpness, diffuse_by_nz, specular_by_nz, specular_by_oz = ctx.saved_tensors
+        by_roughness, diffuse_by_sharpness, specular_by_sharpness, diffuse_by_nz, specular_by_nz, specular_by_oz = (
+            ctx.saved_tensors
+        )
         by_sharpness = (diffuse * diffuse_by_sharpness + specular * specular_by_sharpness).sum(0)
         by_nz = diffuse * diffuse_by_nz + specular * specular_by_nz
         return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * specular_by_oz

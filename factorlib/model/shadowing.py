@@ -40,7 +40,9 @@ def shadowed_rows(block: Block, rows: slice | Int[np.ndarray, " n"]) -> Iterator
         directions, places = torch.from_numpy(block.directions[k]).float(), np.flatnonzero(hidden & (photo == k))
         for some in np.split(places, range(TOGETHER, len(places), TOGETHER)):
             normal, view = (torch.from_numpy(v[rows][some]).float() for v in (block.normal, block.view))
-            yield Shadowed(torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions)
+            yield Shadowed(
+                torch.from_numpy(some), torch.from_numpy(visibility[some]).float() / 255, normal, view, directions
+            )
 
 
 def shadowed_diffuse(response: Tensor, block: Block, rows: slice | Int[np.ndarray, " n"], lobes: UnitLobes) -> Tensor:

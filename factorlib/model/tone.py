@@ -18,12 +18,16 @@ def toned(linear: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray,
     return linear if len(light.log_tone) == 0 else curve(np.maximum(linear, 0.0), exponents(light, photo))
 
 
-def straightened(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
+def straightened(
+    radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n c"]:
     """Linear radiance, from what the photos show.  The inverse of `toned`."""
     return radiance if len(light.log_tone) == 0 else inverse(radiance, exponents(light, photo))
 
 
-def slope_at(radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"] | float:
+def slope_at(
+    radiance: Float[np.ndarray, "n c"], light: Light, photo: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n c"] | float:
     """Derivative of what a photo shows by linear radiance, where it shows `radiance`."""
     if len(light.log_tone) == 0:
         return 1.0

@@ -148,7 +148,10 @@ class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
 
 
 AnyRecipe = Resynthesis | View | Turntable | MovingLight | Relight | Transfer | Insert | Grid
-KINDS = {kind.__struct_config__.tag: kind for kind in (Resynthesis, View, Turntable, MovingLight, Relight, Transfer, Insert, Grid)}
+KINDS = {
+    kind.__struct_config__.tag: kind
+    for kind in (Resynthesis, View, Turntable, MovingLight, Relight, Transfer, Insert, Grid)
+}
 LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
 
 

@@ -78,7 +78,9 @@ class Settled(msgspec.Struct, frozen=True):
     ruled_out: bool | None
 
 
-def settled(moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, " n"], standards: Standards) -> Settled | None:
+def settled(
+    moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, " n"], standards: Standards
+) -> Settled | None:
     """Which candidate to use; None where the candidates share too few pixels to compare them.
 
     cell: number of each pixel's cell
@@ -93,7 +95,10 @@ def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
     for one in sorted(verdicts[1:], key=lambda one: one.held_out_loss, reverse=True):
         best = one if is_better(one, found, standards) else best
     named = {one.name: one for one in verdicts}
-    other, own = named.get("runner_up"), min((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.held_out_loss)
+    other, own = (
+        named.get("runner_up"),
+        min((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.held_out_loss),
+    )
     ruled_out = None if other is None or best is other else is_better(own, other, standards)
     return Settled(best.name, named, ruled_out)
 

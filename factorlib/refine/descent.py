@@ -117,7 +117,9 @@ def _step(
     moving: Moving, state: State, seen: Seen, lit: Illumination, residual: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "7"]:
     """The step of a state; lit: the fitted pixels in their light, whose whitened residual is `residual`."""
-    contours = normal_equations(rendered(moving.caster, moving.target, moving.camera, state), moving.target, moving.prior)
+    contours = normal_equations(
+        rendered(moving.caster, moving.target, moving.camera, state), moving.target, moving.prior
+    )
     free = 7 if moving.prior.sigma > 0 else 6
     jacobian = photometric_jacobian(moving, state, seen, lit.light, free)
     information, gradient = projected_equations(jacobian, residual, lit)
@@ -127,7 +129,9 @@ def _step(
     return np.clip(step, -LARGEST_STEP, LARGEST_STEP)
 
 
-def photometric_jacobian(moving: Moving, state: State, seen: Seen, light: Light, free: int) -> Float[np.ndarray, "n 3 k"]:
+def photometric_jacobian(
+    moving: Moving, state: State, seen: Seen, light: Light, free: int
+) -> Float[np.ndarray, "n 3 k"]:
     """∂r/∂θ at the n pixels that are fitted, by the first `free` of θ, by central differences; 0 where the two sides show
     different surfaces."""
     rows, surfaces = seen.fitted, moving.surfaces

@@ -73,7 +73,12 @@ def refined_photo(
         own = objects[k]
         if pixels is None or not own.moves or not own.silhouette.inside.any():
             continue
-        view = View(pixels, [one.caster for one in objects], [j == k or one.trusted for j, one in enumerate(objects)], scene.shadows)
+        view = View(
+            pixels,
+            [one.caster for one in objects],
+            [j == k or one.trusted for j, one in enumerate(objects)],
+            scene.shadows,
+        )
         moving = moving_object(Photographed(view, k, camera, own.silhouette, prior), poses, surfaces)
         rival = state_of(own.runner_up, camera, own.caster) if own.runner_up else None
         verdict = settled(moving, before[k], rival, pixels.cell, standards)

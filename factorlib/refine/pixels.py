@@ -48,7 +48,11 @@ class Pixels(msgspec.Struct, frozen=True):
 
 
 def pixels_of(
-    photo: Mapping[str, Float[np.ndarray, "h w"]], known: Sequence[bool], count: int, seed: int = 0, noise: Noise = Noise()
+    photo: Mapping[str, Float[np.ndarray, "h w"]],
+    known: Sequence[bool],
+    count: int,
+    seed: int = 0,
+    noise: Noise = Noise(),
 ) -> Pixels | None:
     """At most `count` of the pixels inside a material that is `known`; None where there are too few cells to hold any out.
 
@@ -73,7 +77,16 @@ def pixels_of(
     out = random.permutation(len(names)) < HELD_OUT * len(names)
     if not 2 <= out.sum() < len(names):
         return None
-    return Pixels(x, y, radiance / mean, mean, np.where(clipped, 0.0, 1 / sigma), label[y, x] - 1, cell.reshape(-1), out[cell.reshape(-1)])
+    return Pixels(
+        x,
+        y,
+        radiance / mean,
+        mean,
+        np.where(clipped, 0.0, 1 / sigma),
+        label[y, x] - 1,
+        cell.reshape(-1),
+        out[cell.reshape(-1)],
+    )
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -94,20 +107,29 @@ class View:
         """What the nearest mesh shows under each pixel."""
         along = camera.rays_through(np.column_stack([self.pixels.x, self.pixels.y]) + 0.5)
         n = len(self.pixels)
-        normal, label, nearest, view = np.tile([0.0, 0.0, -1.0], (n, 1)), np.zeros(n, int), np.full(n, np.inf), -unit(along)
+        normal, label, nearest, view = (
+            np.tile([0.0, 0.0, -1.0], (n, 1)),
+            np.zeros(n, int),
+            np.full(n, np.inf),
+            -unit(along),
+        )
         for caster, pose, trusted in zip(self.casters, poses, self.trusted, strict=True):
             hits = caster.cast_along(along, pose)
             wins = (hits.face >= 0) & (hits.depth < nearest)
             face, (u, v) = hits.face[wins], hits.uv[wins].T
             corner = np.stack([1 - u - v, u, v], axis=1)
-            smooth = unit(np.einsum("nk,nkd->nd", corner, caster.mesh.normals[caster.mesh.faces[face]]) @ pose.rotation.T)
+            smooth = unit(
+                np.einsum("nk,nkd->nd", corner, caster.mesh.normals[caster.mesh.faces[face]]) @ pose.rotation.T
+            )
             behind = np.sum(face_normals(caster.mesh, face) @ pose.rotation.T * view[wins], axis=1) < 0
             nearest[wins], normal[wins] = hits.depth[wins], np.where(behind[:, None], -smooth, smooth)
             label[wins] = caster.mesh.face_label[face] if trusted else 0
         agrees = (label == self.pixels.material + 1) & (np.sum(normal * view, axis=1) > GRAZING)
         return Seen(normal, agrees)
 
-    def block(self, camera: Camera, seen: Seen, like: Block | None = None, poses: Sequence[Pose] | None = None) -> Block:
+    def block(
+        self, camera: Camera, seen: Seen, like: Block | None = None, poses: Sequence[Pose] | None = None
+    ) -> Block:
         """All pixels as observations; visibility as in `like`, or of `poses`."""
         pixels, n = self.pixels, len(self.pixels)
         view = -unit(camera.rays_through(np.column_stack([pixels.x, pixels.y]) + 0.5))
@@ -123,6 +145,8 @@ class View:
         meshes, directions = [caster.mesh for caster in self.casters], fibonacci_sphere(self.shadows)
         pixels = np.column_stack([self.pixels.x, self.pixels.y])
         found = sight(Occluders(meshes, poses), camera, pixels, seen.normal, self.shadows, len(pixels))
-        return block if found is None else msgspec.structs.replace(block, visibility=found.visibility, directions=directions[None])
-
-
+        return (
+            block
+            if found is None
+            else msgspec.structs.replace(block, visibility=found.visibility, directions=directions[None])
+        )

@@ -43,4 +43,7 @@ def specular_table(error: Tensor, alpha: Tensor, sharpness: Tensor, no: Tensor, 
 def diffuse_table(error: Tensor, sharpness: Tensor, nz: Tensor) -> dict:
     """Errors over all samples, and by sharpness and the lobe's angle from the normal."""
     angle = torch.rad2deg(torch.arccos(nz.clamp(-1, 1)))
-    return quantiles(error) | {"sharpness": binned(error, sharpness, SHARPNESS), "degrees from the normal": binned(error, angle, DEGREES)}
+    return quantiles(error) | {
+        "sharpness": binned(error, sharpness, SHARPNESS),
+        "degrees from the normal": binned(error, angle, DEGREES),
+    }

@@ -18,6 +18,10 @@ class ClosedForm(Operator):
         """As of `Operator`, by `factorlib.reflection.diffuse`."""
         return diffuse(sharpness, nz)
 
-    def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+    def specular(
+        self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
+    ) -> Float[Tensor, "n p"]:
         """As of `Operator`, by `factorlib.reflection.filtering`; at most MOST."""
-        return filtered_specular(*torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)).value.clamp_max(MOST)
+        return filtered_specular(
+            *torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
+        ).value.clamp_max(MOST)

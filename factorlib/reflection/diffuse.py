@@ -43,7 +43,9 @@ def _normal(mean: Tensor, along: Tensor, across: Tensor, c: Tensor) -> Tensor:
     m = mean * c
     deviation = torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
     u = m / deviation
-    return 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5)) + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
+    return 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5)) + deviation * torch.exp(-0.5 * u * u) / math.sqrt(
+        2 * math.pi
+    )
 
 
 def _remainder(mean: Tensor, c: Tensor) -> Tensor:

@@ -30,7 +30,12 @@ class Layers(msgspec.Struct, frozen=True):
 
     def to(self, dtype: torch.dtype) -> Layers:
         """The same network in another floating-point type."""
-        return Layers(self.mean.to(dtype), self.scale.to(dtype), [w.to(dtype) for w in self.weights], [b.to(dtype) for b in self.biases])
+        return Layers(
+            self.mean.to(dtype),
+            self.scale.to(dtype),
+            [w.to(dtype) for w in self.weights],
+            [b.to(dtype) for b in self.biases],
+        )
 
 
 def fading(sharpness: Tensor) -> Tensor:

@@ -36,7 +36,9 @@ from factorlib.reflection.tape import Tape, Value
 from factorlib.wholefile import sync
 
 log = logging.getLogger("factorlib.reflection")
-ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
+ENVIRONMENT = (
+    "FACTORLIB_FUSED",
+)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
 PROGRAMS = {"CC": "cc"}
 # Every flag leaves the bits as they are: no operation is contracted, reordered or replaced, errno and traps are nobody's.
 FLAGS = "-std=gnu11 -O3 -march=native -ffp-contract=off -ffinite-math-only -fno-signed-zeros -fno-math-errno -fno-trapping-math -fPIC -shared"
@@ -69,7 +71,9 @@ class Fused:
         """The value alone, in about a third of the time."""
         return self._filled(1, roughness, sharpness, no, nz, oz)[0]
 
-    def _filled(self, count: int, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
+    def _filled(
+        self, count: int, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
+    ) -> list[Tensor]:
         no, nz, oz = (t.detach().float().contiguous() for t in (no, nz, oz))
         out = [torch.empty_like(nz) for _ in range(count)]
         pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # the rest are null
@@ -128,7 +132,9 @@ def source(part: str, features: int, width: int, depth: int) -> str:
         (fade, inside * result * LARGEST * t),
         *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)),
     ]
-    by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)])
+    by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(
+        seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)]
+    )
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
     results = (result.clamp_max(MOST), by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
     places = PLACES | {"formula": "formula[l]"} | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
@@ -138,9 +144,13 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     before, after = text.split("      FORWARD\n")
     middle, after = after.split("        BACKWARD\n")
     between, end = after.split("        VALUE\n")
-    sizes = f"#define FEATURES {features}\n#define WIDTH {width}\n#define DEPTH {depth}\n#define MOMENTS {len(MOMENTS)}\n"
+    sizes = (
+        f"#define FEATURES {features}\n#define WIDTH {width}\n#define DEPTH {depth}\n#define MOMENTS {len(MOMENTS)}\n"
+    )
     for name in ("expf", "logf", "log1pf", "erfcf"):
-        forward, backward, value = ([line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward, value))
+        forward, backward, value = (
+            [line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward, value)
+        )
     forward, backward, value = ("\n".join(lines) + "\n" for lines in (forward, backward, value))
     return sizes + before + forward + middle + backward + between + value + end
 
@@ -158,7 +168,10 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
             made = Path(folder) / "kernel.so"
             (Path(folder) / "kernel.c").write_text(text)
             subprocess.run(
-                [*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"], check=True, capture_output=True, text=True
+                [*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"],
+                check=True,
+                capture_output=True,
+                text=True,
             )
             sync(made)
             os.replace(made, library)
@@ -171,7 +184,9 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
 def _machine() -> str:
     """What -march=native depends on."""
     try:
-        return next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features")))
+        return next(
+            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
+        )
     except (OSError, StopIteration):
         return platform.machine() + platform.processor()
 

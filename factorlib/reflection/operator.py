@@ -66,18 +66,29 @@ class Operator:
         raise NotImplementedError
 
     def specular(
-        self, roughness: Tensor, sharpness: Float[Tensor, " p"], no: Float[Tensor, " n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+        self,
+        roughness: Tensor,
+        sharpness: Float[Tensor, " p"],
+        no: Float[Tensor, " n"],
+        nz: Float[Tensor, "n p"],
+        oz: Float[Tensor, "n p"],
     ) -> Float[Tensor, "n p"]:
         """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²; every input may be [n, p] as well."""
         raise NotImplementedError
 
     def response(
-        self, roughness: Tensor, sharpness: Float[Tensor, " p"], no: Float[Tensor, " n"], nz: Float[Tensor, "n p"], oz: Float[Tensor, "n p"]
+        self,
+        roughness: Tensor,
+        sharpness: Float[Tensor, " p"],
+        no: Float[Tensor, " n"],
+        nz: Float[Tensor, "n p"],
+        oz: Float[Tensor, "n p"],
     ) -> Response:
         """Values and derivatives together; nothing is left on torch's graph."""
         rows = max(1, CHUNK // max(nz.shape[1], 1))
         parts = [
-            self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows]) for i in range(0, len(nz), rows)
+            self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows])
+            for i in range(0, len(nz), rows)
         ]
         if len(parts) == 1:
             return parts[0]
@@ -85,7 +96,9 @@ class Operator:
 
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
         with torch.enable_grad():
-            r, log_sharpness = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (roughness, sharpness.log()))
+            r, log_sharpness = (
+                t.detach().expand(nz.shape).clone().requires_grad_() for t in (roughness, sharpness.log())
+            )
             views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (columns(no), nz, oz))
             diffuse = self.diffuse(log_sharpness.exp(), nz)
             specular = self.specular(r, log_sharpness.exp(), views, nz, oz)
@@ -101,11 +114,17 @@ class Operator:
 
         normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
         """
-        axis, sharpness, weight = (torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight))
-        kd, ks, roughness = (torch.as_tensor(t).to(self.dtype) for t in (material.diffuse, material.specular, material.roughness))
+        axis, sharpness, weight = (
+            torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight)
+        )
+        kd, ks, roughness = (
+            torch.as_tensor(t).to(self.dtype) for t in (material.diffuse, material.specular, material.roughness)
+        )
         normals, views = (torch.as_tensor(t).to(self.dtype) for t in (normals, views))
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
-        radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (self.specular(roughness, sharpness, no, nz, oz) @ weight)
+        radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (
+            self.specular(roughness, sharpness, no, nz, oz) @ weight
+        )
         return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # so that NaN is not zero
 
 

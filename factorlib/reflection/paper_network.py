@@ -50,7 +50,9 @@ class PaperNetwork(Operator):
 
     def __init__(self, dtype: torch.dtype = torch.float32):
         super().__init__(dtype)
-        self.layers = {part: read_layers(SHIPPED / f"paper_{part}.safetensors", INPUTS[part]).to(dtype) for part in INPUTS}
+        self.layers = {
+            part: read_layers(SHIPPED / f"paper_{part}.safetensors", INPUTS[part]).to(dtype) for part in INPUTS
+        }
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         """As of `Operator`; λ is clamped to SHARPNESS."""
@@ -59,7 +61,9 @@ class PaperNetwork(Operator):
         normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
-    def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Float[Tensor, "n p"]:
+    def specular(
+        self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
+    ) -> Float[Tensor, "n p"]:
         """As of `Operator`; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
         roughness, sharpness, no, nz, oz = torch.broadcast_tensors(roughness, sharpness, columns(no), nz, oz)
         normal, half, axis = frame_of_cosines(no, nz, oz)

@@ -66,7 +66,9 @@ class DiffuseSamples(msgspec.Struct, frozen=True):
 
 def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) -> DiffuseSamples:
     """Sharpness log-uniform; n·z uniform for one half, within three widths of the horizon for the other."""
-    u = torch.from_numpy(qmc.Sobol(3, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count])
+    u = torch.from_numpy(
+        qmc.Sobol(3, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count]
+    )
     lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 0]
     even = 2 * u[:, 1] - 1
     nz = torch.where(u[:, 2] < 0.5, even, (3 * even / torch.sqrt(lam)).clamp(-1, 1))
@@ -75,7 +77,13 @@ def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) 
 
 
 def specular_inputs(
-    count: int, seed: int, *, alpha: Range = (0.01, 1.0), sharpness: Range = (0.3, 5000.0), least_no: float = 0.02, grazing: bool = False
+    count: int,
+    seed: int,
+    *,
+    alpha: Range = (0.01, 1.0),
+    sharpness: Range = (0.3, 5000.0),
+    least_no: float = 0.02,
+    grazing: bool = False,
 ) -> tuple[Tensor, ...]:
     """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence.
 
@@ -104,7 +112,9 @@ def _rayleigh(u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.sqrt(-2 * np.log1p(-u))
 
 
-def _turned(axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"], azimuth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def _turned(
+    axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"], azimuth: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
     """`axis` (in the plane y = 0) turned away from itself by `angle` in the direction `azimuth`."""
     across = np.stack([axis[:, 2], 0 * angle, -axis[:, 0]], 1)
     sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]

@@ -125,7 +125,9 @@ class Value:
 
     def _(name: str, swap: bool = False) -> Callable[[Any, Any], Any]:
         return (
-            (lambda self, other: self.tape.apply(name, other, self)) if swap else (lambda self, other: self.tape.apply(name, self, other))
+            (lambda self, other: self.tape.apply(name, other, self))
+            if swap
+            else (lambda self, other: self.tape.apply(name, self, other))
         )
 
     __add__, __radd__, __sub__, __rsub__ = _("add"), _("add", True), _("sub"), _("sub", True)
@@ -147,7 +149,9 @@ class Value:
         return self.tape.apply("sqrt", self)
 
     @classmethod
-    def __torch_function__(cls, function: Callable, types: Any, arguments: tuple = (), keywords: dict | None = None) -> Any:
+    def __torch_function__(
+        cls, function: Callable, types: Any, arguments: tuple = (), keywords: dict | None = None
+    ) -> Any:
         x = arguments[0]
         compound = {
             torch.rsqrt: lambda: 1.0 / x.sqrt(), torch.sigmoid: lambda: 1.0 / (1.0 + x.tape.apply("exp", -x)),

@@ -70,7 +70,9 @@ def specular_problem(samples: Samples) -> Problem:
 def diffuse_problem(samples: DiffuseSamples) -> Problem:
     """What the diffuse network is fitted to, at `samples`."""
     formula = diffuse(samples.sharpness, samples.nz)
-    return Problem(diffuse_features(samples.sharpness, samples.nz), samples.sharpness, formula, samples.value, samples.scale())
+    return Problem(
+        diffuse_features(samples.sharpness, samples.nz), samples.sharpness, formula, samples.value, samples.scale()
+    )
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -88,7 +90,11 @@ class Step(msgspec.Struct, frozen=True):
 
 
 def train(
-    problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None], checkpoint: Checkpoint | None = None
+    problem: Problem,
+    held_out: Problem,
+    schedule: Schedule,
+    report: Callable[[Step], None],
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Layers, list[Step]]:
     """The network of least held-out error, and the curve; goes on from `checkpoint`, to the same bytes."""
     run = Run(problem.float(), held_out.float(), schedule)
@@ -183,7 +189,9 @@ def robust(error: Tensor) -> Tensor:
 def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator: torch.Generator) -> Layers:
     """Random weights of variance 1.7 over the number of inputs, the last layer's a tenth as large, so that the correction begins near 0."""
     sizes = [features.shape[1], *[schedule.width] * schedule.depth, 1]
-    weights = [torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in zip(sizes, sizes[1:], strict=False)]
+    weights = [
+        torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in zip(sizes, sizes[1:], strict=False)
+    ]
     weights[-1] *= 0.1
     biases = [torch.zeros(b) for b in sizes[1:]]
     for tensor in (*weights, *biases):
@@ -203,4 +211,9 @@ def _measured(step: int, loss: float, layers: Layers, held_out: Problem) -> Step
 
 
 def _copy(layers: Layers) -> Layers:
-    return Layers(layers.mean, layers.scale, [w.detach().clone() for w in layers.weights], [b.detach().clone() for b in layers.biases])
+    return Layers(
+        layers.mean,
+        layers.scale,
+        [w.detach().clone() for w in layers.weights],
+        [b.detach().clone() for b in layers.biases],
+    )

@@ -15,7 +15,9 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.render.photo_scene import Placed
 
-MOST_TILT_DEG = 50.0  # of the upright axis against the cameras', on the mean: photos look down on things, and are held askew
+MOST_TILT_DEG = (
+    50.0  # of the upright axis against the cameras', on the mean: photos look down on things, and are held askew
+)
 
 
 class Plane(msgspec.Struct, frozen=True):
@@ -50,7 +52,9 @@ def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = No
     rotation = rotation / np.cbrt(np.linalg.det(rotation))
     uprights = rotation.T[:, 1][None] if uprights is None else uprights
     vertices = placed.mesh.vertices
-    poses, chances = trimesh.poses.compute_stable_poses(trimesh.convex.convex_hull(vertices - vertices.mean(axis=0)), n_samples=1)
+    poses, chances = trimesh.poses.compute_stable_poses(
+        trimesh.convex.convex_hull(vertices - vertices.mean(axis=0)), n_samples=1
+    )
     normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
     upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():

@@ -106,16 +106,22 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
     return Spot(plane, max(spots, key=room), height)
 
 
-def spot_at(scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float) -> Spot:
+def spot_at(
+    scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
+) -> Spot:
     """Where the photo's `pixel` shows the ground; InputError where it does not."""
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
-        raise InputError(f"pixel {pixel} shows no ground: it lies above the horizon", key="at", cure="name a pixel further down")
+        raise InputError(
+            f"pixel {pixel} shows no ground: it lies above the horizon", key="at", cure="name a pixel further down"
+        )
     return Spot(plane, point, relative_height * height_over(plane, neighbour))
 
 
-def stood(name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot) -> Placed:
+def stood(
+    name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
+) -> Placed:
     """A mesh in its own frame, `up` upward there, stood on a spot."""
     toward = _rotation_between(up, spot.plane.normal)
     rotation = rotation_of_vector(np.radians(turn_deg) * spot.plane.normal) @ toward
@@ -139,7 +145,12 @@ class Inserted(msgspec.Struct, frozen=True):
 
 
 def inserted(
-    backdrop: Backdrop, new: Placed, spot: Spot, ground: Ground, samples: int, report: Callable[[int], None] = lambda done: None
+    backdrop: Backdrop,
+    new: Placed,
+    spot: Spot,
+    ground: Ground,
+    samples: int,
+    report: Callable[[int], None] = lambda done: None,
 ) -> Inserted:
     """The photo with the new object; report: how many of STEPS are done.
 
@@ -147,7 +158,10 @@ def inserted(
     """
     scene, photo = backdrop.scene, backdrop.photo
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    there, more = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}, shapes([new], scene.materials)
+    there, more = (
+        {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)},
+        shapes([new], scene.materials),
+    )
 
     def traced(entries: dict[str, Any], samples: int = samples) -> Picture:
         """With the same random numbers each time."""
@@ -160,7 +174,9 @@ def inserted(
         found = "the new object is not seen: it stands outside the picture, or something hides it"
         raise InputError(found, key="at", cure="say where it stands, `at: [x, y]`, or make it smaller")
     report(1)
-    diffuse = ground.diffuse or _ground_colour(traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES), photo, shows_ground)
+    diffuse = ground.diffuse or _ground_colour(
+        traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES), photo, shows_ground
+    )
     report(2)
     disc = _disc(spot, _lambertian(diffuse))
     without = traced(disc)
@@ -202,7 +218,11 @@ def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
 
 def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
     """The new object shines with radiance 1, all else is black: what is seen is its share of each pixel."""
-    glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)}
+    glowing = {
+        f"{new.name}_{label}_{side}": _emitter(new, label, side)
+        for label in new.mesh.labels
+        for side in range(1 + new.mesh.open)
+    }
     black = shapes(scene.objects, scene.materials, black=[each.name for each in scene.objects])
     picture = rendered({**black, **glowing}, camera, samples, 1, 1)
     return np.clip(picture[..., 0], 0, 1)
@@ -214,10 +234,17 @@ def _emitter(new: Placed, label: int, side: int) -> Any:
     if side:
         behind = part.vertices - HAIR * new.mesh.radius * part.normals
         part = Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True)
-    return shape(part, {"type": "diffuse", "reflectance": rgb(0.0)}, new.world_from_object, {"type": "area", "radiance": rgb(1.0)})
+    return shape(
+        part,
+        {"type": "diffuse", "reflectance": rgb(0.0)},
+        new.world_from_object,
+        {"type": "area", "radiance": rgb(1.0)},
+    )
 
 
-def _shadow(without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], near: Float[np.ndarray, "h w 1"]) -> Picture:
+def _shadow(
+    without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], near: Float[np.ndarray, "h w 1"]
+) -> Picture:
     """(1), that of the nearest pixel beside the object for those under it; 1 where nothing is lit, and toward the rim of the disc."""
     beside = coverage == 0
     with np.errstate(divide="ignore", invalid="ignore"):

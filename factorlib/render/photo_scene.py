@@ -78,7 +78,9 @@ def light_entry(light: Light) -> dict[str, Any]:
     return lobes_envmap(light) if isinstance(light, Lobes) else envmap(light, finer=max(1, MAP_ROWS // len(light)))
 
 
-def shapes(objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()) -> dict[str, Any]:
+def shapes(
+    objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
+) -> dict[str, Any]:
     """A shape for each material of each object; objects named in `black` reflect nothing."""
     found = {}
     for each in objects:
@@ -129,7 +131,9 @@ def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
     return msgspec.structs.replace(scene, camera=camera)
 
 
-def orbit(scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0) -> Float[np.ndarray, "4 4"]:
+def orbit(
+    scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0
+) -> Float[np.ndarray, "4 4"]:
     """world_from_camera of the photo's camera moved about the objects' middle.
 
     azimuth_deg: to the right;  elevation_deg: upward;  zoom: of the size in the picture, by distance

@@ -72,27 +72,44 @@ class Reflector:
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
                 some = None if shadows is None else shadows.take(rows)
-                result[rows] = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), some).double().numpy()
+                result[rows] = (
+                    self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), some)
+                    .double()
+                    .numpy()
+                )
                 report(min(i + step, len(normals)), len(normals))
         return result
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
 
-    def _radiance(self, material: MaterialLike, normals: Tensor, views: Tensor, shadows: Shadows | None) -> Float[Tensor, "n 3"]:
+    def _radiance(
+        self, material: MaterialLike, normals: Tensor, views: Tensor, shadows: Shadows | None
+    ) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
-        diffuse_seen, specular_seen = (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
+        diffuse_seen, specular_seen = (
+            (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
+        )
         radiance = kd * ((diffuse_seen * self._diffuse(nz)) @ self.weight)
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)
-            radiance = radiance + ks * ((specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight)
+            radiance = radiance + ks * (
+                (specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight
+            )
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
 
     def _seen(self, shadows: Shadows, normals: Tensor, views: Tensor, roughness: float) -> tuple[Tensor, Tensor]:
         """Shares of the diffuse and of the specular reflection of each lobe, [n, p]."""
-        visibility, directions = torch.from_numpy(shadows.visibility).float() / 255, torch.from_numpy(shadows.directions).float()
-        normals, views, lobes = normals.float(), views.float(), kernel(directions, self.axis.float(), self.sharpness.float())
+        visibility, directions = (
+            torch.from_numpy(shadows.visibility).float() / 255,
+            torch.from_numpy(shadows.directions).float(),
+        )
+        normals, views, lobes = (
+            normals.float(),
+            views.float(),
+            kernel(directions, self.axis.float(), self.sharpness.float()),
+        )
         weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)[0]
         return tuple(seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
 
@@ -126,7 +143,9 @@ class Reflector:
         value[point, lobe] = self.operator.specular(roughness, *pairs)[:, 0]
         return value
 
-    def _shares(self, specular: Float[Tensor, "n p"], ks: Tensor, radiance: Float[Tensor, "n 3"]) -> Float[Tensor, "n p"]:
+    def _shares(
+        self, specular: Float[Tensor, "n p"], ks: Tensor, radiance: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n p"]:
         """Each lobe's highlight over the point's radiance, in the channel where that is most."""
         most = torch.zeros_like(specular)
         for c in range(3):

@@ -13,7 +13,12 @@ from factorlib.results.materials import Reflectance
 
 def forms(name: str, material: Reflectance) -> dict[str, str]:
     """By program: text to paste there.  Numbers are linear; what each program makes of them is in docs/formats.md."""
-    numbers = {"diffuse": material.diffuse, "specular": material.specular, "roughness": material.roughness, "alpha": material.alpha}
+    numbers = {
+        "diffuse": material.diffuse,
+        "specular": material.specular,
+        "roughness": material.roughness,
+        "alpha": material.alpha,
+    }
     return {
         "numbers": json.dumps({name: numbers}),
         "Mitsuba": material_xml(name, material),

@@ -22,7 +22,13 @@ class Series(msgspec.Struct, frozen=True):
 
 
 def line_plot(
-    series: Sequence[Series], x_label: str, y_label: str, *, log_y: bool = False, steps: Sequence[float] = (), names: Sequence[str] = ()
+    series: Sequence[Series],
+    x_label: str,
+    y_label: str,
+    *,
+    log_y: bool = False,
+    steps: Sequence[float] = (),
+    names: Sequence[str] = (),
 ) -> str:
     """An SVG of the series; empty text if there is nothing to draw.
 
@@ -34,8 +40,14 @@ def line_plot(
         return ""
     xs, ys = [p[0] for p in points], [math.log10(p[1]) if log_y else p[1] for p in points]
     aside = 0.4 if names else 0.0
-    across, up = _scale(min(xs) - aside, max(xs) + aside, LEFT, WIDTH - RIGHT), _scale(*_padded(min(ys), max(ys)), HEIGHT - BOTTOM, TOP)
-    parts = [f'<line class="rule" x1="{across(x):.1f}" x2="{across(x):.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>' for x in steps]
+    across, up = (
+        _scale(min(xs) - aside, max(xs) + aside, LEFT, WIDTH - RIGHT),
+        _scale(*_padded(min(ys), max(ys)), HEIGHT - BOTTOM, TOP),
+    )
+    parts = [
+        f'<line class="rule" x1="{across(x):.1f}" x2="{across(x):.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>'
+        for x in steps
+    ]
     parts += _y_axis(up, min(ys), max(ys), log_y) + _x_axis(across, min(xs), max(xs), names)
     parts += [_polyline(line, k, across, up, log_y) for k, line in enumerate(kept) if line]
     labels = (
@@ -100,10 +112,16 @@ def _x_axis(across: Scale, low: float, high: float, names: Sequence[str]) -> lis
     base = HEIGHT - BOTTOM
     marks = list(enumerate(names)) if names else [(v, f"{v:g}") for v in ticks(low, high, 8)]
     found = [f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{base}" y2="{base}"/>']
-    return found + [f'<text x="{across(v):.1f}" y="{base + 14}" text-anchor="middle">{escape(text)}</text>' for v, text in marks]
+    return found + [
+        f'<text x="{across(v):.1f}" y="{base + 14}" text-anchor="middle">{escape(text)}</text>' for v, text in marks
+    ]
 
 
 def _polyline(line: list[tuple[float, float]], k: int, across: Scale, up: Scale, log_y: bool) -> str:
     at = " ".join(f"{across(x):.1f},{up(math.log10(y) if log_y else y):.1f}" for x, y in line)
-    dots = "".join(f'<circle cx="{a.split(",")[0]}" cy="{a.split(",")[1]}" r="2.2"/>' for a in at.split()) if len(line) <= 40 else ""
+    dots = (
+        "".join(f'<circle cx="{a.split(",")[0]}" cy="{a.split(",")[1]}" r="2.2"/>' for a in at.split())
+        if len(line) <= 40
+        else ""
+    )
     return f'<g class="s{k}"><polyline points="{at}"/>{dots}</g>'

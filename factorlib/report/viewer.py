@@ -82,20 +82,26 @@ class Viewed(msgspec.Struct, frozen=True):
     photos: list[ViewedPhoto]
 
 
-def viewed(run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]) -> Viewed | None:
+def viewed(
+    run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]
+) -> Viewed | None:
     """lights, objects: slices of the photos;  exposure: by photo.  None where no light or no material was exported."""
     lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported()
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None
-    photos = [_photo(run, name, lights[name], exposure[name]) for name in run.set.photos if lights[name].illumination in lobes]
+    photos = [
+        _photo(run, name, lights[name], exposure[name]) for name in run.set.photos if lights[name].illumination in lobes
+    ]
     return Viewed(_meshes(run, objects), materials, {name: _light(found) for name, found in lobes.items()}, photos)
 
 
 def _photo(run: Artifacts, name: str, light: LightSlice, exposure: float) -> ViewedPhoto:
     world_from_camera = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera)
     rotation = YUP_FROM_CAMERA @ world_from_camera @ YUP_FROM_CAMERA.T
-    return ViewedPhoto(name, light.illumination, rotation.ravel().tolist(), list(run.exposures().get(name, (1.0,) * 3)), exposure)
+    return ViewedPhoto(
+        name, light.illumination, rotation.ravel().tolist(), list(run.exposures().get(name, (1.0,) * 3)), exposure
+    )
 
 
 def _light(lobes: Lobes) -> ViewedLight:
@@ -132,7 +138,9 @@ def _parts(file: Path) -> dict[str, trimesh.Trimesh]:
     return {name: geometry[name] for name in sorted(geometry)}
 
 
-def _mesh(run: Artifacts, name: str, parts: Mapping[str, trimesh.Trimesh], share: float, objects: Mapping[str, ObjectsSlice]) -> ViewedMesh:
+def _mesh(
+    run: Artifacts, name: str, parts: Mapping[str, trimesh.Trimesh], share: float, objects: Mapping[str, ObjectsSlice]
+) -> ViewedMesh:
     photo, rotation, translation, scale = _pose(run, name, objects)
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -159,7 +167,9 @@ def _pose(run: Artifacts, mesh: str, objects: Mapping[str, ObjectsSlice]) -> tup
     return None, YUP_FROM_CAMERA.T, np.zeros(3), np.ones(3)
 
 
-def _simplified(part: trimesh.Trimesh, share: float) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def _simplified(
+    part: trimesh.Trimesh, share: float
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Vertices, normals and triangles, of which at most that share is kept, by quadric error."""
     if share == 1.0:
         return part.vertices, part.vertex_normals, part.faces
@@ -169,11 +179,15 @@ def _simplified(part: trimesh.Trimesh, share: float) -> tuple[Float[np.ndarray, 
     return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), np.asarray(mesh.triangles)
 
 
-def _packed(material: str, unit: Float[np.ndarray, "v 3"], normal: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Part:
+def _packed(
+    material: str, unit: Float[np.ndarray, "v 3"], normal: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Part:
     """unit: positions within [−1, 1]"""
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     vertices = np.rint((np.clip(unit, -1, 1) + 1) * 32767.5).astype("<u2")
-    return Part(material, _base64(vertices), _base64(np.rint(32767 * normal).astype("<i2")), _base64(faces.astype("<u4")))
+    return Part(
+        material, _base64(vertices), _base64(np.rint(32767 * normal).astype("<i2")), _base64(faces.astype("<u4"))
+    )
 
 
 def _base64(values: np.ndarray) -> str:

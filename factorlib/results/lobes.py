@@ -16,9 +16,7 @@ from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
 
-FRAME = (
-    "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
-)
+FRAME = "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
 COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
 WHAT, CURE = "a table of lobes", "run the stage `solve` again"
 
@@ -29,7 +27,9 @@ def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
     rows = [np.column_stack([lights[n].axis, lights[n].sharpness, lights[n].weight]) for n in names]
     table = np.concatenate([np.zeros((0, len(COLUMNS))), *rows]).astype(float)
     illumination = [name for name, part in zip(names, rows, strict=True) for _ in range(len(part))]
-    columns = {"illumination": pa.array(illumination, pa.string())} | {c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)}
+    columns = {"illumination": pa.array(illumination, pa.string())} | {
+        c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)
+    }
     about = {"frame": FRAME, "lobe": "weight * exp(sharpness * (dot(direction, axis) - 1))", "illuminations": names}
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
     with writing(path):
@@ -41,7 +41,9 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
     columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=cure)
     with reading(WHAT, path, cure=cure):
         names = msgspec.convert(about["illuminations"], list[str])
-        values = np.column_stack([columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]).reshape(-1, len(COLUMNS))
+        values = np.column_stack(
+            [columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]
+        ).reshape(-1, len(COLUMNS))
         illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
         if not set(illumination) <= set(names):
             raise ValueError("a lobe of an illumination that its metadata do not name")

@@ -52,13 +52,19 @@ class Site(msgspec.Struct, frozen=True):
             cure = "keep build/ and the data on a file system that all machines mount at the same path"
             raise InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
         if self.library != LIBRARY:
-            raise InputError(f"{here} runs the code in {LIBRARY}", file=self.library, cure=started_by("<scheduler>", self.library))
+            raise InputError(
+                f"{here} runs the code in {LIBRARY}", file=self.library, cure=started_by("<scheduler>", self.library)
+            )
         if self.python != (python := f"{sys.version_info[0]}.{sys.version_info[1]}"):
-            raise InputError(f"{here} has Python {python}, the run has {self.python}", cure=started_by("<scheduler>", self.library))
+            raise InputError(
+                f"{here} has Python {python}, the run has {self.python}", cure=started_by("<scheduler>", self.library)
+            )
         for name, wanted in (record or {}).items():
             package = name.removeprefix("package:")
             if package != name and (found := _version(package)) != wanted:
-                raise InputError(f"{here} has {package} {found}, the run has {wanted}", cure="make setup, in the same checkout")
+                raise InputError(
+                    f"{here} has {package} {found}, the run has {wanted}", cure="make setup, in the same checkout"
+                )
 
 
 def started_by(scheduler: str, library: Path = LIBRARY) -> str:
@@ -108,7 +114,15 @@ class Blocks:
     def __init__(self, scheduler: str, site: Site, task: Task):
         self.scheduler, self.site, self.code = scheduler, site, task.code
         self.shelf = parcel().Shelf(task.temporary.with_name(f"{task.temporary.name}.shelf"))
-        self.spent = {"maps": 0, "tasks": 0, "cpu_seconds": 0.0, "memory_mb": 0.0, "bytes_sent": 0, "bytes_shelved": 0, "bytes_back": 0}
+        self.spent = {
+            "maps": 0,
+            "tasks": 0,
+            "cpu_seconds": 0.0,
+            "memory_mb": 0.0,
+            "bytes_sent": 0,
+            "bytes_shelved": 0,
+            "bytes_back": 0,
+        }
         self._client: Any = None
 
     def __call__(self, function: Callable, items: Iterable) -> list:

@@ -65,7 +65,9 @@ class Closure(msgspec.Struct, frozen=True):
         record = {f"source:{module}": digest for module, digest in self.modules.items()}
         record |= {f"data:{file}": digest for file, digest in self.data.items()}
         record |= {f"environment:{name}": os.environ[name] for name in self.environment if name in os.environ}
-        return record | {f"program:{name}": found for name, default in self.programs.items() if (found := _program(name, default))}
+        return record | {
+            f"program:{name}": found for name, default in self.programs.items() if (found := _program(name, default))
+        }
 
     def changes(self, record: Mapping[str, Any]) -> list[str]:
         """The names of what is not as it is in `record`."""
@@ -80,7 +82,9 @@ def _program(name: str, default: str) -> str | None:
     try:
         words = shlex.split(command) or [""]
     except ValueError as error:
-        raise InputError(f"{command!r} is no command ({error})", key=name, cure=f"name a program, as in {name}={default}") from None
+        raise InputError(
+            f"{command!r} is no command ({error})", key=name, cure=f"name a program, as in {name}={default}"
+        ) from None
     return " ".join([Path(words[0]).name, *words[1:]]) if shutil.which(words[0]) else None
 
 
@@ -89,7 +93,10 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
     tree = ast.parse(text)
     imports = sorted({name for node in ast.walk(tree) for name in _imported(node, module, is_package)})
     names = names_of(tree)
-    environment, programs = _declared(tree, "ENVIRONMENT", list[str], []), _declared(tree, "PROGRAMS", dict[str, str], {})
+    environment, programs = (
+        _declared(tree, "ENVIRONMENT", list[str], []),
+        _declared(tree, "PROGRAMS", dict[str, str], {}),
+    )
     for node in ast.walk(tree):
         _drop_docstring(node)
     return Source(hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32], imports, names, environment, programs)
@@ -98,12 +105,18 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
 def _declared(tree: ast.Module, name: str, type_: Any, default: Any) -> Any:
     """The value of the constant `name` of a module, without running it."""
     for node in tree.body:
-        if isinstance(node, ast.Assign) and any(isinstance(target, ast.Name) and target.id == name for target in node.targets):
+        if isinstance(node, ast.Assign) and any(
+            isinstance(target, ast.Name) and target.id == name for target in node.targets
+        ):
             try:
                 return msgspec.convert(ast.literal_eval(node.value), type_)
             except (ValueError, msgspec.ValidationError):
-                cure = "write names as they stand: " + ('{"CC": "cc"}' if type_ == dict[str, str] else '("A_VARIABLE",)')
-                raise InputError(f"line {node.lineno}: {name} is read without running the module", key=name, cure=cure) from None
+                cure = "write names as they stand: " + (
+                    '{"CC": "cc"}' if type_ == dict[str, str] else '("A_VARIABLE",)'
+                )
+                raise InputError(
+                    f"line {node.lineno}: {name} is read without running the module", key=name, cure=cure
+                ) from None
     return default
 
 
@@ -187,7 +200,8 @@ class Sources:
             external=sorted(external - sys.stdlib_module_names - {""}),
             environment=sorted({name for source in sources.values() for name in source.environment}),
             programs={name: program for source in sources.values() for name, program in source.programs.items()},
-            files={f"source:{name}": seen[name] for name in sources} | {f"data:{name}": path for name, path in data.items()},
+            files={f"source:{name}": seen[name] for name in sources}
+            | {f"data:{name}": path for name, path in data.items()},
         )
 
     def find(self, name: str) -> Path | None:
@@ -200,7 +214,15 @@ class Sources:
         parent, _, last = name.rpartition(".")
         if parent:
             above = self.find(parent)
-            bases = [] if above is None else [above.parent] if above.name == "__init__.py" else [above] if above.is_dir() else []
+            bases = (
+                []
+                if above is None
+                else [above.parent]
+                if above.name == "__init__.py"
+                else [above]
+                if above.is_dir()
+                else []
+            )
         else:
             bases = self.roots
         for base in bases:
@@ -227,7 +249,9 @@ class Sources:
     def _source(self, name: str, file: Path) -> Source:
         if file not in self._read:
             of_folder = Source("", [], Names({}, {}, {}), [], {})
-            self._read[file] = of_folder if file.is_dir() else self.hashes.source(file, lambda: self._parse(name, file), Source)
+            self._read[file] = (
+                of_folder if file.is_dir() else self.hashes.source(file, lambda: self._parse(name, file), Source)
+            )
         return self._read[file]
 
     @staticmethod
@@ -235,18 +259,26 @@ class Sources:
         try:
             return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
         except SyntaxError as error:
-            raise InputError(f"not Python: {error.msg}", file=f"{file}:{error.lineno}", cure="mend that line") from error
+            raise InputError(
+                f"not Python: {error.msg}", file=f"{file}:{error.lineno}", cure="mend that line"
+            ) from error
         except InputError as error:
             raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
 
     def _data(self, modules: dict[str, Path]) -> dict[str, Path]:
         """Whatever is no Python beside the modules, or in folders beside them that are no packages."""
         packages = {
-            name.rpartition(".")[0]: file.parent for name, file in modules.items() if not file.is_dir() and file.name != "__init__.py"
+            name.rpartition(".")[0]: file.parent
+            for name, file in modules.items()
+            if not file.is_dir() and file.name != "__init__.py"
         }
         packages |= {name: file.parent for name, file in modules.items() if file.name == "__init__.py"}
         packages.pop("", None)  # beside a module that is in no package lies anything
-        files = {f"{name}:{path.relative_to(folder).as_posix()}": path for name, folder in packages.items() for path in self._data_of(folder)}
+        files = {
+            f"{name}:{path.relative_to(folder).as_posix()}": path
+            for name, folder in packages.items()
+            for path in self._data_of(folder)
+        }
         return dict(sorted(files.items()))
 
     def _data_of(self, folder: Path) -> list[Path]:

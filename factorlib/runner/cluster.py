@@ -49,7 +49,9 @@ class Cluster:
 
     def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
         if find_spec("distributed") is None:
-            raise InputError("Dask is not installed", key="executor", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'")
+            raise InputError(
+                "Dask is not installed", key="executor", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+            )
         self.site = Site(run, run / "mark")
         write_text(self.site.mark, "")
         self._executors: dict[int | None, Executor] = {}
@@ -155,9 +157,17 @@ def _client(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         workers, threads = nprocesses_nthreads(machine_cores())
         with (
-            dask.config.set(dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))),  # `set` replaces whole branches
+            dask.config.set(
+                dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))
+            ),  # `set` replaces whole branches
             LocalCluster(
-                workers, threads, host="127.0.0.1", dashboard_address=None, memory_limit=0, resources={CORES: threads}, silence_logs=logging.CRITICAL
+                workers,
+                threads,
+                host="127.0.0.1",
+                dashboard_address=None,
+                memory_limit=0,
+                resources={CORES: threads},
+                silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):
@@ -167,7 +177,9 @@ def _client(scheduler: str | None) -> Iterator[Any]:
         with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
             beside.submit(asyncio.run, _answered(scheduler)).result()
         client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except Exception as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
+    except (
+        Exception
+    ) as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
         said = str(error) or f"nothing in {PATIENCE} s"
         raise InputError(f"no Dask scheduler answers at {scheduler} ({said})", key="scheduler", cure=cure) from error
@@ -208,11 +220,25 @@ def _known(asked: Future) -> Future:
 def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), started as steps need it."""
     if find_spec("distributed") is None:
-        raise InputError("Dask is not installed", key="worker", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'")
+        raise InputError(
+            "Dask is not installed", key="worker", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        )
     if not ADDRESS.fullmatch(scheduler):
-        raise InputError(f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786")
+        raise InputError(
+            f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+        )
     count = str(cores or machine_cores())
-    options = ["--nthreads", count, "--nworkers", "1", "--resources", f"{CORES}={count}", "--memory-limit", "0", "--no-dashboard"]
+    options = [
+        "--nthreads",
+        count,
+        "--nworkers",
+        "1",
+        "--resources",
+        f"{CORES}={count}",
+        "--memory-limit",
+        "0",
+        "--no-dashboard",
+    ]
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
     os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})

@@ -52,7 +52,9 @@ def names_of(tree: ast.Module) -> Names:
     classes, imported, instances, constants = {}, {}, {}, {}
     for node in tree.body:
         if isinstance(node, ast.ClassDef):
-            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
+            fields = [
+                item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
+            ]
             defaults = {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
             classes[node.name] = Class([ast.unparse(base) for base in node.bases], defaults)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -61,16 +63,25 @@ def names_of(tree: ast.Module) -> Names:
             for target, value in _pairs(node):
                 if isinstance(value, ast.Call) and not value.args and not value.keywords:
                     instances[ast.unparse(target)] = ast.unparse(value.func)
-                elif isinstance(target, ast.Name) and isinstance(value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name):
+                elif isinstance(target, ast.Name) and isinstance(
+                    value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name
+                ):
                     constants[target.id] = ast.unparse(value)
-    bound = Counter(node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del))
+    bound = Counter(
+        node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del)
+    )
     return Names(classes, imported, instances, {name: text for name, text in constants.items() if bound[name] == 1})
 
 
 def _pairs(node: ast.Assign) -> list[tuple[ast.expr, ast.expr]]:
     """A, B = x, y as two assignments."""
     (target, *others), value = node.targets, node.value
-    if not others and isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
+    if (
+        not others
+        and isinstance(target, ast.Tuple)
+        and isinstance(value, ast.Tuple)
+        and len(target.elts) == len(value.elts)
+    ):
         return list(zip(target.elts, value.elts, strict=True))
     return [(each, value) for each in node.targets]
 
@@ -127,7 +138,12 @@ def _value(text: str, module: str, names: Callable[[str], Names | None], deep: i
         return _value(name, source, names, deep + 1)
     if of in here.instances:
         return values_of(module, here.instances[of], names, deep + 1).get(attribute, UNKNOWN)
-    if of in here.imported and attribute and (there := names(here.imported[of][0])) and here.imported[of][1] in there.instances:
+    if (
+        of in here.imported
+        and attribute
+        and (there := names(here.imported[of][0]))
+        and here.imported[of][1] in there.instances
+    ):
         return _value(f"{here.imported[of][1]}.{attribute}", here.imported[of][0], names, deep + 1)
     return _literal(text)
 

@@ -55,7 +55,9 @@ class Pools:
 
     def close(self, kill: bool = False) -> None:
         """End all worker processes; `kill`: at once, whatever they do."""
-        executors = [e for spare in self._spare.values() for e in spare] + [executor for _, _, executor in self._busy.values()]
+        executors = [e for spare in self._spare.values() for e in spare] + [
+            executor for _, _, executor in self._busy.values()
+        ]
         if kill:
             for process in multiprocessing.active_children():
                 process.kill()
@@ -71,7 +73,9 @@ def machine_cores() -> int:
 
 
 def _executor(threads: int) -> Executor:
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid()))
+    return ProcessPoolExecutor(
+        1, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid())
+    )
 
 
 class _OfWorkers:

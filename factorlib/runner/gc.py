@@ -133,7 +133,9 @@ def unneeded(project: Project) -> list[Unneeded]:
     if sizes:
         kept = [(path.stat().st_mtime, sizes[path.name]) for path in trees if path.name in sizes]
         found.setdefault(LEFT_OVER, []).extend(kept)
-    groups = [Unneeded(s, len(r), sum(b for _, b in r), min(t for t, _ in r), max(t for t, _ in r)) for s, r in found.items()]
+    groups = [
+        Unneeded(s, len(r), sum(b for _, b in r), min(t for t, _ in r), max(t for t, _ in r)) for s, r in found.items()
+    ]
     return sorted(groups, key=lambda group: (-group.bytes, group.stage))
 
 
@@ -183,7 +185,12 @@ def _needed(store: Store, current: set[str]) -> set[str]:
     found, stack = set(current), list(current)
     while stack:
         record = entries[key].record if (key := stack.pop()) in entries else {}
-        above = {other for name, output in record.items() if name.startswith(INPUT) for other in gave.get((name.removeprefix(INPUT), output), [])}
+        above = {
+            other
+            for name, output in record.items()
+            if name.startswith(INPUT)
+            for other in gave.get((name.removeprefix(INPUT), output), [])
+        }
         stack += above - found
         found |= above
     return found
@@ -216,7 +223,11 @@ def forget_all(project: Project) -> Gone:
 
 def _forget(project: Project, home: Home) -> Gone:
     """Only what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
-    folders = [folder for folder in home.folder.iterdir() if folder.is_dir() and not folder.is_symlink() and folder != home.errors]
+    folders = [
+        folder
+        for folder in home.folder.iterdir()
+        if folder.is_dir() and not folder.is_symlink() and folder != home.errors
+    ]
     pictures = [path for folder in folders for path in folder.iterdir() if _is_link_to_result(path)]  # of recipes
     ours = [path for path in home.folder.iterdir() if _is_link_to_result(path)] + pictures
     ours += [path for path in (home.keys_file, home.log) if path.is_symlink() or path.is_file()]

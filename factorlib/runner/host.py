@@ -66,4 +66,8 @@ def _child(run: Path, threads: int) -> Any:
 def _wanted(worker: Worker, key: str) -> bool:
     """False once the task is cancelled, which for Dask is a change of its state, no interruption; or the worker closes."""
     task = worker.state.tasks.get(key)
-    return task is not None and task.state != "cancelled" and worker.status.name in ("running", "paused", "closing_gracefully")
+    return (
+        task is not None
+        and task.state != "cancelled"
+        and worker.status.name in ("running", "paused", "closing_gracefully")
+    )

@@ -93,7 +93,9 @@ class Inspector:
             self._wrong.pop(output, None)
             self.remember(output, now)
 
-    def _of_file(self, output: str, name: str, hash_: str, now: Mapping[str, Stamp], right: Mapping[str, Stamp]) -> str | None:
+    def _of_file(
+        self, output: str, name: str, hash_: str, now: Mapping[str, Stamp], right: Mapping[str, Stamp]
+    ) -> str | None:
         if name not in now:
             return f"{name}: missing"
         if now[name] == right.get(name):
@@ -123,7 +125,11 @@ class Inspector:
         """Write the cache, where there is anything new to write."""
         if not self._changed:
             return
-        there = {name: stamps for name, stamps in self.known.items() if (self.trees / name).is_dir() or (self.views / name).is_dir()}
+        there = {
+            name: stamps
+            for name, stamps in self.known.items()
+            if (self.trees / name).is_dir() or (self.views / name).is_dir()
+        }
         write_cache(self.cache, there)
         self._changed = False
 

@@ -23,7 +23,9 @@ class Packages:
 
     def __init__(self, cache: Path | None):
         self.cache = cache
-        self.state = [[path, os.stat(path).st_mtime_ns] for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
+        self.state = [
+            [path, os.stat(path).st_mtime_ns] for path in sys.path if path.endswith("-packages") and os.path.isdir(path)
+        ]
         self._known = self._read()
         self._names: dict | None = None
         self._changed = False

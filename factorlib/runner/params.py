@@ -1,8 +1,8 @@
 """What a stage's parameters mean, may be, and are by default: read from its `Params`, each field followed by a string that says it.
 
-    class Params(msgspec.Struct):
-        lobes: Annotated[int, Meta(ge=1)] = 72
-        "Most lobes that an illumination may get."
+class Params(msgspec.Struct):
+    lobes: Annotated[int, Meta(ge=1)] = 72
+    "Most lobes that an illumination may get."
 """
 
 from __future__ import annotations
@@ -13,7 +13,19 @@ import textwrap
 from typing import Any
 
 import msgspec
-from msgspec.inspect import BoolType, Field, FloatType, IntType, LiteralType, NoneType, StrType, StructType, Type, UnionType, type_info
+from msgspec.inspect import (
+    BoolType,
+    Field,
+    FloatType,
+    IntType,
+    LiteralType,
+    NoneType,
+    StrType,
+    StructType,
+    Type,
+    UnionType,
+    type_info,
+)
 
 
 class Parameter(msgspec.Struct, frozen=True):
@@ -52,7 +64,11 @@ def texts_of(struct: type) -> dict[str, str]:
 
 
 def _default(field: Field) -> str:
-    value = field.default_factory() if field.default is msgspec.NODEFAULT and callable(field.default_factory) else field.default
+    value = (
+        field.default_factory()
+        if field.default is msgspec.NODEFAULT and callable(field.default_factory)
+        else field.default
+    )
     return "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
 
 

@@ -101,7 +101,9 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def needed(self, targets: list[str] | None) -> list[str]:
         """The targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
-        wanted = {name for name, stage in self.stages.items() if not stage.optional} if targets is None else set(targets)
+        wanted = (
+            {name for name, stage in self.stages.items() if not stage.optional} if targets is None else set(targets)
+        )
         order = self.order()
         for name in reversed(order):
             if name in wanted:
@@ -116,7 +118,12 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     """
     pipeline = read_yaml(path, Pipeline)
     if pipeline.format != FORMAT:
-        raise InputError(f"format {pipeline.format} is not known", file=path, key="format", cure=f"this version reads format: {FORMAT}")
+        raise InputError(
+            f"format {pipeline.format} is not known",
+            file=path,
+            key="format",
+            cure=f"this version reads format: {FORMAT}",
+        )
     _check_executor(pipeline, path, "")
     for name, stage in pipeline.stages.items():
         _check_stage(name, stage, pipeline, known_slices, path)
@@ -125,7 +132,10 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     except CycleError as error:
         circle = " <- ".join(error.args[1])
         raise InputError(
-            f"stages that need each other: {circle}", file=path, key="stages", cure="make the second pass a stage of its own"
+            f"stages that need each other: {circle}",
+            file=path,
+            key="stages",
+            cure="make the second pass a stage of its own",
         ) from None
     return pipeline
 
@@ -133,7 +143,12 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
     if pipeline.executor not in EXECUTORS:
         shown = repr(pipeline.executor[:SHOWN])
-        raise InputError(f"there is no executor {shown}", file=file, key=f"{prefix}executor", cure=did_you_mean(pipeline.executor, EXECUTORS))
+        raise InputError(
+            f"there is no executor {shown}",
+            file=file,
+            key=f"{prefix}executor",
+            cure=did_you_mean(pipeline.executor, EXECUTORS),
+        )
     if pipeline.scheduler is None:
         return
     if pipeline.executor != DASK:
@@ -141,23 +156,45 @@ def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
         raise InputError("only Dask has a scheduler", file=file, key=f"{prefix}scheduler", cure=cure)
     if not ADDRESS.fullmatch(pipeline.scheduler):
         shown = repr(pipeline.scheduler[:SHOWN])
-        raise InputError(f"{shown} is no address", file=file, key=f"{prefix}scheduler", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786")
+        raise InputError(
+            f"{shown} is no address",
+            file=file,
+            key=f"{prefix}scheduler",
+            cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786",
+        )
 
 
 def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
     if not NAME.fullmatch(name) or name in TAKEN:
-        raise InputError(f"a stage cannot be called {name!r}", file=path, key="stages", cure="give it another name, of a-z, 0-9 and _")
+        raise InputError(
+            f"a stage cannot be called {name!r}",
+            file=path,
+            key="stages",
+            cure="give it another name, of a-z, 0-9 and _",
+        )
     if stage.gather is not None:
         check_name(stage.gather, "a gathered file", file=path, key=f"stages.{name}.gather")
     for entry in stage.inputs:
         known = [DATASET + s for s in known_slices] + list(pipeline.stages)
         if entry not in known:
-            raise InputError(f"there is no {entry!r}", file=path, key=f"stages.{name}.inputs", cure=did_you_mean(entry, known))
+            raise InputError(
+                f"there is no {entry!r}", file=path, key=f"stages.{name}.inputs", cure=did_you_mean(entry, known)
+            )
     for param in stage.given:
         if param in stage.inputs:
-            raise InputError(f"{param!r} is a stage already", file=path, key=f"stages.{name}.given", cure="call the parameter something else")
+            raise InputError(
+                f"{param!r} is a stage already",
+                file=path,
+                key=f"stages.{name}.given",
+                cure="call the parameter something else",
+            )
     if stage.gather and stage.over != "photo":
-        raise InputError("only what is made per photo can be gathered", file=path, key=f"stages.{name}.gather", cure="add over: photo")
+        raise InputError(
+            "only what is made per photo can be gathered",
+            file=path,
+            key=f"stages.{name}.gather",
+            cure="add over: photo",
+        )
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
@@ -229,7 +266,9 @@ def _words(text: str) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:
-        raise InputError(f"{text[:SHOWN]!r} cannot be split into words ({error})", key="SET", cure="close every quote") from error
+        raise InputError(
+            f"{text[:SHOWN]!r} cannot be split into words ({error})", key="SET", cure="close every quote"
+        ) from error
 
 
 def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
@@ -243,7 +282,9 @@ def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
     try:
         return stage, keys, parse_yaml(value, f"SET {shown}")
     except (ValueError, RecursionError) as error:  # thousands of digits or brackets
-        raise InputError(f"not readable as a value ({error})", key=f"SET {shown}", cure="write a number, a word, or a short list") from error
+        raise InputError(
+            f"not readable as a value ({error})", key=f"SET {shown}", cure="write a number, a word, or a short list"
+        ) from error
 
 
 def _how(target: str, keys: list[str]) -> str:
@@ -256,7 +297,12 @@ def check_values(pipeline: Pipeline, file: Path) -> Pipeline:
     for name, stage in pipeline.stages.items():
         for key, value in _leaves(stage.params, f"stages.{name}.params"):
             if wrong := _no_value(value):
-                raise InputError(f"{str(value)[:SHOWN]!r} {wrong}", file=file, key=key, cure="write a number, a word, or leave it out")
+                raise InputError(
+                    f"{str(value)[:SHOWN]!r} {wrong}",
+                    file=file,
+                    key=key,
+                    cure="write a number, a word, or leave it out",
+                )
     return pipeline
 
 

@@ -115,7 +115,9 @@ def _planned(step: Step, spec: Spec, own: Record, listing: Listing, planned: Map
     return Planned(step, "to run", reasons or ["its result is gone"], record, key)
 
 
-def _planned_below(step: Step, own: Record, above: list[Planned], open_: list[Planned], before: Record | None, forced: bool) -> Planned:
+def _planned_below(
+    step: Step, own: Record, above: list[Planned], open_: list[Planned], before: Record | None, forced: bool
+) -> Planned:
     """A step under others that are still to run."""
     if forced:
         return Planned(step, "to run", ["forced"])
@@ -135,7 +137,11 @@ def _gathered_of(record: Record) -> Record:
 
 def inputs_of(spec: Spec, step: Step, outputs: Mapping[Step, str]) -> Record:
     """The part of a step's record that is the results it is handed."""
-    gathers = {name: spec.pipeline.stages[name].gather for name in spec.pipeline.stages[step.stage].upstream if step.photo is None}
+    gathers = {
+        name: spec.pipeline.stages[name].gather
+        for name in spec.pipeline.stages[step.stage].upstream
+        if step.photo is None
+    }
     gathered = {f"gathered:{name}": file for name, file in gathers.items() if file}
     return {f"input:{above}": outputs[above] for above in spec.above(step)} | gathered
 
@@ -165,7 +171,9 @@ _KIND = {
 
 def difference(before: Record, after: Record) -> list[str]:
     """What changed between two records, in words, one line per cause."""
-    changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
+    changed = [
+        name for name in sorted(before.keys() | after.keys()) if before.get(name, _ABSENT) != after.get(name, _ABSENT)
+    ]
     return [_change(name, before, after) for name in changed]
 
 
@@ -212,4 +220,7 @@ def names(steps: Iterable[Step]) -> str:
     counts: dict[str, list[Step]] = {}
     for step in steps:
         counts.setdefault(step.stage, []).append(step)
-    return ", ".join(str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} {'recipes' if found[0].recipe else 'photos'})" for stage, found in counts.items())
+    return ", ".join(
+        str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} {'recipes' if found[0].recipe else 'photos'})"
+        for stage, found in counts.items()
+    )

@@ -165,7 +165,9 @@ class Run:
 
     def _start(self, planned: Planned) -> None:
         if planned.key in self.made:
-            self._fail(planned.step, Outcome(error=f"{planned.reasons[0]}, and was made just now: is the disk failing?"))
+            self._fail(
+                planned.step, Outcome(error=f"{planned.reasons[0]}, and was made just now: is the disk failing?")
+            )
             return
         lock = FileLock(self.survey.store.locks / f"{planned.key}.lock")
         try:
@@ -191,7 +193,16 @@ class Run:
     def _code(self, stage: str) -> Code:
         project, spec = self.survey.project, self.survey.spec.pipeline.stages[stage]
         cores = self.pools.cores if spec.cores == "all" else min(spec.cores, self.pools.cores)
-        return Code(project.root, project.package, stage, spec.values, project.pipeline_file, spec.threads, cores, self.survey.words)
+        return Code(
+            project.root,
+            project.package,
+            stage,
+            spec.values,
+            project.pipeline_file,
+            spec.threads,
+            cores,
+            self.survey.words,
+        )
 
     def _task(self, planned: Planned) -> Task:
         step, data = planned.step, self.survey.data
@@ -199,7 +210,9 @@ class Run:
         slices = {name: data.slice(name, step.photo) for name in stage.slices}
         files = {file: data.folder / file for slice_ in slices.values() for file in slice_.files}
         given = {param: given_folder(stage, param) for param in stage.folders}
-        read = {f"given:{param}/{file}": folder / file for param, folder in given.items() for file in stage.given[param]}
+        read = {
+            f"given:{param}/{file}": folder / file for param, folder in given.items() for file in stage.given[param]
+        }
         recipe = self.survey.recipes[step.recipe] if step.recipe else None
         read |= {f"recipe file:{name}": path for name, path in recipe.files.items()} if recipe else {}
         return Task(
@@ -208,9 +221,11 @@ class Run:
             makes=stage.makes,
             gather=stage.gather,
             folders={name: self._folder(step, name) for name in stage.upstream} | given,
-            facts={DATASET + name: slice_.facts for name, slice_ in slices.items()} | ({"recipe": recipe.facts} if recipe else {}),
+            facts={DATASET + name: slice_.facts for name, slice_ in slices.items()}
+            | ({"recipe": recipe.facts} if recipe else {}),
             files=files | read,
-            hashes={file: planned.record[f"file:{file}"] for file in files} | {file: planned.record[file] for file in read},
+            hashes={file: planned.record[f"file:{file}"] for file in files}
+            | {file: planned.record[file] for file in read},
             log=self._log_above(step, self.folder / f"{label(step)}.log.jsonl") if stage.logs else None,
             store=self.survey.store.root,
             key=planned.key,
@@ -230,7 +245,10 @@ class Run:
         if step.photo is not None:
             return store.tree(outputs[Step(name, step.photo)])
         return view_of(
-            store, self.survey.outputs.inspector, {found.photo: outputs[found] for found in self.survey.spec.steps_of(name)}, stage.gather
+            store,
+            self.survey.outputs.inspector,
+            {found.photo: outputs[found] for found in self.survey.spec.steps_of(name)},
+            stage.gather,
         )
 
     def _log_above(self, step: Step, path: Path) -> Path:
@@ -293,7 +311,8 @@ class Run:
         self.survey.outputs.forget(work.task.key)
         if outcome.damaged:
             self.display.warn(
-                step, f"its kept result was damaged and is replaced; what was there: {self.survey.project.shown(outcome.damaged)}"
+                step,
+                f"its kept result was damaged and is replaced; what was there: {self.survey.project.shown(outcome.damaged)}",
             )
         self.survey.previous[str(step)] = work.task.record
         self.tally.ran.append(step)
@@ -313,7 +332,12 @@ class Run:
             write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
-        self._log(json.dumps({"event": "failed", "stage": step.stage, "photo": step.of, "text": outcome.error}, sort_keys=True) + "\n")
+        self._log(
+            json.dumps(
+                {"event": "failed", "stage": step.stage, "photo": step.of, "text": outcome.error}, sort_keys=True
+            )
+            + "\n"
+        )
 
     def _log(self, lines: str) -> None:
         self.survey.home.folder.mkdir(parents=True, exist_ok=True)
@@ -328,6 +352,8 @@ def _outcome_of(future: Future) -> Outcome:
     try:
         return future.result()
     except (BrokenProcessPool, CancelledError):
-        return Outcome(error="its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume")
+        return Outcome(
+            error="its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume"
+        )
     except Exception as error:
         return Outcome(error=f"{type(error).__name__}: {error}", traceback=repr(error))

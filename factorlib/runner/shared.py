@@ -49,15 +49,21 @@ def shared_store(own: Path) -> Path | None:
     folder = Path(named).expanduser()
     try:
         if not folder.is_dir():
-            raise InputError("there is no such folder", file=named, key=VARIABLE, cure="make it, or name another; it may be empty")
+            raise InputError(
+                "there is no such folder", file=named, key=VARIABLE, cure="make it, or name another; it may be empty"
+            )
         return None if own.is_dir() and folder.samefile(own) else folder.resolve()
     except (OSError, RuntimeError, ValueError) as error:  # no right to look, links in a circle, a NUL
         if isinstance(error, InputError):
             raise
-        raise InputError(f"cannot be looked at ({error})", file=named[:100], key=VARIABLE, cure="name a folder that you may read") from error
+        raise InputError(
+            f"cannot be looked at ({error})", file=named[:100], key=VARIABLE, cure="name a folder that you may read"
+        ) from error
 
 
-def fetch(shared: Store, own: Store, key: str, record: Record, draft: Path, say: Say) -> tuple[Entry, Path | None] | None:
+def fetch(
+    shared: Store, own: Store, key: str, record: Record, draft: Path, say: Say
+) -> tuple[Entry, Path | None] | None:
     """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
 
     draft: a folder of the own store that is not there yet;  second comes what `Store.take_in` gives
@@ -164,7 +170,9 @@ def _read(folder: Path) -> Shipped:
     try:
         return msgspec.json.decode((folder / MADE_FROM).read_bytes(), type=Shipped)
     except msgspec.DecodeError as error:
-        raise InputError(f"does not say what the shipped files were made from ({error})", file=folder / MADE_FROM, cure=CURE) from None
+        raise InputError(
+            f"does not say what the shipped files were made from ({error})", file=folder / MADE_FROM, cure=CURE
+        ) from None
 
 
 def copy_shipped(folder: Path, out: Path) -> None:

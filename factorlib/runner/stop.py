@@ -22,7 +22,11 @@ class Stopped(SystemExit):
 @contextlib.contextmanager
 def heed_stops() -> Iterator[None]:
     """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
-    heeded = [number for number in (signal.SIGINT, signal.SIGTERM) if _in_main_thread() and signal.getsignal(number) != signal.SIG_IGN]
+    heeded = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if _in_main_thread() and signal.getsignal(number) != signal.SIG_IGN
+    ]
     before = {number: signal.signal(number, _stop) for number in heeded}
     try:
         yield

@@ -49,7 +49,17 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs, self.views, self.locks, self.tmp, self.cache, self.unfinished, self.damaged = (
+        (
+            self.trees,
+            self.keys,
+            self.logs,
+            self.views,
+            self.locks,
+            self.tmp,
+            self.cache,
+            self.unfinished,
+            self.damaged,
+        ) = (
             root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache", "unfinished", "damaged")
         )
 

@@ -17,7 +17,16 @@ from factorlib.runner.defaults import other_than
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.packages import Packages
-from factorlib.runner.pipeline import DATASET, Pipeline, Stage, check_values, read_pipeline, said_of_settings, with_settings, words_by_key
+from factorlib.runner.pipeline import (
+    DATASET,
+    Pipeline,
+    Stage,
+    check_values,
+    read_pipeline,
+    said_of_settings,
+    with_settings,
+    words_by_key,
+)
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project, Recipe
 from factorlib.runner.store import Outputs, Store
@@ -51,20 +60,30 @@ class Survey:
 
 
 def survey(
-    project: Project, dataset: str, targets: list[str] | None, settings: list[str], force: bool = False, recipes: list[str] | None = None
+    project: Project,
+    dataset: str,
+    targets: list[str] | None,
+    settings: list[str],
+    force: bool = False,
+    recipes: list[str] | None = None,
 ) -> Survey:
     """Read everything a plan needs; every InputError there is about pipeline, settings, dataset or recipes comes from here.
 
     recipes: paths or names of those that are asked for; without any, stages over recipes have no steps
     """
-    words, pipeline = words_by_key(settings), with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings)
+    words, pipeline = (
+        words_by_key(settings),
+        with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings),
+    )
     try:
         check_values(pipeline, project.pipeline_file)
     except InputError as error:
         raise said_of_settings(error, words) from None
     for name in targets or []:
         if name not in pipeline.stages:
-            raise InputError(f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages))
+            raise InputError(
+                f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages)
+            )
     folder = project.dataset_folder(dataset)
     data = project.provider.read(folder)
     home, store = home_of(project, data.folder), Store(project.build / "store")
@@ -83,7 +102,18 @@ def survey(
         packages.save()
     outputs = Outputs(store)
     entries = {step: outputs.entry(key) for step, key in home.last_keys(warn=True).items()}
-    return Survey(project, data, home, store, spec, records, outputs, {step: e.record for step, e in entries.items() if e}, asked, words)
+    return Survey(
+        project,
+        data,
+        home,
+        store,
+        spec,
+        records,
+        outputs,
+        {step: e.record for step, e in entries.items() if e},
+        asked,
+        words,
+    )
 
 
 def _records(
@@ -93,10 +123,15 @@ def _records(
     _check_params(project, spec.pipeline, sources)
     records = {}
     for name in spec.pipeline.needed(spec.targets):
-        of_stage = _stage_record(name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages)
+        of_stage = _stage_record(
+            name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages
+        )
         values = other_than(sources.default_values(project.package, name), spec.pipeline.stages[name].values)
         of_stage |= {f"param:{param}": value for param, value in values.items()}
-        of_stage |= {f"default:{param}": text for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()}
+        of_stage |= {
+            f"default:{param}": text
+            for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()
+        }
         of_stage |= _given(name, spec.pipeline, project, hashes)
         for step in spec.steps_of(name):
             records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
@@ -121,13 +156,24 @@ def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> Non
             if param not in known:
                 where = f"stages.{name}.params.{param}"
                 cure = did_you_mean(param, known) if known else "leave it out"
-                raise InputError(f"the stage {name!r} has no parameter {param!r}", file=project.pipeline_file, key=where, cure=cure)
+                raise InputError(
+                    f"the stage {name!r} has no parameter {param!r}", file=project.pipeline_file, key=where, cure=cure
+                )
 
 
 def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Packages) -> Record:
     stage = pipeline.stages[name]
-    record = {"stage": name, "threads": stage.threads, "python": f"{sys.version_info[0]}.{sys.version_info[1]}", "makes": stage.makes}
-    return record | closure.record() | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+    record = {
+        "stage": name,
+        "threads": stage.threads,
+        "python": f"{sys.version_info[0]}.{sys.version_info[1]}",
+        "makes": stage.makes,
+    }
+    return (
+        record
+        | closure.record()
+        | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+    )
 
 
 def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) -> Record:
@@ -138,11 +184,16 @@ def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) 
         for file in files:
             try:
                 if os.path.lexists(folder / file):
-                    check_plain(folder / file, "a result", f"{name}.{param}", most_bytes=None)  # a pipe or a device would never end
+                    check_plain(
+                        folder / file, "a result", f"{name}.{param}", most_bytes=None
+                    )  # a pipe or a device would never end
                 record[f"given:{param}/{file}"] = hashes.content(folder / file)
             except (OSError, TypeError):
                 found = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"
-                key, cure = f"{name}.{param}", f"name a folder with {', '.join(files)}, such as the result of an earlier run of the stage"
+                key, cure = (
+                    f"{name}.{param}",
+                    f"name a folder with {', '.join(files)}, such as the result of an earlier run of the stage",
+                )
                 raise InputError(found, file=project.shown(folder), key=key, cure=cure) from None
     return record
 

@@ -26,7 +26,11 @@ def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool
     users = _users(homes)
     keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if everything else set()))
     entries = {key: store.entry(key) for key in keys}
-    damaged = [(store.keys / f"{key}.json", ["missing or not readable"], users.get(key, [])) for key in keys if entries[key] is None]
+    damaged = [
+        (store.keys / f"{key}.json", ["missing or not readable"], users.get(key, []))
+        for key in keys
+        if entries[key] is None
+    ]
     good = {key: entry for key, entry in entries.items() if entry}
     damaged += [_of_record(store, key, entry, users) for key, entry in good.items() if key_of(entry.record) != key]
     damaged += list(_of_trees(store, inspector, good, users))
@@ -53,7 +57,9 @@ def _of_record(store: Store, key: str, entry: Entry, users: Mapping[str, list[st
     return (store.keys / f"{key}.json", ["its record is not the one that made the key"], _name(key, entry, users))
 
 
-def _of_trees(store: Store, inspector: Inspector, entries: Mapping[str, Entry], users: Mapping[str, list[str]]) -> Iterator[Damage]:
+def _of_trees(
+    store: Store, inspector: Inspector, entries: Mapping[str, Entry], users: Mapping[str, list[str]]
+) -> Iterator[Damage]:
     """Every tree once, whichever keys gave it."""
     of_tree: dict[str, list[str]] = {}
     for key, entry in entries.items():
@@ -83,7 +89,11 @@ def _of_view(store: Store, view: Path, of_photos: Mapping[str, Entry], gather: s
     """A photo of which there is any file must be there in whole; one that failed in the last run is not."""
     found = set(stamps_of(view))
     shown = {photo: entry for photo, entry in of_photos.items() if found & entry.files.keys()}
-    trees = {name: (store.tree(entry.output) / name, hash_) for entry in shown.values() for name, hash_ in entry.files.items()}
+    trees = {
+        name: (store.tree(entry.output) / name, hash_)
+        for entry in shown.values()
+        for name, hash_ in entry.files.items()
+    }
     for name, (file, hash_) in sorted(trees.items()):
         if name not in found:
             yield f"{name}: missing"

@@ -42,7 +42,13 @@ from factorlib.stage import Inputs
 from factorlib.wholefile import replace_file
 from factorlib.yamlfile import convert
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -134,7 +140,10 @@ def run_step(task: Task, spread_over: Spread | None = None) -> Outcome:
             entry, damaged = _made(task, events, spread_over or partial(spread, task.code.cores))
             cost = meter.read(task.code.threads, task.code.cores)
             if spread_over is not None:
-                cost |= {"cpu_seconds": round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3), "spread": spread_over.spent}
+                cost |= {
+                    "cpu_seconds": round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3),
+                    "spread": spread_over.spent,
+                }
             _write_log(task, events, cost)
             _keep(task, entry)
             if task.shared:
@@ -231,7 +240,12 @@ def _made(task: Task, events: Events, map_: Callable) -> tuple[Entry, Path | Non
 
 
 def _run_main(
-    module: ModuleType, params: msgspec.Struct, inputs: Inputs, task: Task, results: dict[Path, dict[str, Stamp]], events: Events
+    module: ModuleType,
+    params: msgspec.Struct,
+    inputs: Inputs,
+    task: Task,
+    results: dict[Path, dict[str, Stamp]],
+    events: Events,
 ) -> None:
     """Where the stage fails because a file was taken away or edited while it ran, that is what is said: it is no defect of the stage."""
     try:
@@ -274,7 +288,9 @@ def _check_results_still(results: dict[Path, dict[str, Stamp]]) -> None:
         now = stamps_of(folder)
         for name in sorted(before.keys() | now.keys()):
             if before.get(name) != now.get(name):
-                raise InputError("the file changed while it was being read", file=folder / name, cure="run again: it is made again")
+                raise InputError(
+                    "the file changed while it was being read", file=folder / name, cure="run again: it is made again"
+                )
 
 
 def _check_code_still(task: Task, hashes: FileHashes) -> None:
@@ -282,7 +298,9 @@ def _check_code_still(task: Task, hashes: FileHashes) -> None:
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     if changes := closure.changes(task.record):
-        before, now = ({name: record[name] for name in changes if name in record} for record in (task.record, closure.record()))
+        before, now = (
+            {name: record[name] for name in changes if name in record} for record in (task.record, closure.record())
+        )
         files = [str(closure.files[name]) for name in changes if name in closure.files]
         found = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
         raise CodeChanged(found, file=", ".join(files) or None, cure="run again")
@@ -302,7 +320,9 @@ def _write_log(task: Task, events: Events, cost: dict) -> None:
     """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
     where = {"stage": task.code.stage, "photo": task.photo, "key": task.key}
     where |= {"recipe": task.record["recipe"]} if "recipe" in task.record else {}
-    lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [{"event": "done", **where, **cost}]
+    lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [
+        {"event": "done", **where, **cost}
+    ]
     path = Store(task.store).log(task.key)
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_file(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines).encode())

@@ -35,7 +35,9 @@ CURVED_GAIN = 0.25
 FEW = 2  # materials: with so few, several starts are tried
 STARTS = (0.15, 0.4, 0.8)  # roughness
 
-Report = Callable[[str, Fit], Callable[[float], None]]  # by what is done, and its start: what to call at every point that is tried
+Report = Callable[
+    [str, Fit], Callable[[float], None]
+]  # by what is done, and its start: what to call at every point that is tried
 
 
 class Effects(msgspec.Struct, frozen=True):
@@ -69,7 +71,11 @@ def effects_chosen(
     sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
     unjudged = problem.none_held_out  # then what is there anyway stays, and nothing further is added
     shadows = {"on": hidden, "off": False, "auto": hidden if unjudged or not hidden else None}[choices.self_shadowing]
-    bounces = {"on": True, "off": False, "auto": False if unjudged else None}[choices.interreflection] if problem.has_bounces else False
+    bounces = (
+        {"on": True, "off": False, "auto": False if unjudged else None}[choices.interreflection]
+        if problem.has_bounces
+        else False
+    )
     tried: dict[tuple[bool, bool], Trial] = {}
 
     def trial(with_shadows: bool, with_bounces: bool) -> Trial:
@@ -83,10 +89,18 @@ def effects_chosen(
             tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one.losses))
         return tried[with_shadows, with_bounces]
 
-    said = Evidence(bool(shadows)) if shadows is not None else compare(trial(False, False).losses, trial(True, False).losses, AGAINST)
+    said = (
+        Evidence(bool(shadows))
+        if shadows is not None
+        else compare(trial(False, False).losses, trial(True, False).losses, AGAINST)
+    )
     if not said.kept:
         return Effects(trial(False, False).fit, said, Evidence(False))
-    lit = Evidence(bool(bounces)) if bounces is not None else compare(trial(True, False).losses, trial(True, True).losses, FOR)
+    lit = (
+        Evidence(bool(bounces))
+        if bounces is not None
+        else compare(trial(True, False).losses, trial(True, True).losses, FOR)
+    )
     return Effects(trial(True, lit.kept).fit, said, lit)
 
 
@@ -110,13 +124,18 @@ def curves_chosen(problem: JointProblem, fit: Fit, prior: LightPrior, choices: C
     had = [len(light.log_tone) > 0 for light in lights]
     if choices.tone == "off" or problem.none_held_out:
         return Curves(fit, [Evidence(has) for has in had])
-    sample, freed = sample_of(problem, choices), [light if has else with_curves(light) for light, has in zip(lights, had, strict=True)]
+    sample, freed = (
+        sample_of(problem, choices),
+        [light if has else with_curves(light) for light, has in zip(lights, had, strict=True)],
+    )
     curved = _with_lights(fit, freed)
     curved = fitted(sample, curved, prior, CURVED, all_free(fit), report("tone curves", curved))
     before, after = losses_of(sample, fit.point), losses_of(sample, curved.point)
     evidence = []
     for k, light in enumerate(curved.point.lights):
-        one = compare(Losses([before.values[k]], [before.clusters[k]]), Losses([after.values[k]], [after.clusters[k]]), FOR)
+        one = compare(
+            Losses([before.values[k]], [before.clusters[k]]), Losses([after.values[k]], [after.clusters[k]]), FOR
+        )
         gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
         kept = one.kept and gain > CURVED_GAIN and not beyond_cameras(light)
         evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))

@@ -78,7 +78,8 @@ class Descent(msgspec.Struct, frozen=True):
         """Compute the systems of all lights at some materials; `marginal` says what `materials_given` means."""
         materials = materials_of(theta)
         fields = [
-            msgspec.structs.replace(f, illumination=msgspec.structs.replace(f.illumination, materials=materials)) for f in fields
+            msgspec.structs.replace(f, illumination=msgspec.structs.replace(f.illumination, materials=materials))
+            for f in fields
         ]
         parts = list(self.spread(lambda field: marginal(field, materials_given=materials_given), fields))
         prior, values = self.prior.at(theta), sum(3 * int((~f.illumination.block.held_out).sum()) for f in fields)
@@ -97,7 +98,11 @@ def stepped(
     H = damped(H, damping)
     for part in state.parts:
         factor = cho_factor(damped(part.light_hessian, damping), check_finite=False)
-        solution = cho_solve(factor, np.column_stack([part.cross_hessian.T, part.light_gradient, part.determinant_by_light]), check_finite=False)
+        solution = cho_solve(
+            factor,
+            np.column_stack([part.cross_hessian.T, part.light_gradient, part.determinant_by_light]),
+            check_finite=False,
+        )
         H[np.ix_(part.places, part.places)] -= part.cross_hessian @ solution[:, :-2]
         g[part.places] -= part.cross_hessian @ (solution[:, -2] + solution[:, -1])
         solutions.append(solution)
@@ -123,7 +128,9 @@ def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     brighter = np.exp(cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).T)
     exposures = np.concatenate([[0.0], exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)])
     tone = np.clip(light.log_tone + tones.clip(-MOST_TONE, MOST_TONE), *np.log(TONE))
-    return msgspec.structs.replace(light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone)
+    return msgspec.structs.replace(
+        light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone
+    )
 
 
 def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:

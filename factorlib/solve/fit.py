@@ -41,7 +41,9 @@ SURE = 0.6  # times the typical confidence of a material's normals: what is less
 DARK = 0.2  # of the noise model's absolute part is left where normals are sure
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
-LEAST_AT_START = 0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
+LEAST_AT_START = (
+    0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
+)
 
 
 class Hyperparameters(msgspec.Struct, frozen=True):
@@ -98,10 +100,14 @@ def fitted(
     given = not free.any()
     fields = list(
         problem.spread(
-            lambda one: field_of(*one, prior, given), list(zip(problem.illuminations(point), start.hyperparameters, strict=True))
+            lambda one: field_of(*one, prior, given),
+            list(zip(problem.illuminations(point), start.hyperparameters, strict=True)),
         )
     )
-    state, hyperparameters = descent.run(fields, unknowns_of(materials), np.zeros_like(free), schedule.lights), start.hyperparameters
+    state, hyperparameters = (
+        descent.run(fields, unknowns_of(materials), np.zeros_like(free), schedule.lights),
+        start.hyperparameters,
+    )
     for number, iterations in enumerate(schedule.together):
         fields = state.fields
         if number or schedule.estimate:
@@ -118,17 +124,23 @@ def _point_of(state: State, start: Materials, free: Bool[np.ndarray, "m 7"]) -> 
     return Point(Materials(rows[:, :3], rows[:, 3:6], rows[:, 6]), [field.illumination.light for field in state.fields])
 
 
-def field_of(illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False) -> Field:
+def field_of(
+    illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False
+) -> Field:
     """Give an illumination its table of responses, and say how much its observations and the prior count."""
     table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
     precision, log_determinant = prior.precision(illumination.light.axis, one.factors)
-    return Field(msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST)
+    return Field(
+        msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST
+    )
 
 
 def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
     """Return the field as other hyperparameters weight it."""
     precision, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
-    return msgspec.structs.replace(field, precision=precision, log_determinant=log_determinant, temperature=one.temperature)
+    return msgspec.structs.replace(
+        field, precision=precision, log_determinant=log_determinant, temperature=one.temperature
+    )
 
 
 def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
@@ -157,7 +169,9 @@ def above_zero(materials: Materials, free: Bool[np.ndarray, "m 7"]) -> Materials
 def sure_ones(problem: JointProblem) -> JointProblem:
     """The observations that materials are fitted to: those whose normals are sure, with less noise in the dark."""
     blocks = [block.take(sure(block)) for block in problem.blocks]
-    blocks = [block.with_noise(msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute)) for block in blocks]
+    blocks = [
+        block.with_noise(msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute)) for block in blocks
+    ]
     return msgspec.structs.replace(problem, blocks=blocks)
 
 

@@ -111,7 +111,10 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
             scores[:, at] += summing @ part.by_material
             scores[:, k + own.start : k + own.stop] += summing @ J
             scores[:, k + 3 * p :] += summing @ part.by_photo
-    loss, by_light = float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum()), np.zeros(size)
+    loss, by_light = (
+        float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum()),
+        np.zeros(size),
+    )
     value += loss / T
     if materials_given:
         return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)

@@ -35,7 +35,11 @@ from factorlib.model.components import connected_components
 from factorlib.model.materials import Materials
 
 DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
-SPECULAR, LEVEL, TINT = 0.05, 0.7, 0.15  # of (1); e^LEVEL: a factor of 2; e^TINT: 16 %, for the white balance of photos is not known better
+SPECULAR, LEVEL, TINT = (
+    0.05,
+    0.7,
+    0.15,
+)  # of (1); e^LEVEL: a factor of 2; e^TINT: 16 %, for the white balance of photos is not known better
 BRIGHTEST, BRIGHTNESS = 0.69, 0.16  # of (2)
 
 
@@ -56,7 +60,9 @@ class MaterialPrior:
         specular = (start.specular > LEAST_REFLECTANCE).any(1)
         self.mean[specular, 3:6] = np.log(SPECULAR)
         self.precision[specular, 3:6, 3:6] = np.full((3, 3), 1 / 9) / LEVEL**2 + (np.eye(3) - 1 / 3) / TINT**2
-        self.members = [list(members) for members, lights in connected_components(blocks, len(start)) if members and lights]
+        self.members = [
+            list(members) for members, lights in connected_components(blocks, len(start)) if members and lights
+        ]
 
     def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
         """At the materials' unknowns."""

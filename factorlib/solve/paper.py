@@ -92,17 +92,23 @@ def solve(
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
             point = objective.point(x)
             held_out = problem.held_out_loss(point)
-            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, paper.lobes * len(blocks)))
+            history.append(
+                Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, paper.lobes * len(blocks))
+            )
             report(history[-1])
             snapshot(history[-1], point)
     return Solution(in_gauge(objective.point(x), blocks), history, problem.loss, np.zeros(materials, bool))
 
 
-def drawn(rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator) -> list[Int[np.ndarray, " _"]]:
+def drawn(
+    rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator
+) -> list[Int[np.ndarray, " _"]]:
     """`count` of all rows, without replacement, as a list per block."""
     starts = np.cumsum([0, *map(len, rows)])
     chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
-    return [own[chosen[(chosen >= a) & (chosen < b)] - a] for own, a, b in zip(rows, starts[:-1], starts[1:], strict=True)]
+    return [
+        own[chosen[(chosen >= a) & (chosen < b)] - a] for own, a, b in zip(rows, starts[:-1], starts[1:], strict=True)
+    ]
 
 
 def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
@@ -159,7 +165,10 @@ class PaperObjective:
             reflectance = (begin.diffuse + begin.specular)[block.material].mean(0)
             weight = np.tile(block.radiance.mean(0) / np.maximum(reflectance, 1e-3), (p, 1))
             level = np.full((p, 1), _logit(_share(np.log(sharpness), np.log(SHARPNESS))))
-            parts += [np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))]).reshape(-1), np.zeros(len(block.photos) - 1)]
+            parts += [
+                np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))]).reshape(-1),
+                np.zeros(len(block.photos) - 1),
+            ]
         return torch.from_numpy(np.concatenate(parts))
 
     def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
@@ -193,7 +202,9 @@ class PaperObjective:
             for m in np.unique(block.material[rows]).tolist():
                 own = rows[block.material[rows] == m]
                 predicted = self._predicted(block, own, light, (diffuse[m], specular[m], roughness[m]))
-                difference = (predicted - torch.from_numpy(block.radiance[own])) * torch.from_numpy(block.precision[own])
+                difference = (predicted - torch.from_numpy(block.radiance[own])) * torch.from_numpy(
+                    block.precision[own]
+                )
                 satisfied = torch.from_numpy(block.clipped[own]) & (difference > 0)
                 squares = squares + (difference.masked_fill(satisfied, 0.0) ** 2).sum()
                 values += difference.numel()

@@ -9,7 +9,13 @@ from factorlib.solve.options import Choices
 from factorlib.solve.paper import REPORTS
 
 Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
-PHASES = ("no shadows", "shadows", "shadows and bounces", "tone curves", "materials and lights")  # then splittings, and lights
+PHASES = (
+    "no shadows",
+    "shadows",
+    "shadows and bounces",
+    "tone curves",
+    "materials and lights",
+)  # then splittings, and lights
 POINTS = 30  # of a phase: about as many as are tried
 
 
@@ -37,7 +43,13 @@ def of_parts(progress: Progress, choices: Choices) -> Report:
         """Say how many of all phases are done."""
         nonlocal furthest
         splitting = event.phase.removeprefix("splitting ")
-        phase = PHASES.index(event.phase) if event.phase in PHASES else len(PHASES) + int(splitting) - 1 if splitting.isdigit() else total - 1
+        phase = (
+            PHASES.index(event.phase)
+            if event.phase in PHASES
+            else len(PHASES) + int(splitting) - 1
+            if splitting.isdigit()
+            else total - 1
+        )
         within = 1.0 if event.iteration < 0 else min(event.iteration / POINTS, 1.0)
         furthest = min(max(furthest, phase + within), total - 0.01)
         progress(furthest, total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")

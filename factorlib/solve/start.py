@@ -23,7 +23,11 @@ LEAST_RADIANCE = 1e-6  # of a block's mean
 
 
 def starting_point(
-    blocks: Sequence[Block], count: int, cells: int, roughness: float = ROUGHNESS, specular_share: float = SPECULAR_SHARE
+    blocks: Sequence[Block],
+    count: int,
+    cells: int,
+    roughness: float = ROUGHNESS,
+    specular_share: float = SPECULAR_SHARE,
 ) -> Point:
     """Materials 0 … `count`−1 whose diffuse part explains median radiances, and one constant light of `cells` cells a block."""
     materials = starting_materials(blocks, count, specular_share, roughness)

@@ -56,18 +56,30 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
     for m, name in enumerate(names):
         if component[m] is not None:
             known = earlier.table.materials[name]
-            rows[m] = [*(known.diffuse * factors[component[m]]), *(known.specular * factors[component[m]]), known.roughness]
+            rows[m] = [
+                *(known.diffuse * factors[component[m]]),
+                *(known.specular * factors[component[m]]),
+                known.roughness,
+            ]
     materials, lights = Materials.of_vector(rows.reshape(-1)), []
     for block in blocks:
         constant = constant_light(block, materials, cells)
         shown = [component[m] for m in np.unique(block.material) if component[m] is not None]
-        light = known_light(block, constant, earlier, factors[max(set(shown), key=lambda c: (shown.count(c), -c))]) if shown else None
+        light = (
+            known_light(block, constant, earlier, factors[max(set(shown), key=lambda c: (shown.count(c), -c))])
+            if shown
+            else None
+        )
         lights.append(better_one(problem, block, materials, light, constant))
     return Point(materials, lights)
 
 
 def gauge_factors(
-    earlier: Earlier, names: Sequence[str], component: Sequence[int | None], albedo: Float[np.ndarray, "m 3"], blocks: Sequence[Block]
+    earlier: Earlier,
+    names: Sequence[str],
+    component: Sequence[int | None],
+    albedo: Float[np.ndarray, "m 3"],
+    blocks: Sequence[Block],
 ) -> dict[int, Float[np.ndarray, "3"]]:
     """Find, for each component of the earlier solution, the factor per channel that brings its reflectances to the scale of `albedo`.
 
@@ -105,12 +117,19 @@ def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[n
     )
 
 
-def better_one(problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light) -> Light:
+def better_one(
+    problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light
+) -> Light:
     """Return the known light, unless the constant one explains the block better."""
     if known is None:
         return constant
-    loss = [Illumination(block, one, materials, problem.operator).losses(problem.loss).mean() for one in (known, constant)]
+    loss = [
+        Illumination(block, one, materials, problem.operator).losses(problem.loss).mean() for one in (known, constant)
+    ]
     if loss[0] <= loss[1]:
         return known
-    log.warning("illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light", block.name)
+    log.warning(
+        "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light",
+        block.name,
+    )
     return constant

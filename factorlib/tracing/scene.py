@@ -53,7 +53,12 @@ def bsdf(material: Material) -> dict[str, Any]:
     lambertian = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
     if share == 0:
         return lambertian
-    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": _conductor(specular / share, material.roughness)}
+    return {
+        "type": "blendbsdf",
+        "weight": float(share),
+        "bsdf_0": lambertian,
+        "bsdf_1": _conductor(specular / share, material.roughness),
+    }
 
 
 def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
@@ -72,7 +77,9 @@ def transform(matrix: Float[np.ndarray, "4 4"]) -> Any:
     return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
 
 
-def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
     """The 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
@@ -85,7 +92,10 @@ def lobes_envmap(lobes: Lobes, height: int = LOBE_ROWS) -> dict[str, Any]:
 
 
 def shape(
-    mesh: Mesh, material: dict[str, Any], world_from_object: Float[np.ndarray, "4 4"] = np.eye(4), emitter: dict[str, Any] | None = None
+    mesh: Mesh,
+    material: dict[str, Any],
+    world_from_object: Float[np.ndarray, "4 4"] = np.eye(4),
+    emitter: dict[str, Any] | None = None,
 ) -> Any:
     """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
     with TemporaryDirectory() as folder:
@@ -96,7 +106,11 @@ def shape(
 
 
 def sensor(
-    camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], columns: slice = slice(None), near: float = 1e-3, alpha: bool = False
+    camera: Camera,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    columns: slice = slice(None),
+    near: float = 1e-3,
+    alpha: bool = False,
 ) -> dict[str, Any]:
     """The pinhole camera, of whose image some columns are taken.
 
@@ -105,7 +119,10 @@ def sensor(
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
     (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
-    offset = {"principal_point_offset_x": (w / 2 - cx) / w, "principal_point_offset_y": (h / 2 - cy) / h}  # as its pictures, not its x axis
+    offset = {
+        "principal_point_offset_x": (w / 2 - cx) / w,
+        "principal_point_offset_y": (h / 2 - cy) / h,
+    }  # as its pictures, not its x axis
     return {
         "type": "perspective",
         "fov_axis": "x",
@@ -127,7 +144,12 @@ def sensor(
 
 
 def traced(
-    entries: dict[str, Any], camera: Camera, world_from_camera: Float[np.ndarray, "4 4"], spp: int, seed: int, max_depth: int
+    entries: dict[str, Any],
+    camera: Camera,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    spp: int,
+    seed: int,
+    max_depth: int,
 ) -> Float[np.ndarray, "h w 3"]:
     """Radiance of a scene, by a camera at world_from_camera; as `rendered`."""
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
@@ -144,7 +166,10 @@ def rendered(
     """
     mi = mitsuba()
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
-    loaded = {name: mi.load_dict(entry, parallel=False) if isinstance(entry, dict) else entry for name, entry in entries.items()}
+    loaded = {
+        name: mi.load_dict(entry, parallel=False) if isinstance(entry, dict) else entry
+        for name, entry in entries.items()
+    }
     integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
@@ -165,7 +190,12 @@ def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> d
 
 
 def light_seen(
-    entries: dict[str, Any], world_from_light: Float[np.ndarray, "4 4"], height: int, spp: int, seed: int, max_depth: int = -1
+    entries: dict[str, Any],
+    world_from_light: Float[np.ndarray, "4 4"],
+    height: int,
+    spp: int,
+    seed: int,
+    max_depth: int = -1,
 ) -> Float[np.ndarray, "h w 3"]:
     """The radiance that arrives at the origin of the light frame (y-up), a lat-long map of [height, 2·height].
 
@@ -190,7 +220,9 @@ def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
 
 def _texel_means(faces: dict[str, np.ndarray], height: int, finer: int = 8) -> Float[np.ndarray, "h w 3"]:
     directions = lat_long_directions(finer * height, finer * 2 * height)
-    weight = np.broadcast_to(lat_long_solid_angles(finer * height, finer * 2 * height)[:, None, None], (*directions.shape[:2], 1))
+    weight = np.broadcast_to(
+        lat_long_solid_angles(finer * height, finer * 2 * height)[:, None, None], (*directions.shape[:2], 1)
+    )
     values = looked_up(faces, directions) * weight
 
     def cells(array: np.ndarray) -> np.ndarray:

@@ -45,7 +45,9 @@ def _fastest() -> str:
         if library and _runs(library):
             os.environ[LIBRARY] = library
             return "llvm_ad_rgb"
-    log.warning("no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19): rendering with scalar_rgb, about 3 times slower")
+    log.warning(
+        "no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19): rendering with scalar_rgb, about 3 times slower"
+    )
     return "scalar_rgb"
 
 
@@ -64,7 +66,10 @@ def _version(library: Path) -> int:
 def _runs(library: str) -> bool:
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE], env={**os.environ, LIBRARY: library}, capture_output=True, timeout=PROBE_SECONDS
+            [sys.executable, "-c", PROBE],
+            env={**os.environ, LIBRARY: library},
+            capture_output=True,
+            timeout=PROBE_SECONDS,
         )
     except subprocess.TimeoutExpired:
         return False

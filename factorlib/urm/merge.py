@@ -33,7 +33,15 @@ def merge(observations: Observations, degrees: float) -> Observations:
     cell = np.radians(degrees)
     mirror = mirror_directions(observations.normal, observations.view)
     flags = observations.clipped @ np.array([1, 2, 4])
-    keys = np.column_stack([observations.photo, observations.material, flags, direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)])
+    keys = np.column_stack(
+        [
+            observations.photo,
+            observations.material,
+            flags,
+            direction_cells(observations.normal, cell),
+            direction_cells(mirror, 2 * cell),
+        ]
+    )
     if observations.visibility is not None:
         keys = np.column_stack([keys, _hidden_cells(observations.visibility)])
     return _merged(observations, *groups(keys))
@@ -66,9 +74,13 @@ def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int
         weight=total.astype("f4"),
         **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
         **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
-        visibility=None if observations.visibility is None else _mean_visibility(observations.visibility, weight / total[group], group),
+        visibility=None
+        if observations.visibility is None
+        else _mean_visibility(observations.visibility, weight / total[group], group),
         met=kept.met,
-        confidence=None if observations.confidence is None else (np.bincount(group, weight * observations.confidence) / total).astype("f4"),
+        confidence=None
+        if observations.confidence is None
+        else (np.bincount(group, weight * observations.confidence) / total).astype("f4"),
     )
 
 

@@ -39,7 +39,12 @@ MET = (
 )
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
-    "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo", "x": "pixels", "y": "pixels", "weight": "pixels"},
+    "units": {
+        "radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo",
+        "x": "pixels",
+        "y": "pixels",
+        "weight": "pixels",
+    },
 }
 
 
@@ -60,7 +65,9 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides directions (geometry.met); with `visibility` alone
+    met: UInt16[np.ndarray, "n k"] | None = (
+        None  # codes of what hides directions (geometry.met); with `visibility` alone
+    )
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
 
@@ -74,7 +81,9 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        further = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in (*WIDE, *OPTIONAL)}
+        further = {
+            name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in (*WIDE, *OPTIONAL)
+        }
         return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, **further)
 
 
@@ -95,7 +104,11 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         values = np.ascontiguousarray(getattr(observations, name), dtype=dtype)
         flat = pa.array(values.reshape(-1))
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
-    names = {"materials": observations.materials, "photos": observations.photos, "illuminations": observations.illuminations}
+    names = {
+        "materials": observations.materials,
+        "photos": observations.photos,
+        "illuminations": observations.illuminations,
+    }
     about = {**UNITS, **names}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
@@ -111,9 +124,13 @@ def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
     parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
-        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in (*COLUMNS, *OPTIONAL) if name in parts}
+        columns = {
+            name: _array(parts[name], DTYPES[name], name in VECTORS) for name in (*COLUMNS, *OPTIONAL) if name in parts
+        }
         columns |= {name: _of_bytes(parts[name], dtype) for name, dtype in WIDE.items() if name in parts}
-        named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")}
+        named = {
+            kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")
+        }
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**columns, **named, exposures=exposures)
         _check(observations)
@@ -122,13 +139,20 @@ def read_observations(path: str | Path) -> Observations:
 
 def _check(observations: Observations) -> None:
     """Raise ValueError for a number that names nothing; what is not finite, or weighs nothing, the solve leaves out and counts."""
-    for name, known in (("material", observations.materials), ("photo", observations.photos), ("illumination", observations.illuminations)):
+    for name, known in (
+        ("material", observations.materials),
+        ("photo", observations.photos),
+        ("illumination", observations.illuminations),
+    ):
         index = getattr(observations, name)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
     if observations.exposures and len(observations.exposures) != len(observations.photos):
         raise ValueError("its exposures are not one a photo")
-    if observations.confidence is not None and not ((observations.confidence >= 0) & (observations.confidence <= 1)).all():
+    if (
+        observations.confidence is not None
+        and not ((observations.confidence >= 0) & (observations.confidence <= 1)).all()
+    ):
         raise ValueError("column 'confidence' is not between 0 and 1")
     if observations.met is not None:
         if observations.visibility is None or observations.visibility.shape != observations.met.shape:
@@ -143,8 +167,12 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     parts = sorted(parts, key=lambda part: part.photos)
     materials = parts[0].materials
     if any(part.materials != materials for part in parts):
-        raise InputError("reflectance maps of different material lists", cure="run the stage `urm` again for all photos")
-    names = {kind: tuple(sorted({n for part in parts for n in getattr(part, kind)})) for kind in ("photos", "illuminations")}
+        raise InputError(
+            "reflectance maps of different material lists", cure="run the stage `urm` again for all photos"
+        )
+    names = {
+        kind: tuple(sorted({n for part in parts for n in getattr(part, kind)})) for kind in ("photos", "illuminations")
+    }
     columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
@@ -152,20 +180,29 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     columns |= {name: _of_all(parts, name) for name in WIDE}
     if any(part.confidence is not None for part in parts):
-        columns["confidence"] = np.concatenate([np.ones(len(p), "f4") if p.confidence is None else p.confidence for p in parts])
-    return Observations(**columns, materials=materials, **names, exposures=tuple(exposures.get(p) for p in names["photos"]))
+        columns["confidence"] = np.concatenate(
+            [np.ones(len(p), "f4") if p.confidence is None else p.confidence for p in parts]
+        )
+    return Observations(
+        **columns, materials=materials, **names, exposures=tuple(exposures.get(p) for p in names["photos"])
+    )
 
 
 def _of_all(parts: Sequence[Observations], name: str) -> np.ndarray | None:
     """`visibility` or `met` of all parts; those without see everything."""
     counts = {getattr(part, name).shape[1] for part in parts if getattr(part, name) is not None}
     if len(counts) > 1:
-        raise InputError(f"reflectance maps whose {name} has {sorted(counts)} directions", cure="run the stage `urm` again for all photos")
+        raise InputError(
+            f"reflectance maps whose {name} has {sorted(counts)} directions",
+            cure="run the stage `urm` again for all photos",
+        )
     if not counts:
         return None
     (k,) = counts
     given = [getattr(part, name) for part in parts]
-    return np.concatenate([np.full((len(part), k), NOTHING[name], WIDE[name]) if own is None else own for part, own in zip(parts, given)])
+    return np.concatenate(
+        [np.full((len(part), k), NOTHING[name], WIDE[name]) if own is None else own for part, own in zip(parts, given)]
+    )
 
 
 def _renumber(index: np.ndarray, old: Sequence[str], new: Sequence[str]) -> np.ndarray:

@@ -73,5 +73,3 @@ def evenly_spread(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) ->
     rank = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
     total, wanted = np.repeat(size, size), np.repeat(count, size)
     return np.sort(order[(rank + 1) * wanted // total > rank * wanted // total])
-
-

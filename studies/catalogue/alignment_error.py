@@ -52,13 +52,23 @@ def settings(scale: Scale) -> list[Setting]:
 
 def _setting(scale: Scale, x: int, perturbation: str, arm: str) -> Setting:
     (of_perturbation, perturbed), (of_arm, how) = PERTURBATIONS[perturbation], ARMS[arm]
-    return setting(scale, f"{perturbation}-{arm}", of_perturbation + of_arm, x, full_matrix(scale.side, scale.side), perturbation=perturbed, **how)
+    return setting(
+        scale,
+        f"{perturbation}-{arm}",
+        of_perturbation + of_arm,
+        x,
+        full_matrix(scale.side, scale.side),
+        perturbation=perturbed,
+        **how,
+    )
 
 
 def claims(scale: Scale) -> list[Claim]:
     """What raises the error, and what helps against it; of settings that this scale has."""
     costly = [_costly(perturbation) for perturbation in ("turned-5", "turned-20", "shifted", "larger", "coarse")]
-    refined = [_helps("outline", perturbation, "fitting the outline") for perturbation in ("turned-5", "turned-20", "larger")]
+    refined = [
+        _helps("outline", perturbation, "fitting the outline") for perturbation in ("turned-5", "turned-20", "larger")
+    ]
     robust = [_matters("squares", "turned-20", "the robust loss")]
     sure = [_matters("even", perturbation, "knowing how sure normals are") for perturbation in ("turned-5", "coarse")]
     known = {one.name for one in settings(scale)}
@@ -66,7 +76,9 @@ def claims(scale: Scale) -> list[Claim]:
 
 
 def _costly(perturbation: str) -> Claim:
-    return Claim("entries", "exact-as-it-is", f"{perturbation}-as-it-is", f"“{PERTURBATIONS[perturbation][0]}” raises the error")
+    return Claim(
+        "entries", "exact-as-it-is", f"{perturbation}-as-it-is", f"“{PERTURBATIONS[perturbation][0]}” raises the error"
+    )
 
 
 def _helps(arm: str, perturbation: str, what: str) -> Claim:
@@ -78,7 +90,9 @@ def _matters(arm: str, perturbation: str, what: str) -> Claim:
 
 
 def _better(lower: str, higher: str, perturbation: str, what: str) -> Claim:
-    return Claim("entries", lower, higher, f"{what} helps where objects are {PERTURBATIONS[perturbation][0]}", paper=False)
+    return Claim(
+        "entries", lower, higher, f"{what} helps where objects are {PERTURBATIONS[perturbation][0]}", paper=False
+    )
 
 
 STUDY = Study(

@@ -36,9 +36,19 @@ def _setting(scale: Scale, x: int, method: Method) -> Setting:
 
 def claims(scale: Scale) -> list[Claim]:
     """The joint solve against each of the others."""
-    what = {"novel_view": "new views", "novel_light": "pictures in new light", "novel_material": "pictures of new materials"}
+    what = {
+        "novel_view": "new views",
+        "novel_light": "pictures in new light",
+        "novel_material": "pictures of new materials",
+    }
     return [
-        Claim(measure, "ours", method, f"{words} are predicted better than by {_named(method)}", paper=method in IN_THE_PAPER and measure in OF_THE_PAPER)
+        Claim(
+            measure,
+            "ours",
+            method,
+            f"{words} are predicted better than by {_named(method)}",
+            paper=method in IN_THE_PAPER and measure in OF_THE_PAPER,
+        )
         for measure, words in what.items()
         for method in LABELS
         if method != "ours" and not (measure == "novel_material" and method == "projective")
@@ -46,7 +56,12 @@ def claims(scale: Scale) -> list[Claim]:
 
 
 def _named(method: Method) -> str:
-    return {"mitsuba": "Mitsuba", "intrinsic": "the intrinsic decomposition", "projective": "projective texturing", "grey": "a grey ball"}[method]
+    return {
+        "mitsuba": "Mitsuba",
+        "intrinsic": "the intrinsic decomposition",
+        "projective": "projective texturing",
+        "grey": "a grey ball",
+    }[method]
 
 
 STUDY = Study(

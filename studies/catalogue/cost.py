@@ -19,15 +19,29 @@ def settings(scale: Scale) -> list[Setting]:
     """By entries; then as the solve is by default."""
     short, default = SIDES[scale.name], BY_DEFAULT[scale.name]
     return [
-        *(Setting(f"{n * n}", f"6 lobes, {n * n:,}", x, lambda seed, n=n: Sized(seed, n, SHORT)) for x, n in enumerate(short)),
-        *(Setting(f"default-{n * n}", f"by default, {n * n:,}", len(short) + x, lambda seed, n=n: Sized(seed, n)) for x, n in enumerate(default)),
+        *(
+            Setting(f"{n * n}", f"6 lobes, {n * n:,}", x, lambda seed, n=n: Sized(seed, n, SHORT))
+            for x, n in enumerate(short)
+        ),
+        *(
+            Setting(f"default-{n * n}", f"by default, {n * n:,}", len(short) + x, lambda seed, n=n: Sized(seed, n))
+            for x, n in enumerate(default)
+        ),
     ]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """Whether an entry of the largest costs less or more; the exponents are notes (`studies.steps.cost.conclude`)."""
     least, most = (SIDES[scale.name][k] ** 2 for k in (0, -1))
-    return [Claim("seconds_an_entry", f"{most}", f"{least}", f"an entry of {most:,} costs less than one of {least}", paper=False)]
+    return [
+        Claim(
+            "seconds_an_entry",
+            f"{most}",
+            f"{least}",
+            f"an entry of {most:,} costs less than one of {least}",
+            paper=False,
+        )
+    ]
 
 
 STUDY = Study(

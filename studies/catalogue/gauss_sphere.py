@@ -24,12 +24,28 @@ def claims(scale: Scale) -> list[Claim]:
     sphere = scale.square
     nine = "faces-9"
     return [
-        Claim("new_light", nine, Guess(nine), "materials of nine faces are predicted in every light better than by a guess of mean colours"),
-        Claim("entries", nine, Guess(nine), "all entries are predicted from nine faces better than by a guess of mean colours"),
+        Claim(
+            "new_light",
+            nine,
+            Guess(nine),
+            "materials of nine faces are predicted in every light better than by a guess of mean colours",
+        ),
+        Claim(
+            "entries",
+            nine,
+            Guess(nine),
+            "all entries are predicted from nine faces better than by a guess of mean colours",
+        ),
         Claim("new_light", nine, "faces-1", "nine faces tell more of materials than one"),
         Claim("new_light", sphere, nine, "a sphere tells more than nine faces", paper=False),
         Claim("roughness", sphere, "faces-1", "roughness is known better of a sphere than of one face", paper=False),
-        Claim("stated_roughness", sphere, "faces-1", "the solve states a smaller error of roughness for a sphere than for one face", paper=False),
+        Claim(
+            "stated_roughness",
+            sphere,
+            "faces-1",
+            "the solve states a smaller error of roughness for a sphere than for one face",
+            paper=False,
+        ),
     ]
 
 

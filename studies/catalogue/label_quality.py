@@ -27,12 +27,25 @@ def claims(scale: Scale) -> list[Claim]:
     at = {0: none} | {d: f"normals-{d}deg" for d in degrees}
     *_, low, mid, most = at
     return [
-        Claim("entries", none, f"normals-{degrees[0]}deg", f"noise of {degrees[0]}° on normals raises the error", paper=False),
+        Claim(
+            "entries",
+            none,
+            f"normals-{degrees[0]}deg",
+            f"noise of {degrees[0]}° on normals raises the error",
+            paper=False,
+        ),
         Claim("entries", none, f"normals-{degrees[-1]}deg", f"noise of {degrees[-1]}° on normals raises the error"),
         Claim("entries", at[mid], at[most], f"{most}° is worse than {mid}°", paper=False),
-        Claim("entries", Rise(at[mid], at[most], most - mid), Rise(at[low], at[mid], mid - low), f"the error rises less per degree beyond {mid}°"),
+        Claim(
+            "entries",
+            Rise(at[mid], at[most], most - mid),
+            Rise(at[low], at[mid], mid - low),
+            f"the error rises less per degree beyond {mid}°",
+        ),
         Claim("entries", none, f"labels-{shares[0]}pc", f"{shares[0]} % of wrong labels raise the error", paper=False),
-        Claim("entries", none, f"labels-{shares[-1]}pc", f"{shares[-1]} % of wrong labels raise the error", paper=False),
+        Claim(
+            "entries", none, f"labels-{shares[-1]}pc", f"{shares[-1]} % of wrong labels raise the error", paper=False
+        ),
     ]
 
 

@@ -39,9 +39,20 @@ def spread(scale: Scale) -> tuple[int, ...]:
 def claims(scale: Scale) -> list[Claim]:
     """Better than without light; worse than with the chair."""
     return [
-        Claim("chair", "chair-left-out", "chair-flat", "a chair that was left out is predicted better than by a flat colour"),
+        Claim(
+            "chair",
+            "chair-left-out",
+            "chair-flat",
+            "a chair that was left out is predicted better than by a flat colour",
+        ),
         Claim("chair_scaled", "chair-left-out", "chair-flat", "the same with brightness and tint given", paper=False),
-        Claim("chair", "chair-observed", "chair-left-out", "a chair that was observed is shown better than one that was left out", paper=False),
+        Claim(
+            "chair",
+            "chair-observed",
+            "chair-left-out",
+            "a chair that was observed is shown better than one that was left out",
+            paper=False,
+        ),
     ]
 
 

@@ -20,7 +20,10 @@ def claims(scale: Scale) -> list[Claim]:
     n = scale.largest
     measures = (("first_material", "material 0"), ("first_light", "light 0"))
     against_one = [Claim(m, f"{n}x{n}", "1x1", f"error falls from 1 × 1 to {n} × {n} ({what})") for m, what in measures]
-    against_less = [Claim(m, f"{n}x{n}", f"{n - 1}x{n - 1}", f"it still falls from {n - 1} × {n - 1} ({what})", paper=False) for m, what in measures]
+    against_less = [
+        Claim(m, f"{n}x{n}", f"{n - 1}x{n - 1}", f"it still falls from {n - 1} × {n - 1} ({what})", paper=False)
+        for m, what in measures
+    ]
     return against_one + against_less
 
 

@@ -36,7 +36,13 @@ def claims(scale: Scale) -> list[Claim]:
     last = len(BANDS[scale.name]) - 2
     ends = ((0, "smoothest"), (last, "roughest"))
     return [
-        Claim(measure, _name("network", k), _name(other, k), f"the network is nearer than {words} for the {band} ({of})", paper=False)
+        Claim(
+            measure,
+            _name("network", k),
+            _name(other, k),
+            f"the network is nearer than {words} for the {band} ({of})",
+            paper=False,
+        )
         for k, band in ends
         for other, words in (("closed_form", "the closed form"), ("paper_network", "the paper's networks"))
         for measure, of in (("error_median", "median error"), ("rendering", "sphere"))

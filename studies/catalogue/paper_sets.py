@@ -60,10 +60,35 @@ def claims(scale: Scale) -> list[Claim]:
     sets = (("docksta", "unobserved", "entries of Docksta's pattern that were not observed"), ("lapd", "entries", "entries of LAPD's pattern"),
             ("photos", "entries", "entries of all photos"))  # fmt: skip
     return [
-        *(Claim(measure, f"set-{name}", Guess(f"set-{name}"), f"{words} are predicted better than by a guess of mean colours") for name, measure, words in sets),
-        Claim("unobserved", "set-docksta", "set-docksta-unlinked", "the linking chair helps to predict what was not observed"),
-        Claim("observed", "set-docksta", "set-docksta-unlinked", "the linking chair helps with what was observed", paper=False),
-        Claim("entries", "set-photos", "set-docksta", "the full matrix is predicted better than the linked one", paper=False),
+        *(
+            Claim(
+                measure,
+                f"set-{name}",
+                Guess(f"set-{name}"),
+                f"{words} are predicted better than by a guess of mean colours",
+            )
+            for name, measure, words in sets
+        ),
+        Claim(
+            "unobserved",
+            "set-docksta",
+            "set-docksta-unlinked",
+            "the linking chair helps to predict what was not observed",
+        ),
+        Claim(
+            "observed",
+            "set-docksta",
+            "set-docksta-unlinked",
+            "the linking chair helps with what was observed",
+            paper=False,
+        ),
+        Claim(
+            "entries",
+            "set-photos",
+            "set-docksta",
+            "the full matrix is predicted better than the linked one",
+            paper=False,
+        ),
     ]
 
 

@@ -14,21 +14,37 @@ from studies.core.part import PARTS, Part
 from studies.core.study import Claim, Scale, Setting, Study
 
 QUICK = ("as-it-is", "bounce", "robust")
-WORTH = {"shadows": "shadows", "bounce": "bounces", "normals": "confidences of normals", "robust": "pseudo-Huber residuals"}
+WORTH = {
+    "shadows": "shadows",
+    "bounce": "bounces",
+    "normals": "confidences of normals",
+    "robust": "pseudo-Huber residuals",
+}
 FURTHER = {"clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
-DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}  # measure -> what parts may do
+DO = {
+    "unseen": "explain unseen observations better",
+    "diffuse": "make k_d truer",
+    "glossy": "make lights truer",
+}  # measure -> what parts may do
 
 
 def settings(scale: Scale) -> list[Setting]:
     """As it is, then without each part."""
     names = QUICK if scale.name == "quick" else tuple(PARTS)
-    return [Setting(name, PARTS[name][0], x, lambda seed, name=name: Part(seed, name, scale.solve)) for x, name in enumerate(names)]
+    return [
+        Setting(name, PARTS[name][0], x, lambda seed, name=name: Part(seed, name, scale.solve))
+        for x, name in enumerate(names)
+    ]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """Unseen cells, materials and lights with each part against without it."""
     parts = {name: words for name, words in (WORTH | FURTHER).items() if scale.name == "full" or name in QUICK}
-    return [Claim(measure, "as-it-is", name, f"{words} {does}", paper=False) for measure, does in DO.items() for name, words in parts.items()]
+    return [
+        Claim(measure, "as-it-is", name, f"{words} {does}", paper=False)
+        for measure, does in DO.items()
+        for name, words in parts.items()
+    ]
 
 
 STUDY = Study(

@@ -26,13 +26,38 @@ def _setting(scale: Scale, x: int, n: int, start: str) -> Setting:
 def claims(scale: Scale) -> list[Claim]:
     """All photos against one and against one less; warm against from nothing."""
     n = scale.largest
-    measures = (("new_light", "re-rendering"), ("diffuse", "k_d"), ("roughness", "roughness"), ("first_light", "light 0"))
+    measures = (
+        ("new_light", "re-rendering"),
+        ("diffuse", "k_d"),
+        ("roughness", "roughness"),
+        ("first_light", "light 0"),
+    )
     return [
         *(Claim(m, f"photos-{n}", "photos-1", f"{n} photos are better than one ({what})") for m, what in measures),
-        Claim("new_light", f"photos-{n}", f"photos-{n - 1}", f"the last of {n} photos still improves re-rendering", paper=False),
-        Claim("seconds", f"photos-{n}-warm", f"photos-{n}", "a warm start takes less time than a start from nothing", paper=False),
-        Claim("new_light", f"photos-{n}-warm", f"photos-{n}", "a warm start is better than one from nothing", paper=False),
-        Claim("new_light", f"photos-{n}", f"photos-{n}-warm", "a start from nothing is better than a warm one", paper=False),
+        Claim(
+            "new_light",
+            f"photos-{n}",
+            f"photos-{n - 1}",
+            f"the last of {n} photos still improves re-rendering",
+            paper=False,
+        ),
+        Claim(
+            "seconds",
+            f"photos-{n}-warm",
+            f"photos-{n}",
+            "a warm start takes less time than a start from nothing",
+            paper=False,
+        ),
+        Claim(
+            "new_light", f"photos-{n}-warm", f"photos-{n}", "a warm start is better than one from nothing", paper=False
+        ),
+        Claim(
+            "new_light",
+            f"photos-{n}",
+            f"photos-{n}-warm",
+            "a start from nothing is better than a warm one",
+            paper=False,
+        ),
     ]
 
 

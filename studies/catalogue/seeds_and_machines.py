@@ -24,13 +24,20 @@ def settings(scale: Scale) -> list[Setting]:
     """Instructions as they are with seeds of two runs, then others with the seeds of the first."""
     if scale.name == "quick":
         return [_setting(scale, "fixed", 0, 0, "as it is")]
-    rows = (("fixed", 0, "seeds 0 to 4"), ("fixed", 5, "seeds 5 to 9"), ("all", 0, "all instructions"), ("least", 0, "without AVX2"))
+    rows = (
+        ("fixed", 0, "seeds 0 to 4"),
+        ("fixed", 5, "seeds 5 to 9"),
+        ("all", 0, "all instructions"),
+        ("least", 0, "without AVX2"),
+    )
     return [_setting(scale, instructions, first, x, label) for x, (instructions, first, label) in enumerate(rows)]
 
 
 def _setting(scale: Scale, instructions: str, first: int, x: int, label: str) -> Setting:
     data = hash_of_data()
-    return Setting(f"{instructions}-{first}", label, x, lambda seed: Machine(first + seed, instructions, data, scale.solve))
+    return Setting(
+        f"{instructions}-{first}", label, x, lambda seed: Machine(first + seed, instructions, data, scale.solve)
+    )
 
 
 def claims(scale: Scale) -> list[Claim]:

@@ -46,7 +46,9 @@ def claims(scale: Scale) -> list[Claim]:
         return own
     return [
         *own,
-        Claim("seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster", paper=False),
+        Claim(
+            "seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster", paper=False
+        ),
         Claim("entries", "lobes", "closed-form", "the network predicts better than the closed form", paper=False),
         Claim("entries", "merge-0", "lobes", "merging observations costs accuracy", paper=False),
         Claim("seconds", "lobes", "merge-0", "merging observations saves time", paper=False),

@@ -87,8 +87,16 @@ def claims(scale: Scale) -> list[Claim]:
     return [
         Claim("unobserved", f"link-{n}", f"diagonal-{n}", "a linking material helps unconnected pairs", paper=False),
         Claim("unobserved", f"loop-{n}", f"diagonal-{n}", "a loop helps unconnected pairs", paper=False),
-        Claim("unobserved", f"link-{n}", f"star-{n}", "the diagonal is worth more than a second arm of the star", paper=False),
-        Claim("unobserved", f"star-{n}", f"random-{n}", "a star is worth more than as many entries at random", paper=False),
+        Claim(
+            "unobserved",
+            f"link-{n}",
+            f"star-{n}",
+            "the diagonal is worth more than a second arm of the star",
+            paper=False,
+        ),
+        Claim(
+            "unobserved", f"star-{n}", f"random-{n}", "a star is worth more than as many entries at random", paper=False
+        ),
         Claim("new_light", f"{n}x{n}", f"loop-{n}", "all entries are worth more than a loop", paper=False),
     ]
 

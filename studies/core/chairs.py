@@ -74,12 +74,17 @@ def kept(answer: Answer) -> float:
 def _of_materials(dataset: Dataset, answer: Answer, splits: Sequence[Split]) -> Score:
     seen = {answer.names[m] for split in splits for m in np.unique(split.seen.material)}
     of = answer.solution.point.materials
-    rows = {n: Reflectance(tuple(of.diffuse[k].tolist()), tuple(of.specular[k].tolist()), float(of.roughness[k])) for k, n in enumerate(answer.names)}
+    rows = {
+        n: Reflectance(tuple(of.diffuse[k].tolist()), tuple(of.specular[k].tolist()), float(of.roughness[k]))
+        for k, n in enumerate(answer.names)
+    }
     truths = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in dataset.truth.materials.items()}
     return material_errors({n: rows[n] for n in sorted(seen)}, truths, dict.fromkeys(seen, 0))
 
 
 def _of_lights(dataset: Dataset, answer: Answer) -> Score:
     found = {name: light_of_lat_long(map_of(lobes)) for name, lobes in answer.lights().items()}
-    truths: dict[str, Light] = {name: light_of_lat_long(read_rgb_exr(dataset.folder / dataset.truth.illumination[name])) for name in found}
+    truths: dict[str, Light] = {
+        name: light_of_lat_long(read_rgb_exr(dataset.folder / dataset.truth.illumination[name])) for name in found
+    }
     return light_errors(found, truths, GAUGE, ("glossy", "mirror"))

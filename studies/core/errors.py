@@ -14,7 +14,10 @@ PARTS = ("diffuse", "specular", "roughness")
 
 
 def material_errors(
-    found: Mapping[str, Reflectance], truths: Mapping[str, Reflectance], component: Mapping[str, int], parts: Sequence[str] = PARTS
+    found: Mapping[str, Reflectance],
+    truths: Mapping[str, Reflectance],
+    component: Mapping[str, int],
+    parts: Sequence[str] = PARTS,
 ) -> Score:
     """Means over materials, one factor per channel and component taken out; the null is grey.
 
@@ -32,4 +35,6 @@ def light_errors(
     gauge: of `factorlib.evaluate.gauge`
     """
     errors = compare_lights(found, truths, {}).mean[gauge]
-    return Score(*({sphere: getattr(errors[sphere], which).rmse for sphere in spheres} for which in ("estimate", "null")))
+    return Score(
+        *({sphere: getattr(errors[sphere], which).rmse for sphere in spheres} for which in ("estimate", "null"))
+    )

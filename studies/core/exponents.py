@@ -9,7 +9,10 @@ import numpy as np
 from studies.core.statistics import spread
 from studies.core.table import Spread
 
-LINEAR = (0.9, 1.1)  # an interval within it is called linear: from 9 entries to 1,600 the cost is then within a factor 1.7 of proportion
+LINEAR = (
+    0.9,
+    1.1,
+)  # an interval within it is called linear: from 9 entries to 1,600 the cost is then within a factor 1.7 of proportion
 
 
 def exponent(costs: Mapping[float, float]) -> float:

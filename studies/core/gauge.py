@@ -48,5 +48,8 @@ def in_true_gauge(
     of_light = {li: factor[component[case.names_in(li)[0]]] for li in case.lights}
     return Answer(
         {n: times(table[n], factor[component[n]]) for n in case.material_names},
-        {li: Light(tuple((level / of_light[li]).astype(np.float32) for level in lights[li].levels)) for li in case.lights},
+        {
+            li: Light(tuple((level / of_light[li]).astype(np.float32) for level in lights[li].levels))
+            for li in case.lights
+        },
     )

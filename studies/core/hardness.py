@@ -29,7 +29,11 @@ def operator(case: Hard) -> dict[str, float]:
 
     float32, float64 = ({f"network {d}": made("network", d)} for d in ("float32", "float64"))
     found = measures(pairs_of(case.case), float32, float32 | float64, with_reference=True)["network float32"]
-    return {"value_error": found["value"], "gradient_rounding": found["gradient_rounding"], "not_finite": not found["finite"]}
+    return {
+        "value_error": found["value"],
+        "gradient_rounding": found["gradient_rounding"],
+        "not_finite": not found["finite"],
+    }
 
 
 def solve(case: Hard) -> dict[str, float]:
@@ -40,7 +44,9 @@ def solve(case: Hard) -> dict[str, float]:
     errors = {error: getattr(answer, error) for error in ("k", "roughness", "radiance")}
     bounded = {error: value for error, value in errors.items() if getattr(bound, error) is not None}
     shares = [value / getattr(bound, error) for error, value in bounded.items()]
-    return {f"hard_{error}": value for error, value in bounded.items() if np.isfinite(value)} | {"of_bound": max(shares)}
+    return {f"hard_{error}": value for error, value in bounded.items() if np.isfinite(value)} | {
+        "of_bound": max(shares)
+    }
 
 
 def align(case: Hard) -> dict[str, float]:
@@ -54,5 +60,8 @@ def align(case: Hard) -> dict[str, float]:
     wrong = [row for row in rows if not (can_be_right and row["right"])]
     found = {"undoubted": np.mean([float(row in wrong and not row["doubts"]) for row in rows])}
     if can_be_right:
-        found |= {"wrong_poses": len(wrong) / len(rows), "normal_error": np.median([row["normal_error_deg"] for row in rows])}
+        found |= {
+            "wrong_poses": len(wrong) / len(rows),
+            "normal_error": np.median([row["normal_error_deg"] for row in rows]),
+        }
     return found

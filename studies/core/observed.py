@@ -26,7 +26,9 @@ STEEPEST = 0.25  # n·o of the faces that are seen at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
 
 
-def observations_of(case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]) -> dict[str, Observations]:
+def observations_of(
+    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+) -> dict[str, Observations]:
     """One photo a light, by name."""
     return {light_name(light): _photo(case, light, list(materials.values()), lights[light]) for light in case.lights}
 
@@ -38,7 +40,9 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
     for m, sphere in zip(shown, radiance, strict=True):
         sphere *= 1 + NOISE * _random(case, number, m, "noise").standard_normal(sphere.shape)
     n, names, photo = radiance.shape[0] * radiance.shape[1], tuple(case.material_names), (light_name(number),)
-    seen = np.concatenate([tilted(in_camera(normals), case.normal_deg, _random(case, number, m, "normals")) for m in shown])
+    seen = np.concatenate(
+        [tilted(in_camera(normals), case.normal_deg, _random(case, number, m, "normals")) for m in shown]
+    )
     labels = [mislabelled(len(normals), case.materials.index(m), [case.materials.index(s) for s in shown], case.wrong_labels,
                           _random(case, number, m, "labels")) for m in shown]  # fmt: skip
     zero = np.zeros(n, int)
@@ -62,7 +66,9 @@ def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Gen
     return np.where((turned @ FRONT > GRAZING)[:, None], turned, normals)
 
 
-def mislabelled(n: int, label: int, shown: Sequence[int], share: float, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+def mislabelled(
+    n: int, label: int, shown: Sequence[int], share: float, rng: np.random.Generator
+) -> Int[np.ndarray, " n"]:
     """The label of each pixel: for `share` of them another one of `shown`, where there is any."""
     others = [other for other in shown if other != label]
     wrong = rng.random(n) < share

@@ -1,10 +1,10 @@
 """How far an operator is from the exact reflection, for roughnesses of a band: a case is an operator, a band, and samples of a seed.
 
-    median, p95, worst   of |R − S| / (S + E/100), specular, as in docs/operator.md (`benchmarks.operator.errors`), S exact and E the
-                         lobe's integral; float32
-    rendering            DSSIM of a sphere of k_s = 1 in light of `LOBES` lobes, against the same by `reference`, after the tone map of
-                         `factorlib.evaluate.picture`; null: the mean radiance everywhere
-    microseconds         processor time of value and gradients, an evaluation (`benchmarks.operator.timing`)
+median, p95, worst   of |R − S| / (S + E/100), specular, as in docs/operator.md (`benchmarks.operator.errors`), S exact and E the
+                     lobe's integral; float32
+rendering            DSSIM of a sphere of k_s = 1 in light of `LOBES` lobes, against the same by `reference`, after the tone map of
+                     `factorlib.evaluate.picture`; null: the mean radiance everywhere
+microseconds         processor time of value and gradients, an evaluation (`benchmarks.operator.timing`)
 """
 
 from __future__ import annotations
@@ -55,7 +55,9 @@ def light_of(seed: int) -> Lobes:
     return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), sharpness, weight)
 
 
-def rendered(operator: Operator, light: Lobes, normals: Float[np.ndarray, "n 3"], roughness: float) -> Float[np.ndarray, "n 3"]:
+def rendered(
+    operator: Operator, light: Lobes, normals: Float[np.ndarray, "n 3"], roughness: float
+) -> Float[np.ndarray, "n 3"]:
     """Radiance of k_s = 1, seen from z."""
     n, z, o = (torch.as_tensor(t).to(operator.dtype) for t in (normals, light.axis, VIEW))
     sharpness, alike = (torch.as_tensor(t).to(operator.dtype) for t in (light.sharpness, roughness))

@@ -38,7 +38,9 @@ STEPS = {
 }
 
 
-def run_stages(folder: Path, out: Path, params: Mapping[str, dict[str, Any]], names: tuple[str, ...] = tuple(STEPS)) -> None:
+def run_stages(
+    folder: Path, out: Path, params: Mapping[str, dict[str, Any]], names: tuple[str, ...] = tuple(STEPS)
+) -> None:
     """The named stages on the data set in `folder`, each into out/<stage>/; params: by stage, those that differ from their defaults."""
     dataset = read_dataset(folder)
     for name in names:
@@ -47,7 +49,10 @@ def run_stages(folder: Path, out: Path, params: Mapping[str, dict[str, Any]], na
         for photo in [photo.name for photo in dataset.spec.photos] if step.over_photos else [None]:
             step.stage.main(given, inputs_of(dataset, step, out, photo), out / name, silent)
         if step.gather:
-            write_json(out / name / step.gather, {p.name: read_json(out / name / f"{p.name}.json") for p in dataset.spec.photos})
+            write_json(
+                out / name / step.gather,
+                {p.name: read_json(out / name / f"{p.name}.json") for p in dataset.spec.photos},
+            )
 
 
 def inputs_of(dataset: Dataset, step: Step, out: Path, photo: str | None) -> Inputs:

@@ -60,7 +60,8 @@ def scored(case: Entries, truths: Mapping[str, Reflectance], solved: Path, light
 def stated_errors(table: Mapping[str, Solved]) -> Score:
     """Means over materials of the standard errors that the solve states: of roughness, and of k_d + k_s relative to it."""
     relative = [
-        float(np.mean(np.hypot(m.stderr.diffuse, m.stderr.specular) / np.maximum(np.add(m.diffuse, m.specular), LEAST))) for m in table.values()
+        float(np.mean(np.hypot(m.stderr.diffuse, m.stderr.specular) / np.maximum(np.add(m.diffuse, m.specular), LEAST)))
+        for m in table.values()
     ]
     return Score({
         "stated_roughness": float(np.mean([m.stderr.roughness for m in table.values()])),
@@ -88,14 +89,24 @@ class Pictures:
         parts = {"entries": entries, "observed": observed, "unobserved": entries - observed}
         found = {e: self._dssim(self.recovered(*e), *e) for e in entries}
         flat = {e: self._dssim(self.truth(*e).mean(axis=0, keepdims=True), *e) for e in entries}
-        return Score(*({part: _mean(error[e] for e in sorted(of)) for part, of in parts.items() if of} for error in (found, flat)))
+        return Score(
+            *(
+                {part: _mean(error[e] for e in sorted(of)) for part, of in parts.items() if of}
+                for error in (found, flat)
+            )
+        )
 
     def _of_all(self) -> Score:
         """Recovered materials in all true lights, and all true materials in the recovered lights."""
         names, lights = self.case.material_names, self.case.lights
         grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
-        in_lights = {n: _mean(self._dssim(self.true[li].ball(self.answer.materials[n]), n, li) for li in self.true) for n in names}
-        of_materials = {li: _mean(self._dssim(self.found[li].ball(of), n, li) for n, of in self.truths.items()) for li in lights}
+        in_lights = {
+            n: _mean(self._dssim(self.true[li].ball(self.answer.materials[n]), n, li) for li in self.true)
+            for n in names
+        }
+        of_materials = {
+            li: _mean(self._dssim(self.found[li].ball(of), n, li) for n, of in self.truths.items()) for li in lights
+        }
         values = {"new_light": _mean(in_lights.values()), "new_material": _mean(of_materials.values())}
         values |= {"first_material": in_lights[first]} if (first := self.case.names[0]) in in_lights else {}
         values |= {"first_light": of_materials[0]} if 0 in of_materials else {}
@@ -107,7 +118,11 @@ class Pictures:
     def _null_of_lights(self) -> float:
         """Of constant lights of the true ones' mean colours."""
         white = Appearances(constant_light(np.ones(3)))
-        return _mean(self._dssim(white.ball(of) * self.true[li].light.mean, n, li) for n, of in self.truths.items() for li in self.case.lights)
+        return _mean(
+            self._dssim(white.ball(of) * self.true[li].light.mean, n, li)
+            for n, of in self.truths.items()
+            for li in self.case.lights
+        )
 
     def truth(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
         """Radiance of a true material in a true light, a row for each pixel inside the disc."""

@@ -145,7 +145,11 @@ class Study(msgspec.Struct, frozen=True):
 
     def cases(self, scale: Scale) -> dict[str, msgspec.Struct]:
         """All cases by name: settings in order, each with all seeds."""
-        return {case_name(setting.name, seed): setting.case(seed) for setting in self.settings(scale) for seed in self.seeds_of(scale)}
+        return {
+            case_name(setting.name, seed): setting.case(seed)
+            for setting in self.settings(scale)
+            for seed in self.seeds_of(scale)
+        }
 
 
 def case_name(setting: str, seed: int) -> str:

@@ -1,11 +1,11 @@
 """How coloured recovered lights are: what the paper's prior acts on.
 
-    chromaticity    of a light: deviation over its three channels of their mean radiances, over the mean of these.  Before that each
-                    channel is divided by its geometric mean over the case's lights: what no observation tells, a factor per
-                    channel, is out of it, in answers and in truths alike.  Mean over lights.
-    colour          mean angle between the colours of a mirror sphere in the recovered and in the true light, in the truth's gauge
-    tint            deviation over channels of the log of the factor that takes recovered reflectances to true ones: what remains
-                    of the free factor where the prior, or the gauge, has settled it
+chromaticity    of a light: deviation over its three channels of their mean radiances, over the mean of these.  Before that each
+                channel is divided by its geometric mean over the case's lights: what no observation tells, a factor per
+                channel, is out of it, in answers and in truths alike.  Mean over lights.
+colour          mean angle between the colours of a mirror sphere in the recovered and in the true light, in the truth's gauge
+tint            deviation over channels of the log of the factor that takes recovered reflectances to true ones: what remains
+                of the free factor where the prior, or the gauge, has settled it
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ from studies.core.world import materials_of
 
 def tints_of(case: Case, solved: Path, lights: Mapping[int, Light]) -> Score:
     """By measure, of the files that `solve` wrote; the case's materials and lights are linked; lights: true ones."""
-    table, truths, found = read_materials(solved / "materials.json").materials, materials_of(case.seed), lights_of(solved, case.lights)
+    table, truths, found = (
+        read_materials(solved / "materials.json").materials,
+        materials_of(case.seed),
+        lights_of(solved, case.lights),
+    )
     names = case.material_names
     factor = np.log(factor_of({n: table[n] for n in names}, truths))
     scaled = in_true_gauge(case, table, found, truths, dict.fromkeys(names, 0)).lights

@@ -59,9 +59,15 @@ def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
     return normals[normals[:, 2] > GRAZING]
 
 
-def spheres(materials: Sequence[Reflectance], light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m n 3"]:
+def spheres(
+    materials: Sequence[Reflectance], light: Light, normals: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "m n 3"]:
     """Radiance of a sphere of each material, without noise."""
-    return np.stack([ball(light, material, normals) for material in materials]) if len(materials) else np.zeros((0, len(normals), 3))
+    return (
+        np.stack([ball(light, material, normals) for material in materials])
+        if len(materials)
+        else np.zeros((0, len(normals), 3))
+    )
 
 
 def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -18,14 +18,23 @@ LEAST = 1e-9
 def against(found: Conclusion, across: str, measures: Sequence[str]) -> str:
     """As SVG that stands alone."""
     shown = [m for m in measures if any({m, across} <= row.cells.keys() for row in found.rows)]
-    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (f" — {found.label}" if found.label else "")
+    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (
+        f" — {found.label}" if found.label else ""
+    )
     parts = [text(LEFT / 2, 22, title, css="title")]
     for k, measure in enumerate(shown):
         parts += _panel(found, across, measure, WIDTH * (k % COLUMNS), HEAD + HEIGHT * (k // COLUMNS))
     for k, row in enumerate(found.rows):
         y = HEAD + TOP + 18 * k
-        parts += [dot(WIDTH * COLUMNS + 16, y, _colour(k)), text(WIDTH * COLUMNS + 28, y + 4, f"{k + 1}  {row.label}", css="small")]
-    return page(WIDTH * COLUMNS + KEY, max(HEAD + HEIGHT * -(-len(shown) // COLUMNS), HEAD + TOP + 18 * len(found.rows) + 10), parts)
+        parts += [
+            dot(WIDTH * COLUMNS + 16, y, _colour(k)),
+            text(WIDTH * COLUMNS + 28, y + 4, f"{k + 1}  {row.label}", css="small"),
+        ]
+    return page(
+        WIDTH * COLUMNS + KEY,
+        max(HEAD + HEIGHT * -(-len(shown) // COLUMNS), HEAD + TOP + 18 * len(found.rows) + 10),
+        parts,
+    )
 
 
 def _panel(found: Conclusion, across: str, measure: str, x0: float, y0: float) -> list[str]:
@@ -34,10 +43,19 @@ def _panel(found: Conclusion, across: str, measure: str, x0: float, y0: float) -
     up = _axis([row.cells[measure].spread for _, row in rows], y0 + HEIGHT - BOTTOM, y0 + TOP)
     parts = [text(x0 + LEFT, y0 + TOP - 14, with_unit(measure), css="small")]
     for value in _ticks(up):
-        parts += [line(right.start, up(value), right.end, up(value), "grid"), text(right.start - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
+        parts += [
+            line(right.start, up(value), right.end, up(value), "grid"),
+            text(right.start - 6, up(value) + 4, f"{value:g}", "end", "small soft"),
+        ]
     for value in _ticks(right):
-        parts += [line(right(value), up.start, right(value), up.end, "grid"), text(right(value), up.start + 16, f"{value:g}", "middle", "small soft")]
-    parts += [line(right.start, up.start, right.end, up.start, "axis"), text((right.start + right.end) / 2, up.start + 34, with_unit(across), "middle", "small soft")]
+        parts += [
+            line(right(value), up.start, right(value), up.end, "grid"),
+            text(right(value), up.start + 16, f"{value:g}", "middle", "small soft"),
+        ]
+    parts += [
+        line(right.start, up.start, right.end, up.start, "axis"),
+        text((right.start + right.end) / 2, up.start + 34, with_unit(across), "middle", "small soft"),
+    ]
     return parts + [mark for k, row in rows for mark in _marks(k, row, right, up, across, measure)]
 
 
@@ -46,7 +64,13 @@ def _marks(k: int, row: Row, right: LogAxis, up: LogAxis, across: str, measure: 
     x, y = right(a.mean), up(max(b.mean, LEAST))
     parts = []
     if a.low is not None and b.low is not None:
-        ends = [[min(max(axis(max(end, LEAST)), min(axis.start, axis.end)), max(axis.start, axis.end)) for end in (s.low, s.high)] for axis, s in ((right, a), (up, b))]
+        ends = [
+            [
+                min(max(axis(max(end, LEAST)), min(axis.start, axis.end)), max(axis.start, axis.end))
+                for end in (s.low, s.high)
+            ]
+            for axis, s in ((right, a), (up, b))
+        ]
         parts = [line(ends[0][0], y, ends[0][1], y, style=style), line(x, ends[1][0], x, ends[1][1], style=style)]
     return [*parts, dot(x, y, _colour(k)), text(x + 7, y - 5, str(k + 1), css="small")]
 

@@ -10,14 +10,23 @@ from factorlib.report.plot import log_ticks
 from studies.core.table import Conclusion, Row
 from studies.report.heads import with_unit
 
-LABEL, WIDTH, GAP, LINE, HEAD, FOOT = 270, 210, 24, 17, 36, 40  # of the labels, of a column's axis and between; of a setting; above and below
+LABEL, WIDTH, GAP, LINE, HEAD, FOOT = (
+    270,
+    210,
+    24,
+    17,
+    36,
+    40,
+)  # of the labels, of a column's axis and between; of a setting; above and below
 LETTER = 5.6  # of a column's head, pixels
 LEAST = 1e-9  # taken for 0
 
 
 def bars(found: Conclusion) -> str:
     """As SVG that stands alone; settings whose labels begin alike, up to a colon, share columns: the measures that they have.  So do those without a colon."""
-    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (f" — {found.label}" if found.label else "")
+    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (
+        f" — {found.label}" if found.label else ""
+    )
     parts, top, end = [text(20, 22, title, css="title")], 30.0, 0.0
     for name in dict.fromkeys(_group(row) for row in found.rows):
         rows = [row for row in found.rows if _group(row) == name]
@@ -53,8 +62,17 @@ def _column(rows: Sequence[Row], measure: str, left: float, top: float, colour: 
         return [*parts, text(left, bottom + 15, "0 everywhere", css="small soft")]
     across = LogAxis(min(positive) / 2, max(positive) * 2, left, left + WIDTH)
     for value in (10**t for t in log_ticks(across.log(across.low), across.log(across.high))):
-        parts += [line(across(value), top, across(value), bottom, "grid"), text(across(value), bottom + 15, f"{value:g}", "middle", "small soft")]
+        parts += [
+            line(across(value), top, across(value), bottom, "grid"),
+            text(across(value), bottom + 15, f"{value:g}", "middle", "small soft"),
+        ]
     for k, cell in cells:
-        y, ends = top + LINE * (k + 0.55), [across(max(v, across.low)) for v in (min(cell.values.values()), max(cell.values.values()))]
-        parts += [line(ends[0], y, ends[1], y, style=f"stroke: {colour}; stroke-width: 2"), dot(across(max(cell.spread.mean, across.low)), y, colour, radius=3)]
+        y, ends = (
+            top + LINE * (k + 0.55),
+            [across(max(v, across.low)) for v in (min(cell.values.values()), max(cell.values.values()))],
+        )
+        parts += [
+            line(ends[0], y, ends[1], y, style=f"stroke: {colour}; stroke-width: 2"),
+            dot(across(max(cell.spread.mean, across.low)), y, colour, radius=3),
+        ]
     return parts

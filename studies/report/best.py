@@ -15,7 +15,9 @@ def best(found: Conclusion, measure: str) -> str:
     rows = [row for row in found.rows if measure in row.cells]
     least = min(rows, key=lambda row: row.cells[measure].spread.mean)
     against = {
-        row.label: difference(least.cells[measure].values, row.cells[measure].values, len(rows) - 1).verdict for row in rows if row is not least
+        row.label: difference(least.cells[measure].values, row.cells[measure].values, len(rows) - 1).verdict
+        for row in rows
+        if row is not least
     }
     start = f"Least mean of {MEASURES[measure].label}: “{least.label}”"
     if "too few seeds" in against.values():

@@ -43,7 +43,12 @@ class Testing(NamedTuple):
 
 def _row(setting: Setting, seeds: tuple[int, ...], scores: Mapping[str, Score]) -> Row:
     of = {seed: scores[case_name(setting.name, seed)] for seed in seeds}
-    return Row(setting.name, setting.label, setting.x, {m: _cell(m, of) for m in MEASURES if any(m in s.values for s in of.values())})
+    return Row(
+        setting.name,
+        setting.label,
+        setting.x,
+        {m: _cell(m, of) for m in MEASURES if any(m in s.values for s in of.values())},
+    )
 
 
 def _cell(measure: str, of: Mapping[int, Score]) -> Cell:
@@ -54,7 +59,10 @@ def _cell(measure: str, of: Mapping[int, Score]) -> Cell:
 
 def _both(claim: Claim, rows: Mapping[str, Row]) -> bool:
     """Whether all settings have the measure, and its null where that is compared: small sets lack some."""
-    there = all(name in rows and claim.measure in rows[name].cells for name in claim.settings) and claim.lower != claim.higher
+    there = (
+        all(name in rows and claim.measure in rows[name].cells for name in claim.settings)
+        and claim.lower != claim.higher
+    )
     return there and all(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher))
 
 
@@ -62,7 +70,15 @@ def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, flo
     first, *last = (rows[name].cells[measure] for name in settings_of(side))
     if isinstance(side, Guess):
         return first.nulls
-    return {seed: (last[0].values[seed] - value) / side.per for seed, value in first.values.items() if seed in last[0].values} if last else first.values
+    return (
+        {
+            seed: (last[0].values[seed] - value) / side.per
+            for seed, value in first.values.items()
+            if seed in last[0].values
+        }
+        if last
+        else first.values
+    )
 
 
 def _label(side: Side, rows: Mapping[str, Row]) -> str:
@@ -71,7 +87,9 @@ def _label(side: Side, rows: Mapping[str, Row]) -> str:
 
 def tested_claim(claim: Claim, rows: Mapping[str, Row], testing: Testing) -> Tested:
     """What the seeds say of `claim`."""
-    found = difference(*(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher)), testing.comparisons)
+    found = difference(
+        *(_by_seed(side, claim.measure, rows) for side in (claim.lower, claim.higher)), testing.comparisons
+    )
     return Tested(claim, found, ANSWERS[found.verdict], _sentence(claim, rows, found, testing.over))
 
 

@@ -17,11 +17,20 @@ Curves = dict[str, dict[str, Cell]]
 def curves(found: Conclusion) -> str:
     """As SVG that stands alone; values on a logarithmic axis."""
     names = list(dict.fromkeys(_split(row.label)[0] for row in found.rows))
-    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (f" — {found.label}" if found.label else "")
+    title = f"{found.title}: {len(found.seeds)} seed{'s' * (len(found.seeds) > 1)}" + (
+        f" — {found.label}" if found.label else ""
+    )
     parts = [text(LEFT / 2, 22, title, css="title")]
-    parts += [part for k, name in enumerate(names) for part in (dot(LEFT + 120 * k, 40, COLOURS[k]), text(LEFT + 10 + 120 * k, 44, name))]
+    parts += [
+        part
+        for k, name in enumerate(names)
+        for part in (dot(LEFT + 120 * k, 40, COLOURS[k]), text(LEFT + 10 + 120 * k, 44, name))
+    ]
     for k, measure in enumerate(found.measures):
-        of = {name: {_split(row.label)[1]: row.cells[measure] for row in found.rows if _split(row.label)[0] == name} for name in names}
+        of = {
+            name: {_split(row.label)[1]: row.cells[measure] for row in found.rows if _split(row.label)[0] == name}
+            for name in names
+        }
         parts += _panel(found, of, measure, WIDTH * (k % COLUMNS), HEAD + HEIGHT * (k // COLUMNS))
     return page(WIDTH * COLUMNS, HEAD + HEIGHT * -(-len(found.measures) // COLUMNS), parts)
 
@@ -39,16 +48,28 @@ def _panel(found: Conclusion, of: Curves, measure: str, x0: float, y0: float) ->
     across = {place: left + (k + 0.5) / len(places) * (right - left) for k, place in enumerate(places)}
     parts = [text(left, y0 + TOP - 12, with_unit(measure), css="small")]
     for value in (10**t for t in log_ticks(up.log(up.low), up.log(up.high))):
-        parts += [line(left, up(value), right, up(value), "grid"), text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
+        parts += [
+            line(left, up(value), right, up(value), "grid"),
+            text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft"),
+        ]
     parts += [text(x, base + 16, place, "middle", "small") for place, x in across.items()]
-    parts += [line(left, base, right, base, "axis"), text((left + right) / 2, base + 34, found.varied, "middle", "small soft")]
+    parts += [
+        line(left, base, right, base, "axis"),
+        text((left + right) / 2, base + 34, found.varied, "middle", "small soft"),
+    ]
     return parts + [part for k, cells in enumerate(of.values()) for part in _curve(cells, across, up, COLOURS[k])]
 
 
 def _curve(cells: dict[str, Cell], across: dict[str, float], up: LogAxis, colour: str) -> list[str]:
     at = [(across[place], cell.spread) for place, cell in cells.items()]
     bars = [
-        line(x, min(up(max(s.low, up.low)), up.start), x, max(up(s.high), up.end), style=f"stroke: {colour}; stroke-width: 1.2")
+        line(
+            x,
+            min(up(max(s.low, up.low)), up.start),
+            x,
+            max(up(s.high), up.end),
+            style=f"stroke: {colour}; stroke-width: 1.2",
+        )
         for x, s in at
         if s.low is not None
     ]

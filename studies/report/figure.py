@@ -11,7 +11,10 @@ from studies.core.table import Cell, Conclusion
 from studies.report.heads import with_unit
 
 WIDTH, HEIGHT, COLUMNS = 380, 230, 2  # of a panel; panels side by side, one alone where labels need the room
-LETTER, TURN = 6.0, 35.0  # pixels of a label's letter; degrees that labels are turned by where they do not fit beside each other
+LETTER, TURN = (
+    6.0,
+    35.0,
+)  # pixels of a label's letter; degrees that labels are turned by where they do not fit beside each other
 LEFT, RIGHT, TOP, BOTTOM = 58, 14, 44, 50
 HEAD = 34  # of the title
 FAR = 2.5  # times the highest value
@@ -21,7 +24,10 @@ Place = Callable[[float], float]  # where a number stands, pixels
 def figure(found: Conclusion) -> str:
     """As SVG that stands alone."""
     shown = [m for m in found.measures if any(m in row.cells for row in found.rows)]
-    title = f"{found.title}: {len(found.seeds)} {found.over if len(found.seeds) > 1 else found.over.removesuffix('s')}" + (f" — {found.label}" if found.label else "")
+    title = (
+        f"{found.title}: {len(found.seeds)} {found.over if len(found.seeds) > 1 else found.over.removesuffix('s')}"
+        + (f" — {found.label}" if found.label else "")
+    )
     parts = [text(LEFT / 2, 22, title, css="title")]
     columns, height = (1, HEIGHT + turned_height(found)) if crowded(found) else (COLUMNS, HEIGHT)
     for k, measure in enumerate(shown):
@@ -59,8 +65,14 @@ def _panel(found: Conclusion, measure: str, x0: float, y0: float) -> list[str]:
 
     parts = [text(left, high - 14, with_unit(measure), css="small")]
     for value in ticks(0, 1.05 * top, 4):
-        parts += [line(left, up(value), right, up(value), "grid"), text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft")]
-    parts += [line(left, base, right, base, "axis"), text((left + right) / 2, base + below, found.varied, "middle", "small soft")]
+        parts += [
+            line(left, up(value), right, up(value), "grid"),
+            text(left - 6, up(value) + 4, f"{value:g}", "end", "small soft"),
+        ]
+    parts += [
+        line(left, base, right, base, "axis"),
+        text((left + right) / 2, base + below, found.varied, "middle", "small soft"),
+    ]
     anchor = "end" if turned else "middle"
     parts += [text(across(k), base + 16, row.label, anchor, "small", -turned) for k, row in enumerate(found.rows)]
     parts += [] if near else [text(right, high - 2, f"a guess: up to {null:.2g}", "end", "small soft")]
@@ -72,7 +84,15 @@ def _marks(cells: Sequence[tuple[int, Cell]], across: Place, up: Place, with_nul
     parts = [path(null, SOFT, dashed=True)] if len(null) > 1 else []
     for k, cell in cells:
         if cell.spread.low is not None:
-            parts.append(line(across(k), up(cell.spread.low), across(k), up(cell.spread.high), style=f"stroke: {COLOURS[0]}; stroke-width: 1.8"))
+            parts.append(
+                line(
+                    across(k),
+                    up(cell.spread.low),
+                    across(k),
+                    up(cell.spread.high),
+                    style=f"stroke: {COLOURS[0]}; stroke-width: 1.8",
+                )
+            )
             parts += [dot(across(k) + 7, up(value), COLOURS[1], radius=1.6) for value in cell.values.values()]
         parts.append(dot(across(k), up(cell.spread.mean), COLOURS[0], hollow=cell.spread.low is None, radius=3.6))
     return parts

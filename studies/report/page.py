@@ -27,10 +27,14 @@ def page(studies: Sequence[tuple[Any, Path]]) -> str:
     read = [(_conclusion(table), folder) for table, folder in studies]
     found = [_shown(conclusion, folder) for conclusion, folder in read if conclusion]
     others = [folder.name for conclusion, folder in read if not conclusion]
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
     template = environment.from_string((TEMPLATES / "index.html").read_text(encoding="utf-8"))
     quick = any(conclusion.label for conclusion, _, _ in found)
-    return template.render(studies=found, others=others, quick=quick, with_unit=with_unit, number=number, answer=answer_to_the_paper)
+    return template.render(
+        studies=found, others=others, quick=quick, with_unit=with_unit, number=number, answer=answer_to_the_paper
+    )
 
 
 def _conclusion(table: Any) -> Conclusion | None:

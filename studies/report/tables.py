@@ -8,7 +8,20 @@ import io
 from studies.core.measures import MEASURES
 from studies.core.table import Conclusion
 
-HEAD = ("study", "scale", "setting", "label", "measure", "unit", "seeds", "mean", "deviation", "low_95", "high_95", "null_mean")
+HEAD = (
+    "study",
+    "scale",
+    "setting",
+    "label",
+    "measure",
+    "unit",
+    "seeds",
+    "mean",
+    "deviation",
+    "low_95",
+    "high_95",
+    "null_mean",
+)
 
 
 def csv_text(found: Conclusion) -> str:
@@ -19,7 +32,10 @@ def csv_text(found: Conclusion) -> str:
     for row in found.rows:
         for measure, cell in row.cells.items():
             s = cell.spread
-            numbers = [s.seeds, *("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))]
+            numbers = [
+                s.seeds,
+                *("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null)),
+            ]
             writer.writerow([found.study, found.scale, row.name, row.label, measure, MEASURES[measure].unit, *numbers])
     return out.getvalue()
 

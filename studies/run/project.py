@@ -67,7 +67,9 @@ def studies(scale: Scale = FULL, root: Path = LIBRARY, kind: str = "spheres") ->
 def photos_of(case: LeftOutCase) -> dict[str, Any]:
     """The photos of a study of a data set, how they are solved, and what the data set contains, so that a step's key has it."""
     hashes, folder = FileHashes(None), LIBRARY / FOLDER
-    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.relative_to(folder).parts[0] != "truth")
+    files = sorted(
+        file for file in folder.rglob("*") if file.is_file() and file.relative_to(folder).parts[0] != "truth"
+    )
     content = {str(file.relative_to(folder)): hashes.content(file) for file in files}
     return {"folder": FOLDER, "photos": list(case.photos), "solve": case.solve, "content": content}
 

@@ -45,7 +45,10 @@ class Analysis(msgspec.Struct, frozen=True):
 def analysed(found: Sequence[Answers]) -> Analysis:
     """Of at least one participant."""
     names = sorted({a.picture for answers in found for a in answers.answers})
-    pictures = [_of_picture(name, [a.for_ours for answers in found for a in answers.answers if a.picture == name]) for name in names]
+    pictures = [
+        _of_picture(name, [a.for_ours for answers in found for a in answers.answers if a.picture == name])
+        for name in names
+    ]
     own = [float(np.mean([a.for_ours for a in answers.answers])) for answers in found]
     error = float(np.std(own, ddof=1) / len(own) ** 0.5) if len(own) > 1 else None
     overall = Share(OVERALL, len(found), sum(s.for_ours for s in pictures), float(np.mean(own)), error)
@@ -68,7 +71,16 @@ def csv_text(found: Analysis) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(HEAD)
     for s in (*found.pictures, found.overall):
-        writer.writerow([s.picture, s.participants, s.for_ours, f"{s.share:.4f}", "" if s.error is None else f"{s.error:.4f}", found.simulated])
+        writer.writerow(
+            [
+                s.picture,
+                s.participants,
+                s.for_ours,
+                f"{s.share:.4f}",
+                "" if s.error is None else f"{s.error:.4f}",
+                found.simulated,
+            ]
+        )
     return out.getvalue()
 
 
@@ -109,10 +121,16 @@ def figure(found: Analysis) -> str:
         return LEFT + share * (WIDTH - LEFT - RIGHT)
 
     title = f"Preference for ours over the intrinsic decomposition: {percent(found.overall)}"
-    parts = [text(20, 22, title, css="title"), text(20, 42, label(found) or f"{found.overall.participants} participants", css="small soft")]
+    parts = [
+        text(20, 22, title, css="title"),
+        text(20, 42, label(found) or f"{found.overall.participants} participants", css="small soft"),
+    ]
     for share in (0, 0.25, 0.5, 0.75, 1):
         css = "axis" if share == 0.5 else "grid"
-        parts += [line(across(share), TOP - 8, across(share), base, css), text(across(share), base + 18, f"{100 * share:g} %", "middle", "small soft")]
+        parts += [
+            line(across(share), TOP - 8, across(share), base, css),
+            text(across(share), base + 18, f"{100 * share:g} %", "middle", "small soft"),
+        ]
     for k, s in enumerate(rows):
         parts += _row(s, TOP + ROW * k + ROW / 2, across, COLOURS[1 if s.picture == OVERALL else 0])
     return page(WIDTH, height, parts)
@@ -121,4 +139,8 @@ def figure(found: Analysis) -> str:
 def _row(s: Share, y: float, across: Callable[[float], float], colour: str) -> list[str]:
     low, high = (min(1.0, max(0.0, s.share + side * (s.error or 0.0))) for side in (-1, 1))
     bar = line(across(low), y, across(high), y, style=f"stroke: {colour}; stroke-width: 1.8")
-    return [text(LEFT - 12, y + 4, s.picture, "end", "small"), *([bar] if s.error else []), dot(across(s.share), y, colour, radius=3.6)]
+    return [
+        text(LEFT - 12, y + 4, s.picture, "end", "small"),
+        *([bar] if s.error else []),
+        dot(across(s.share), y, colour, radius=3.6),
+    ]

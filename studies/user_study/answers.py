@@ -52,15 +52,27 @@ def read_answers(files: Sequence[Path]) -> list[Answers]:
     different pages, and simulated answers beside people's.
     """
     if not files:
-        raise InputError("no file of answers is named", key="FILE", cure="name the files that participants saved: answers-*.json")
+        raise InputError(
+            "no file of answers is named", key="FILE", cure="name the files that participants saved: answers-*.json"
+        )
     found = [(file, _read(file)) for file in files]
     known: dict[str, Path] = {}
     for file, answers in found:
         if answers.participant in known:
-            raise InputError(f"the same participant as in {known[answers.participant]}", file=file, key="participant", cure="name each file once")
+            raise InputError(
+                f"the same participant as in {known[answers.participant]}",
+                file=file,
+                key="participant",
+                cure="name each file once",
+            )
         known[answers.participant] = file
     _all_alike(found, "page", "other pictures than in {}", "analyse the files of each page by themselves")
-    _all_alike(found, "simulated", "who answered differs from {}", "analyse people's answers, and those of each simulation, by themselves")
+    _all_alike(
+        found,
+        "simulated",
+        "who answered differs from {}",
+        "analyse people's answers, and those of each simulation, by themselves",
+    )
     return [answers for _, answers in found]
 
 
@@ -70,11 +82,15 @@ def _read(file: Path) -> Answers:
     except msgspec.DecodeError as error:  # also a ValidationError, which says the field
         raise InputError(f"not a file of answers: {error}", file=file, cure=CURE) from None
     if found.format != FORMAT:
-        raise InputError(f"format {found.format} is not known", file=file, key="format", cure=f"this version reads format {FORMAT}")
+        raise InputError(
+            f"format {found.format} is not known", file=file, key="format", cure=f"this version reads format {FORMAT}"
+        )
     if twice := _twice(answer.picture for answer in found.answers):
         raise InputError(f"two answers to '{twice}'", file=file, key="answers", cure=CURE)
     if len(found.answers) != found.asked:
-        raise InputError(f"{len(found.answers)} answers to {found.asked} questions", file=file, key="answers", cure=CURE)
+        raise InputError(
+            f"{len(found.answers)} answers to {found.asked} questions", file=file, key="answers", cure=CURE
+        )
     return found
 
 

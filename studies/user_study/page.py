@@ -23,12 +23,22 @@ TEMPLATE = Path(__file__).parent / "templates" / "user_study.html"
 def page(found: list[Trial], label: str = "") -> str:
     """HTML.  label: what stands on the page of a quick study."""
     asked = [
-        {"name": t.name, "reference": _data(t.reference), "ours": _data(t.ours), "other": _data(t.other), "dssim": [t.dssim_ours, t.dssim_other]}
+        {
+            "name": t.name,
+            "reference": _data(t.reference),
+            "ours": _data(t.ours),
+            "other": _data(t.other),
+            "dssim": [t.dssim_ours, t.dssim_other],
+        }
         for t in found
     ]
     data = json_text({"format": FORMAT, "page": digest(found), "pictures": asked}).replace("</", "<\\/")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(data=data, label=label, count=len(found))
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        data=data, label=label, count=len(found)
+    )
 
 
 def _data(file: Path) -> str:

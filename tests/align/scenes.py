@@ -36,7 +36,10 @@ def blob():
     """Smooth, without symmetry."""
     part = ball()
     x, y, z = part.vertices.T
-    part.vertices = part.vertices * (1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3)[:, None]
+    part.vertices = (
+        part.vertices
+        * (1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3)[:, None]
+    )
     return mesh_of([part])
 
 
@@ -51,10 +54,15 @@ def chair(mirrored: bool = False, labels=(1, 1)):
 
 def dumbbell(labels=(1, 2)):
     """Mirror-symmetric in shape; only the labels tell one end from the other."""
-    return mesh_of([at(ball(0.6), -0.9, 0, 0), at(ball(0.6), 0.9, 0, 0), trimesh.creation.box((1.2, 0.3, 0.5))], [*labels, labels[0]])
+    return mesh_of(
+        [at(ball(0.6), -0.9, 0, 0), at(ball(0.6), 0.9, 0, 0), trimesh.creation.box((1.2, 0.3, 0.5))],
+        [*labels, labels[0]],
+    )
 
 
-def photo_of(mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)) -> tuple[Caster, Camera, Pose]:
+def photo_of(
+    mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)
+) -> tuple[Caster, Camera, Pose]:
     """The mesh at a random rotation, its bounding sphere `fill` of the photo's height, moved by `shift` of its size."""
     caster = Caster(mesh)
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()

@@ -67,7 +67,9 @@ def non_manifold(vertices, faces):
     """Fins inside the body: edges of three faces."""
     a, b, _ = faces[::50].T
     middle = len(vertices)
-    return np.vstack([vertices, vertices.mean(axis=0)]), np.vstack([faces, np.stack([a, b, np.full(len(a), middle)], axis=1)])
+    return np.vstack([vertices, vertices.mean(axis=0)]), np.vstack(
+        [faces, np.stack([a, b, np.full(len(a), middle)], axis=1)]
+    )
 
 
 def with_slivers(vertices, faces):

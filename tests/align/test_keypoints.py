@@ -66,8 +66,12 @@ def test_units_and_origin_of_the_mesh_do_not_matter():
     mesh, shift = caster.mesh, np.array([4e6, -1e6, 2e6])
     far = Caster(type(mesh)(mesh.vertices * 1000 + shift, mesh.faces, mesh.normals, mesh.face_label))
     near = state_of_keypoints(keypoints, caster, camera, prior, "photo", "chair")
-    other = state_of_keypoints(Keypoints(keypoints.pixel, keypoints.point * 1000 + shift), far, camera, prior, "photo", "chair")
-    assert np.allclose(near.rotation, other.rotation, atol=1e-6) and np.isclose(np.exp(other.log_depth), 1000 * np.exp(near.log_depth))
+    other = state_of_keypoints(
+        Keypoints(keypoints.pixel, keypoints.point * 1000 + shift), far, camera, prior, "photo", "chair"
+    )
+    assert np.allclose(near.rotation, other.rotation, atol=1e-6) and np.isclose(
+        np.exp(other.log_depth), 1000 * np.exp(near.log_depth)
+    )
 
 
 def test_keypoints_that_do_not_agree_are_refused():

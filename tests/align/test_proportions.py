@@ -23,7 +23,15 @@ def sightings(true, given, count=4, focal_sigma=0.0, seed=20):
         caster, camera, pose = photo_of(true, seed + k)
         silhouette = Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
         start = state_of(pose, camera, given)
-        made.append(Sighting(given, target_of(silhouette, given.labels, 200, 0.15), camera, FocalPrior(camera.focal, focal_sigma), start))
+        made.append(
+            Sighting(
+                given,
+                target_of(silhouette, given.labels, 200, 0.15),
+                camera,
+                FocalPrior(camera.focal, focal_sigma),
+                start,
+            )
+        )
         truth.append((caster, camera, pose))
     return made, truth
 
@@ -39,10 +47,14 @@ def _error(true, one, state, given, factors):
     mesh = Caster(scaled(given, factors))
     there, found = rasterise(caster, camera, pose), rasterise(mesh, state.camera(one.camera), state.pose(mesh))
     both = (there.label > 0) & (found.label > 0)
-    return float(np.rad2deg(np.median(np.arccos(np.clip(np.sum(there.normal[both] * found.normal[both], axis=1), -1, 1)))))
+    return float(
+        np.rad2deg(np.median(np.arccos(np.clip(np.sum(there.normal[both] * found.normal[both], axis=1), -1, 1))))
+    )
 
 
-@pytest.mark.parametrize("mesh, off, focal_sigma", [(blob, (1.15, 1, 1), 0.0), (chair, (1, 1, 0.88), 0.0), (chair, (1, 1.12, 1), 0.1)])
+@pytest.mark.parametrize(
+    "mesh, off, focal_sigma", [(blob, (1.15, 1, 1), 0.0), (chair, (1, 1, 0.88), 0.0), (chair, (1, 1.12, 1), 0.1)]
+)
 def test_wrong_proportions_come_back_within_three_percent(mesh, off, focal_sigma):
     true = mesh()
     given = scaled(true, off)

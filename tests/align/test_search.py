@@ -22,7 +22,9 @@ QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not nee
 def found_in(caster, camera, pose, silhouette=None, known_focal=False, mesh_given=None, search=QUICK):
     """What the search finds, and the median normal error in degrees."""
     silhouette = silhouette or true_silhouette(caster, camera, pose)
-    prior = focal_prior(camera.focal if known_focal else None, KNOWN if known_focal else None, camera.width, camera.height)
+    prior = focal_prior(
+        camera.focal if known_focal else None, KNOWN if known_focal else None, camera.width, camera.height
+    )
     given = mesh_given or caster
     found = find(given, silhouette, camera, prior, search)
     return found, normal_error_deg(caster, camera, pose, found.state.camera(camera), found.state.pose(given))
@@ -70,7 +72,12 @@ def test_labels_settle_what_the_shape_cannot():
 def test_a_wrong_mesh_scores_lower():
     caster, camera, pose = photo_of(chair(), 11)
     silhouette, prior = true_silhouette(caster, camera, pose), focal_prior(camera.focal, KNOWN, 320, 240)
-    assert find(Caster(blob()), silhouette, camera, prior, QUICK).score < 0.8 < 0.95 < find(caster, silhouette, camera, prior, QUICK).score
+    assert (
+        find(Caster(blob()), silhouette, camera, prior, QUICK).score
+        < 0.8
+        < 0.95
+        < find(caster, silhouette, camera, prior, QUICK).score
+    )
 
 
 def test_millimetres_far_off_and_faces_flipped():

@@ -54,9 +54,17 @@ def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
     label = silhouette.label.copy()
     label[:, 150:] = UNKNOWN
     for known in (silhouette, Silhouette(label)):
-        assert silhouette_iou(known, mesh_label) == label_agreement(known, mesh_label) == labelled_iou(known, mesh_label) == 1
+        assert (
+            silhouette_iou(known, mesh_label)
+            == label_agreement(known, mesh_label)
+            == labelled_iou(known, mesh_label)
+            == 1
+        )
     swapped = np.where(mesh_label > 0, 3 - mesh_label, 0)
-    assert silhouette_iou(silhouette, swapped) == 1 and label_agreement(silhouette, swapped) == labelled_iou(silhouette, swapped) == 0
+    assert (
+        silhouette_iou(silhouette, swapped) == 1
+        and label_agreement(silhouette, swapped) == labelled_iou(silhouette, swapped) == 0
+    )
 
 
 def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
@@ -126,7 +134,9 @@ def test_normals_of_a_coarse_round_mesh_are_believed_less_than_those_of_a_fine_o
 
 @pytest.mark.parametrize("height", [30, 60, 240])
 def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(height):
-    caster, camera, pose = photo_of(mesh_of([ball(subdivisions=5)], crease_deg=180.0), 3, width=2 * height, height=height, focal=40.0)
+    caster, camera, pose = photo_of(
+        mesh_of([ball(subdivisions=5)], crease_deg=180.0), 3, width=2 * height, height=height, focal=40.0
+    )
     maps = rasterise(caster, camera, pose)
     middle, radius = (height // 2, height), 0.75 * height / 2  # pixels
     expected = np.sqrt(4 / 3) / radius  # of n = (x, y) / radius over 3 × 3 pixels

@@ -30,7 +30,9 @@ def test_jacobian_is_the_finite_difference():
     jacobian = state.jacobian(points @ state.rotation.T)
     for k in range(7):
         step = np.eye(7)[k] * h
-        assert np.allclose(jacobian[:, :, k], (image(state.moved(step)) - image(state.moved(-step))) / (2 * h), rtol=1e-5, atol=1e-5)
+        assert np.allclose(
+            jacobian[:, :, k], (image(state.moved(step)) - image(state.moved(-step))) / (2 * h), rtol=1e-5, atol=1e-5
+        )
 
 
 def test_focal_length_moves_neither_place_nor_size():

@@ -20,7 +20,12 @@ KNOWN = FocalPrior(1.0, 0.0)
 def seen(mesh, seed=1, **how):
     """The caster, the photo's camera, the true state, and a target of the mask."""
     caster, camera, pose = photo_of(mesh, seed, **how)
-    return caster, camera, state_of(pose, camera, caster), target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, 200, 0.2)
+    return (
+        caster,
+        camera,
+        state_of(pose, camera, caster),
+        target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, 200, 0.2),
+    )
 
 
 @pytest.mark.parametrize("larger", [0.04, -0.04, 0.1])
@@ -35,7 +40,9 @@ def test_contour_error_is_the_same_at_any_size():
     errors = []
     for fill in (0.9, 0.3):
         caster, camera, state, target = seen(blob(), focal=20.0, fill=fill, width=640, height=480)
-        errors.append(contour_error(caster, target, camera, msgspec.structs.replace(state, log_depth=state.log_depth - 0.1)))
+        errors.append(
+            contour_error(caster, target, camera, msgspec.structs.replace(state, log_depth=state.log_depth - 0.1))
+        )
     assert errors[0] == pytest.approx(errors[1], rel=0.1)
 
 

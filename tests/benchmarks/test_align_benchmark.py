@@ -36,7 +36,9 @@ def test_shapes_are_of_the_size_said_and_rough_ones_near_them(shape):
 def test_a_case_is_the_same_twice_and_cut_by_no_frame(kind):
     first, again = (cases.case(kind, "jug", 3, 1) for _ in range(2))
     assert np.array_equal(first.label, again.label) and np.array_equal(first.pose.rotation, again.pose.rotation)
-    assert first.label.any() and not (first.label[0].any() or first.label[-1].any() or first.label[:, 0].any() or first.label[:, -1].any())
+    assert first.label.any() and not (
+        first.label[0].any() or first.label[-1].any() or first.label[:, 0].any() or first.label[:, -1].any()
+    )
     assert not np.array_equal(first.pose.rotation, cases.case(kind, "jug", 4, 1).pose.rotation)
 
 
@@ -113,9 +115,14 @@ def real_set(folder):
     cases.write_set(folder, [made])
     pose = {"rotation": made.pose.rotation.tolist(), "translation": made.pose.translation.tolist()}
     text = (folder / "dataset.yaml").read_text(encoding="utf-8")
-    (folder / "dataset.yaml").write_text(text.replace("mesh: stack", f"mesh: stack\n    pose: {pose}"), encoding="utf-8")
+    (folder / "dataset.yaml").write_text(
+        text.replace("mesh: stack", f"mesh: stack\n    pose: {pose}"), encoding="utf-8"
+    )
     camera = {"focal_px": 1.1 * made.camera.focal, "principal_point": list(made.camera.centre)}
-    write_json(folder / "reference_poses.json", {made.name: {"camera": camera, "objects": {"object": pose}, "silhouette_iou": 0.9}})
+    write_json(
+        folder / "reference_poses.json",
+        {made.name: {"camera": camera, "objects": {"object": pose}, "silhouette_iou": 0.9}},
+    )
     return made
 
 

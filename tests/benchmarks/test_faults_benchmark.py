@@ -17,7 +17,11 @@ def test_lines_of_one_name_are_added_up(tmp_path):
     (tmp_path / "log").write_text("\n".join(map(json.dumps, lines)))
     found = tables(tried(tmp_path / "log"))
     assert list(found) == ["faults", "hits", "fuzz"]
-    assert "| a kill | 7 | 1 |" in found["faults"] and "| upper | 3 |" in found["hits"] and "| total | 2 |" in found["hits"]
+    assert (
+        "| a kill | 7 | 1 |" in found["faults"]
+        and "| upper | 3 |" in found["hits"]
+        and "| total | 2 |" in found["hits"]
+    )
     assert "| photo.jpg | 1,000 | 400 | 600 | 0 |" in found["fuzz"] and "| all | 1,000 |" in found["fuzz"]
 
 

@@ -46,5 +46,12 @@ def test_every_table_has_its_place_and_the_rest_stays(tmp_path):
 
 
 def test_numbers_are_short():
-    assert [exact(v) for v in (0.00099999, 0.0123, 1.0, 250.0, 1e-6, 64000.0)] == [".001", ".012", "1", "250", "1.0·10⁻⁶", "6.4·10⁴"]
+    assert [exact(v) for v in (0.00099999, 0.0123, 1.0, 250.0, 1e-6, 64000.0)] == [
+        ".001",
+        ".012",
+        "1",
+        "250",
+        "1.0·10⁻⁶",
+        "6.4·10⁴",
+    ]
     assert table(["a", "b"], [["x", "1"]]).splitlines()[1] == "|---|---:|"

@@ -66,7 +66,9 @@ def test_what_processes_cost_is_seen_by_their_role():
 
 def run(folder, build, *settings):
     command = [sys.executable, "-m", "benchmarks.scale.project", str(folder), str(build), SMALL, *settings]
-    return subprocess.run(command, cwd=LIBRARY, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, cwd=LIBRARY, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.long

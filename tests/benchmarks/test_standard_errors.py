@@ -43,7 +43,10 @@ def test_deviations_between_two_runs_are_in_standard_errors_after_the_free_facto
 
 def test_results_of_another_data_set_are_refused(folders):
     one, other = (results(folder, 0.3, 1.0, np.ones((64, 128, 3))) for folder in folders)
-    write_materials(other / "export/materials.json", MaterialTable({"three": solved(Reflectance((0.4,) * 3, (0.1,) * 3, 0.3), ERROR)}))
+    write_materials(
+        other / "export/materials.json",
+        MaterialTable({"three": solved(Reflectance((0.4,) * 3, (0.1,) * 3, 0.3), ERROR)}),
+    )
     with pytest.raises(InputError, match="'one' is missing"):
         material_deviations(one, other)
     with pytest.raises(SystemExit, match="name folders of one data set"):

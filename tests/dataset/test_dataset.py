@@ -18,7 +18,18 @@ from factorlib.images.transfer import ENCODINGS
 from factorlib.labels import LEFT_OUT
 
 TURN = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-FILES = ["kitchen.jpg", "garden.exr", "kitchen.png", "red.png", "coco.json", "own.png", "chair.obj", "vase.ply", "box.gltf", "notes.txt"]
+FILES = [
+    "kitchen.jpg",
+    "garden.exr",
+    "kitchen.png",
+    "red.png",
+    "coco.json",
+    "own.png",
+    "chair.obj",
+    "vase.ply",
+    "box.gltf",
+    "notes.txt",
+]
 SPEC = {
     "format": 1,
     "materials": ["red", "white", "wood"],
@@ -39,7 +50,12 @@ SPEC = {
                 {"name": "vase_1", "mesh": "vase", "pose": {"rotation": TURN, "translation": [0, 0, 2.5]}},
             ],
         },
-        {"name": "garden", "image": "garden.exr", "masks": {"red": "red.png"}, "objects": [{"name": "chair_1", "mesh": "chair"}]},
+        {
+            "name": "garden",
+            "image": "garden.exr",
+            "masks": {"red": "red.png"},
+            "objects": [{"name": "chair_1", "mesh": "chair"}],
+        },
         {"name": "hall", "image": "kitchen.jpg", "masks": "coco.json", "objects": [{"name": "box_1", "mesh": "box"}]},
     ],
 }
@@ -108,7 +124,12 @@ def test_constants_agree_with_those_of_the_readers():
 
 def test_a_slice_is_json_and_converts_to_its_type(folder):
     dataset = read_dataset(write(folder))
-    types = {"photo": schema.PhotoSlice, "objects": schema.ObjectsSlice, "light": schema.LightSlice, "set": schema.SetSlice}
+    types = {
+        "photo": schema.PhotoSlice,
+        "objects": schema.ObjectsSlice,
+        "light": schema.LightSlice,
+        "set": schema.SetSlice,
+    }
     for name in SLICES:
         one = dataset_slice(dataset, name, "kitchen")
         assert json.loads(json.dumps(one.facts)) == one.facts
@@ -123,7 +144,14 @@ def test_slices_name_the_files_they_need(folder):
     assert files["objects"] == ["chair.mtl", "chair.obj", "own.png", "vase.ply"]
     assert files["materials"] == files["light"] == files["set"] == files["truth"] == []
     assert dataset_slice(dataset, "objects", "hall").files == ["box 1.bin", "box.gltf"]
-    assert dataset_slice(dataset, "photo").files == ["coco.json", "garden.exr", "kitchen.jpg", "kitchen.png", "own.png", "red.png"]
+    assert dataset_slice(dataset, "photo").files == [
+        "coco.json",
+        "garden.exr",
+        "kitchen.jpg",
+        "kitchen.png",
+        "own.png",
+        "red.png",
+    ]
 
 
 def test_an_mtl_that_is_not_there_is_not_needed(folder):
@@ -197,7 +225,11 @@ def test_missing_truth_is_a_warning(folder, gone, caplog):
         ({"materials": {"rde": TRUTH["materials"]["red"]}}, "materials.rde", "did you mean 'red'"),
         ({"illumination": {"gardn": "truth/garden.exr"}}, "illumination.gardn", "did you mean 'garden'"),
         ({"normals": {"hal": "truth/garden.exr"}}, "normals.hal", "did you mean 'hall'"),
-        ({"poses": {"kitchen": {"vase_2": TRUTH["poses"]["kitchen"]["vase_1"]}}}, "poses.kitchen.vase_2", "did you mean 'vase_1'"),
+        (
+            {"poses": {"kitchen": {"vase_2": TRUTH["poses"]["kitchen"]["vase_1"]}}},
+            "poses.kitchen.vase_2",
+            "did you mean 'vase_1'",
+        ),
         ({"illumination": {"garden": "../outside.exr"}}, "illumination.garden", "copy the file"),
     ],
 )
@@ -249,12 +281,32 @@ BAD = {
         "photos[0].camera.principal_point[1]",
         "finite",
     ),
-    "duplicate object": ((*P0, "objects", 1, "name"), "chair_1", "photos[0].objects[1].name", "objects[0] has it already"),
+    "duplicate object": (
+        (*P0, "objects", 1, "name"),
+        "chair_1",
+        "photos[0].objects[1].name",
+        "objects[0] has it already",
+    ),
     "bad object name": ((*O0, "name"), "chair 1", "photos[0].objects[0].name", "A-Z a-z 0-9"),
     "unknown mesh": ((*O0, "mesh"), "chiar", "photos[0].objects[0].mesh", "did you mean 'chair'"),
-    "unknown part": ((*O0, "materials"), {"shel": "red"}, "photos[0].objects[0].materials.shel", "did you mean 'shell'"),
-    "unknown material of a part": ((*O0, "materials"), {"shell": "whit"}, "photos[0].objects[0].materials.shell", "did you mean 'white'"),
-    "part of a mesh of one": ((*P0, "objects", 1, "materials"), {"lid": "red"}, "photos[0].objects[1].materials.lid", "'vase'"),
+    "unknown part": (
+        (*O0, "materials"),
+        {"shel": "red"},
+        "photos[0].objects[0].materials.shel",
+        "did you mean 'shell'",
+    ),
+    "unknown material of a part": (
+        (*O0, "materials"),
+        {"shell": "whit"},
+        "photos[0].objects[0].materials.shell",
+        "did you mean 'white'",
+    ),
+    "part of a mesh of one": (
+        (*P0, "objects", 1, "materials"),
+        {"lid": "red"},
+        "photos[0].objects[1].materials.lid",
+        "'vase'",
+    ),
     "missing object mask": ((*O0, "mask"), "owm.png", "photos[0].objects[0].mask", "did you mean 'own.png'"),
     "stretched pose": (
         (*O0, "pose"),
@@ -262,8 +314,18 @@ BAD = {
         "photos[0].objects[0].pose.rotation",
         "unit vectors",
     ),
-    "mirrored pose": ((*O0, "pose"), {"rotation": MIRROR, "translation": [0, 0, 1]}, "photos[0].objects[0].pose.rotation", "reflection"),
-    "NaN pose": ((*O0, "pose"), {"rotation": TURN, "translation": [0, NAN, 1]}, "photos[0].objects[0].pose.translation[1]", "finite"),
+    "mirrored pose": (
+        (*O0, "pose"),
+        {"rotation": MIRROR, "translation": [0, 0, 1]},
+        "photos[0].objects[0].pose.rotation",
+        "reflection",
+    ),
+    "NaN pose": (
+        (*O0, "pose"),
+        {"rotation": TURN, "translation": [0, NAN, 1]},
+        "photos[0].objects[0].pose.translation[1]",
+        "finite",
+    ),
     "three keypoints": ((*O0, "keypoints"), KEYPOINTS[:3], "photos[0].objects[0].keypoints", "give 4 or more"),
     "keypoints on a line": (
         (*O0, "keypoints"),
@@ -277,7 +339,12 @@ BAD = {
         "photos[0].objects[0].keypoints[4].pixel",
         "keypoints[1]",
     ),
-    "keypoints beside a pose": ((*P0, "objects", 1, "keypoints"), KEYPOINTS, "photos[0].objects[1].keypoints", "keep one"),
+    "keypoints beside a pose": (
+        (*P0, "objects", 1, "keypoints"),
+        KEYPOINTS,
+        "photos[0].objects[1].keypoints",
+        "keep one",
+    ),
     "NaN keypoint": (
         (*O0, "keypoints"),
         [*KEYPOINTS[:3], {"pixel": [9, NAN], "point": [0, 0, 1]}],
@@ -290,19 +357,39 @@ BAD = {
     "unsupported mesh": (("meshes", "vase", "file"), "notes.txt", "meshes.vase.file", ".obj"),
     "mesh with both": (("meshes", "chair", "material"), "red", "meshes.chair", "both"),
     "mesh with neither": (("meshes", "vase", "material"), None, "meshes.vase", "neither"),
-    "mesh of unknown material": (("meshes", "vase", "material"), "wite", "meshes.vase.material", "did you mean 'white'"),
-    "part of unknown material": (("meshes", "chair", "parts", "legs"), "woof", "meshes.chair.parts.legs", "did you mean 'wood'"),
+    "mesh of unknown material": (
+        ("meshes", "vase", "material"),
+        "wite",
+        "meshes.vase.material",
+        "did you mean 'white'",
+    ),
+    "part of unknown material": (
+        ("meshes", "chair", "parts", "legs"),
+        "woof",
+        "meshes.chair.parts.legs",
+        "did you mean 'wood'",
+    ),
     "truth outside": (("truth",), "../truth.yaml", "truth", "outside the dataset"),
     "focal of no camera": ((*P0, "camera"), {"focal_px": 1e300}, "photos[0].camera.focal_px", "1e+300"),
     "focal of a hundredth": ((*P0, "camera"), {"focal_px": 0.01}, "photos[0].camera.focal_px", ".01"),
-    "centre far outside": ((*P0, "camera"), {"principal_point": [1e9, 0.0]}, "photos[0].camera.principal_point", "1e+09"),
+    "centre far outside": (
+        (*P0, "camera"),
+        {"principal_point": [1e9, 0.0]},
+        "photos[0].camera.principal_point",
+        "1e+09",
+    ),
     "pose beyond all": (
         (*O0, "pose"),
         {"rotation": TURN, "translation": [0, 0, 1e300]},
         "photos[0].objects[0].pose.translation[2]",
         "1e+300",
     ),
-    "turn beyond all": ((*P0, "world_from_camera"), [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]], "photos[0].world_from_camera[0][0]", "1e+300"),
+    "turn beyond all": (
+        (*P0, "world_from_camera"),
+        [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "photos[0].world_from_camera[0][0]",
+        "1e+300",
+    ),
 }
 
 

@@ -33,7 +33,9 @@ def mask(path, values):
 
 
 def made(folders, meshes="meshes"):
-    missing = new_dataset(folders / "data" / "mine", folders / "photos", folders / "masks", folders / meshes if meshes else None)
+    missing = new_dataset(
+        folders / "data" / "mine", folders / "photos", folders / "masks", folders / meshes if meshes else None
+    )
     return missing, load_yaml(folders / "data" / "mine" / "dataset.yaml")
 
 
@@ -55,7 +57,9 @@ def test_beside_labels_a_further_mask_is_the_silhouette_of_an_object(folders):
     mask(folders / "masks" / "kitchen_right.png", [0, 0, 1])
     mask(folders / "masks" / "IMG_0412.png", [0, 1])
     _, spec = made(folders)
-    assert spec["photos"][1]["objects"] == [{"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")]
+    assert spec["photos"][1]["objects"] == [
+        {"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")
+    ]
     assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
 
 
@@ -75,13 +79,20 @@ def test_a_coco_file_names_the_materials_of_all_photos(folders):
     coco = {"images": [], "annotations": [], "categories": [{"id": 1, "name": "shell"}, {"id": 2, "name": "legs"}]}
     (folders / "masks" / "all.json").write_text(json.dumps(coco))
     missing, spec = made(folders)
-    assert missing == [] and spec["materials"] == ["shell", "legs"] and {p["masks"] for p in spec["photos"]} == {"masks/all.json"}
+    assert (
+        missing == []
+        and spec["materials"] == ["shell", "legs"]
+        and {p["masks"] for p in spec["photos"]} == {"masks/all.json"}
+    )
 
 
 def test_what_is_missing_is_listed(folders):
     mask(folders / "masks" / "kitchen.png", [0, 1])
     missing, spec = made(folders, meshes=None)
-    assert missing == ["photo IMG_0412: no mask called IMG_0412.png or IMG_0412_<material>.png", "there is no mesh: give MESHES=<folder>; rough ones will do"]
+    assert missing == [
+        "photo IMG_0412: no mask called IMG_0412.png or IMG_0412_<material>.png",
+        "there is no mesh: give MESHES=<folder>; rough ones will do",
+    ]
     assert spec["photos"][0]["masks"] == "?" and spec["photos"][1]["objects"] == []
 
 
@@ -90,7 +101,10 @@ def test_of_several_meshes_a_photo_shows_those_it_is_named_for(folders):
     mask(folders / "masks" / "IMG_0412.png", [0, 1])
     (folders / "meshes" / "kitchen.obj").write_text(OBJ)
     missing, spec = made(folders)
-    assert [photo["objects"] for photo in spec["photos"]] == [[{"name": "?", "mesh": "?"}], [{"name": "kitchen", "mesh": "kitchen"}]]
+    assert [photo["objects"] for photo in spec["photos"]] == [
+        [{"name": "?", "mesh": "?"}],
+        [{"name": "kitchen", "mesh": "kitchen"}],
+    ]
     assert missing == ["photo IMG_0412: write which of the meshes it shows"]
 
 
@@ -137,15 +151,23 @@ def test_a_photo_whose_name_the_results_take_is_listed(folders, name):
 def test_coco_categories_that_are_no_names_are_to_be_renamed(folders):
     outlines = [{"id": k, "image_id": k, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 5]]} for k in (0, 1)]
     images = [{"id": k, "file_name": photo} for k, photo in enumerate(("kitchen.jpg", "IMG 0412.png"))]
-    coco = {"images": images, "annotations": outlines, "categories": [{"id": 1, "name": "red shell"}, {"id": 2, "name": "legs"}]}
+    coco = {
+        "images": images,
+        "annotations": outlines,
+        "categories": [{"id": 1, "name": "red shell"}, {"id": 2, "name": "legs"}],
+    }
     (folders / "masks" / "all.json").write_text(json.dumps(coco))
     (folders / "meshes" / "chair.obj").write_text(OBJ.replace("g shell", "g red_shell"))
     missing, spec = made(folders)
-    assert missing == ["masks/all.json: rename its category 'red shell' to 'red_shell': names are made of A-Z a-z 0-9 _ and -"]
+    assert missing == [
+        "masks/all.json: rename its category 'red shell' to 'red_shell': names are made of A-Z a-z 0-9 _ and -"
+    ]
     assert spec["materials"] == ["red_shell", "legs"]
     dataset = read_dataset(folders / "data" / "mine")
     arguments = "photo", None, {}, folders / "pipeline.yaml"
-    assert ["category 'red shell' is no material" in str(fault) for fault in Validation(dataset).faults(*arguments)] == [True, True]
+    assert [
+        "category 'red shell' is no material" in str(fault) for fault in Validation(dataset).faults(*arguments)
+    ] == [True, True]
     file = folders / "data" / "mine" / "masks" / "all.json"
     file.write_text(file.read_text().replace("red shell", "red_shell"))
     assert Validation(dataset).faults(*arguments) == []
@@ -162,12 +184,16 @@ def test_a_mask_without_labels_is_listed(folders):
     mask(folders / "masks" / "kitchen.png", [0, 255])
     mask(folders / "masks" / "IMG_0412.png", [0, 1])
     missing, _ = made(folders)
-    assert missing == ["photo kitchen: kitchen.png has no label, for 255 means left out; the mask of one material is called kitchen_<material>.png"]
+    assert missing == [
+        "photo kitchen: kitchen.png has no label, for 255 means left out; the mask of one material is called kitchen_<material>.png"
+    ]
 
 
 def test_a_mesh_is_shown_where_its_name_is_a_whole_word_of_the_photos(folders):
     for photo in ("armchair.jpg", "red_chair-2.jpg"):
-        (folders / "photos" / "kitchen.jpg").with_name(photo).write_bytes((folders / "photos" / "kitchen.jpg").read_bytes())
+        (folders / "photos" / "kitchen.jpg").with_name(photo).write_bytes(
+            (folders / "photos" / "kitchen.jpg").read_bytes()
+        )
     (folders / "meshes" / "stool.obj").write_text(OBJ)
     _, spec = made(folders)
     shown = {photo["name"]: [each["mesh"] for each in photo["objects"]] for photo in spec["photos"]}

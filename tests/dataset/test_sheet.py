@@ -1,6 +1,5 @@
 """The contact sheet: every photo, its labels and its meshes, in one picture."""
 
-
 import numpy as np
 
 from factorlib.geometry.camera import Camera, Pose
@@ -19,7 +18,11 @@ def test_a_row_for_each_photo_with_its_labels_and_meshes(tmp_path):
     write_sheet(EAMES, tmp_path / "sheet.png", lambda k, total: done.append((k, total)))
     sheet = read_png(tmp_path / "sheet.png")
     row = MESH_SIDE + HEAD + MARGIN
-    assert sheet.shape == (HEAD + 2 * MARGIN + 6 * max(row, 180 + HEAD + MARGIN), 2 * (240 + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
+    assert sheet.shape == (
+        HEAD + 2 * MARGIN + 6 * max(row, 180 + HEAD + MARGIN),
+        2 * (240 + MARGIN) + 2 * (MESH_SIDE + MARGIN),
+        3,
+    )
     assert SIDE == 320 and done == [(k, 12) for k in range(12)]
     write_sheet(EAMES, tmp_path / "again.png")
     assert (tmp_path / "sheet.png").read_bytes() == (tmp_path / "again.png").read_bytes()
@@ -35,7 +38,9 @@ def test_a_mesh_is_drawn_upright_in_the_colours_of_its_labels():
     above, below = picture[middle - 20, middle], picture[middle + 20, middle]
     assert above[0] > 150 > above[2] and below[2] > 150 > below[0]
     assert (picture[0, 0] == 255).all()
-    assert rasterise(mesh, Camera(8, 8, 8.0, (4, 4)), Pose(np.diag([1.0, -1, -1]), np.array([0, 0, 4.0]))).label[3, 4] == 1
+    assert (
+        rasterise(mesh, Camera(8, 8, 8.0, (4, 4)), Pose(np.diag([1.0, -1, -1]), np.array([0, 0, 4.0]))).label[3, 4] == 1
+    )
 
 
 def checkout(folder):

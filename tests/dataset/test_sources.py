@@ -39,11 +39,18 @@ def folder(tmp_path):
 
 def write(folder, cameras, objects=({"name": "chair", "mesh": "chair"},), names=PHOTOS, photo=None):
     """A dataset of photos with a source of cameras; `photo` is laid over the first."""
-    photos = [{"name": name, "image": f"photos/{name}.png", "masks": "mask.png", "objects": list(objects)} for name in names]
+    photos = [
+        {"name": name, "image": f"photos/{name}.png", "masks": "mask.png", "objects": list(objects)} for name in names
+    ]
     photos[0] |= photo or {}
     for entry in photos:
         entry["name"] = entry["name"].replace("000007", "seven")
-    spec = {"format": 1, "materials": ["red"], "meshes": {"chair": {"file": "chair.ply", "material": "red"}}, "photos": photos}
+    spec = {
+        "format": 1,
+        "materials": ["red"],
+        "meshes": {"chair": {"file": "chair.ply", "material": "red"}},
+        "photos": photos,
+    }
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec | {"cameras": cameras}))
     return folder
 
@@ -58,12 +65,23 @@ def seen(external, points, name="chair", size=SIZE):
 # ---- COLMAP --------------------------------------------------------------------------------------------------
 
 
-def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE_PINHOLE", params=(300.0, 104.0, 71.0), where="sparse/0"):
+def colmap(
+    folder,
+    names=("hall.png", "attic.png"),
+    form="binary",
+    model="SIMPLE_PINHOLE",
+    params=(300.0, 104.0, 71.0),
+    where="sparse/0",
+):
     """A model of a camera that stands at different places; it is also returned."""
     made = pycolmap.Reconstruction()
-    made.add_camera_with_trivial_rig(pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params, camera_id=1))
+    made.add_camera_with_trivial_rig(
+        pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params, camera_id=1)
+    )
     for number, name in enumerate(names, start=1):
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.from_rotvec([0.1, number, -0.2]).as_matrix()), [0.2, -0.1, 4.0 + number])
+        rigid = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(Rotation.from_rotvec([0.1, number, -0.2]).as_matrix()), [0.2, -0.1, 4.0 + number]
+        )
         made.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), rigid)
     (folder / where).mkdir(parents=True, exist_ok=True)
     (made.write_binary if form == "binary" else made.write_text)(str(folder / where))
@@ -74,10 +92,14 @@ def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE
 def test_points_of_the_mesh_are_where_colmap_puts_them_in_its_world(folder, form):
     images = colmap(folder, form=form)
     world_from_object = {"scale": 2.5, "rotation": TURN.tolist(), "translation": [0.3, -0.2, 0.5]}
-    external = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_object": {"chair": world_from_object}})).external
+    external = read_dataset(
+        write(folder, {"colmap": "sparse/0", "world_from_object": {"chair": world_from_object}})
+    ).external
     in_world = np.array([2.5 * TURN @ point + [0.3, -0.2, 0.5] for point in POINTS])
     for name in PHOTOS:
-        assert np.allclose(seen(external[name], POINTS), [images[f"{name}.png"].project_point(p) for p in in_world], atol=1e-9)
+        assert np.allclose(
+            seen(external[name], POINTS), [images[f"{name}.png"].project_point(p) for p in in_world], atol=1e-9
+        )
         assert external[name].source == "colmap"
 
 
@@ -104,7 +126,9 @@ def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
     facts = dataset_slice(dataset, "light", "hall").facts
     toward = images["hall.png"].viewing_direction()  # of the world
     assert np.allclose(np.array(facts["world_from_camera"]) @ [0, 0, 1], toward)
-    own = read_dataset(write(folder, {"colmap": "sparse/0", "world_from_camera": True}, photo={"world_from_camera": TURN.tolist()}))
+    own = read_dataset(
+        write(folder, {"colmap": "sparse/0", "world_from_camera": True}, photo={"world_from_camera": TURN.tolist()})
+    )
     assert np.allclose(own.spec.photos[0].world_from_camera, TURN)
 
 
@@ -133,7 +157,9 @@ def test_a_photo_is_found_by_path_then_file_name_then_that_without_suffix(folder
 def test_what_follows_a_dot_is_no_suffix_unless_of_an_image(folder):
     (folder / "photos/r_0.5.png").write_text("")
     transforms(folder, [frame("train/r_0.5", np.eye(3), (0, 0, 5)), frame("train/r_0", np.eye(3), (0, 0, 6))])
-    external = read_dataset(write(folder, {"transforms": "transforms.json"}, photo={"image": "photos/r_0.5.png"})).external
+    external = read_dataset(
+        write(folder, {"transforms": "transforms.json"}, photo={"image": "photos/r_0.5.png"})
+    ).external
     assert set(external) == {"hall"}
 
 
@@ -142,16 +168,26 @@ def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(
     with pytest.raises(InputError, match="could be 'x/hall.png', 'y/hall.png'") as caught:
         read_dataset(write(folder, {"colmap": "sparse/0"}))
     assert caught.value.key == "cameras.images.hall"
-    cameras = {"colmap": "sparse/0", "images": {"hall": "y/hall.png", "attic": "x/hall.png"}, "world_from_object": {"chair": {}}}
+    cameras = {
+        "colmap": "sparse/0",
+        "images": {"hall": "y/hall.png", "attic": "x/hall.png"},
+        "world_from_object": {"chair": {}},
+    }
     external = read_dataset(write(folder, cameras)).external
-    assert np.allclose(external["hall"].poses["chair"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix())
+    assert np.allclose(
+        external["hall"].poses["chair"].rotation, images["y/hall.png"].cam_from_world().rotation.matrix()
+    )
 
 
 def test_a_photo_that_is_not_in_the_model_is_warned_of_and_searched(folder, caplog):
     colmap(folder, names=("hall.png",))
     with caplog.at_level(logging.WARNING):
         dataset = read_dataset(write(folder, {"colmap": "sparse/0"}))
-    assert set(dataset.external) == {"hall"} and "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
+    assert (
+        set(dataset.external) == {"hall"}
+        and "no image of photo 'attic'" in caplog.text
+        and "cameras.images" in caplog.text
+    )
     assert dataset_slice(dataset, "objects", "attic").facts["external"] is None
 
 
@@ -176,7 +212,10 @@ def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
     colmap(folder, model="SIMPLE_RADIAL", params=(300.0, 104.0, 71.0, -0.3))
     cameras = {"colmap": "sparse/0", "world_from_object": {"chair": {}}}
     given = {"rotation": TURN.tolist(), "translation": [0, 0, 3]}
-    own = {"camera": {"focal_px": 99.0, "principal_point": [100, 75]}, "objects": [{"name": "chair", "mesh": "chair", "pose": given}]}
+    own = {
+        "camera": {"focal_px": 99.0, "principal_point": [100, 75]},
+        "objects": [{"name": "chair", "mesh": "chair", "pose": given}],
+    }
     dataset = read_dataset(write(folder, cameras, names=("hall",), photo=own))  # its lens is not even looked at
     assert dataset.external["hall"].poses == {} and dataset.external["hall"].focal_px == 99.0
 
@@ -215,7 +254,9 @@ def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused(folder, mode
     assert all(word in str(caught.value) for word in words) and caught.value.key == "cameras.colmap: hall.png"
 
 
-@pytest.mark.parametrize("model, params", [("PINHOLE", (300.0, 301.0, 100.0, 75.0)), ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, 0.01))])
+@pytest.mark.parametrize(
+    "model, params", [("PINHOLE", (300.0, 301.0, 100.0, 75.0)), ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, 0.01))]
+)
 def test_less_than_half_a_pixel_does_not_matter_and_stays_so(folder, model, params):
     """Nowhere in the image does the pinhole that is taken differ from the camera by more."""
     colmap(folder, model=model, params=params)
@@ -234,7 +275,11 @@ FROM_X = np.column_stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)])  # looks along −x
 
 
 def frame(path, rotation, centre, **lens):
-    return {"file_path": path, "transform_matrix": [*([*row, c] for row, c in zip(np.array(rotation).tolist(), centre)), [0, 0, 0, 1]], **lens}
+    return {
+        "file_path": path,
+        "transform_matrix": [*([*row, c] for row, c in zip(np.array(rotation).tolist(), centre)), [0, 0, 0, 1]],
+        **lens,
+    }
 
 
 def transforms(folder, frames, lens=LENS):
@@ -250,7 +295,11 @@ def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(f
     expected = [[104 + 60, 71 - 120]]
     assert np.allclose(seen(external["hall"], np.array([[1.0, 2.0, 0.0]])), expected)
     assert np.allclose(seen(external["attic"], np.array([[0.0, 2.0, -1.0]])), expected)
-    world = read_dataset(write(folder, {"transforms": "transforms.json", "world_from_camera": True})).spec.photos[1].world_from_camera
+    world = (
+        read_dataset(write(folder, {"transforms": "transforms.json", "world_from_camera": True}))
+        .spec.photos[1]
+        .world_from_camera
+    )
     assert np.allclose(np.array(world) @ [0, 0, 1], (-1, 0, 0)) and np.allclose(np.array(world) @ [0, 1, 0], (0, -1, 0))
 
 
@@ -258,7 +307,11 @@ def test_a_field_of_view_is_a_focal_length_at_any_size(folder):
     """NeRF's own scenes: half a width is seen at half the angle; without w, of whatever width the photo has."""
     angle = 2 * math.atan(100 / 300)
     write(folder, {"transforms": "transforms.json", "world_from_object": {"chair": {}}})
-    transforms(folder, [frame("hall", np.eye(3), (0, 0, 5)), frame("attic", np.eye(3), (0, 0, 5), w=200, h=150)], {"camera_angle_x": angle})
+    transforms(
+        folder,
+        [frame("hall", np.eye(3), (0, 0, 5)), frame("attic", np.eye(3), (0, 0, 5), w=200, h=150)],
+        {"camera_angle_x": angle},
+    )
     external = read_dataset(folder).external
     for name in PHOTOS:
         assert focal_and_centre(external[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
@@ -323,7 +376,10 @@ def test_bop_turns_the_model_into_the_camera(folder):
     bop(write(folder, {"bop": "scene", "obj_ids": {"chair": 5}}, names=("000007",)))
     bop(folder, poses={"7": [GT | {"cam_R_m2c": TURN.ravel().tolist()}]})
     x, y, z = TURN @ [100, 50, 20] + [0, 0, 1500]
-    assert np.allclose(seen(read_dataset(folder).external["seven"], np.array([[100.0, 50, 20]])), [[104 + 300 * x / z, 71 + 300 * y / z]])
+    assert np.allclose(
+        seen(read_dataset(folder).external["seven"], np.array([[100.0, 50, 20]])),
+        [[104 + 300 * x / z, 71 + 300 * y / z]],
+    )
 
 
 def test_a_scene_without_poses_or_without_this_one_is_searched(folder, caplog):
@@ -371,8 +427,16 @@ def test_wrong_scenes_are_refused_where_they_are_wrong(folder, cameras, poses, k
         ({"bop": "photos"}, "cameras.bop", "test/000001"),
         ({"colmap": "sparse/0", "images": {"hal": "hall.png"}}, "cameras.images.hal", "did you mean 'hall'"),
         ({"colmap": "sparse/0", "images": {"hall": "hal.png"}}, "cameras.images.hall", "did you mean 'hall.png'"),
-        ({"colmap": "sparse/0", "world_from_object": {"chai": {}}}, "cameras.world_from_object.chai", "did you mean 'chair'"),
-        ({"colmap": "sparse/0", "world_from_object": {"chair": {"scale": 0}}}, "cameras.world_from_object.chair.scale", "more than 0"),
+        (
+            {"colmap": "sparse/0", "world_from_object": {"chai": {}}},
+            "cameras.world_from_object.chai",
+            "did you mean 'chair'",
+        ),
+        (
+            {"colmap": "sparse/0", "world_from_object": {"chair": {"scale": 0}}},
+            "cameras.world_from_object.chair.scale",
+            "more than 0",
+        ),
         (
             {"colmap": "sparse/0", "world_from_object": {"chair": {"rotation": (2 * np.eye(3)).tolist()}}},
             "cameras.world_from_object.chair.rotation",
@@ -406,12 +470,16 @@ def test_objects_of_one_photo_share_a_scale(folder):
 EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 
 
-@pytest.mark.parametrize("width, height, scale", [(200, 150, 1), (400, 300, 2), (100, 75, 0.5), (67, 50, 0.335), (133, 100, 0.665)])
+@pytest.mark.parametrize(
+    "width, height, scale", [(200, 150, 1), (400, 300, 2), (100, 75, 0.5), (67, 50, 0.335), (133, 100, 0.665)]
+)
 def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(width, height, scale):
     focal, centre = focal_and_centre(EXTERNAL, width, height, "hall")
     point = np.array([0.2, -0.1, 1.0])
     place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
-    assert np.allclose(Camera(width, height, focal, centre).project(point), place, atol=0 if scale in (1, 2, 0.5) else 0.5)
+    assert np.allclose(
+        Camera(width, height, focal, centre).project(point), place, atol=0 if scale in (1, 2, 0.5) else 0.5
+    )
 
 
 @pytest.mark.parametrize(
@@ -440,7 +508,10 @@ def test_thousands_of_photos_find_their_images_in_a_moment():
 @pytest.mark.parametrize("key", ["scale", "mesh_unit_mm"])
 @pytest.mark.parametrize("number", [1e300, 1e-300], ids=["huge", "tiny"])
 def test_a_unit_that_no_mesh_has_is_refused(folder, key, number):
-    of_source = {"transforms": "t.json", "world_from_object": {"chair": {"scale": number}}}, {"bop": ".", "mesh_unit_mm": number}
+    of_source = (
+        {"transforms": "t.json", "world_from_object": {"chair": {"scale": number}}},
+        {"bop": ".", "mesh_unit_mm": number},
+    )
     (folder / "t.json").write_text("{}")
     with pytest.raises(InputError) as caught:
         read_dataset(write(folder, of_source[key != "scale"]))

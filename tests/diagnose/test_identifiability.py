@@ -23,12 +23,22 @@ NAMES = ("a", "b", "c")
 def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(tints, bounced, said):
     rng, operator = np.random.default_rng(0), reflection_operator("closed_form", dtype="float64")
     grey = [random_light(rng, 3) for _ in tints]
-    grey = [msgspec.structs.replace(light, weight=np.repeat(light.weight.mean(1, keepdims=True), 3, axis=1)) for light in grey]
+    grey = [
+        msgspec.structs.replace(light, weight=np.repeat(light.weight.mean(1, keepdims=True), 3, axis=1))
+        for light in grey
+    ]
     blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
     if bounced:
         blocks = [msgspec.structs.replace(one, bounced=np.zeros((len(one), 6))) for one in blocks]
-    lights = [msgspec.structs.replace(light, weight=10.0**k * light.weight * tint) for k, (light, tint) in enumerate(zip(grey, tints, strict=True))]
+    lights = [
+        msgspec.structs.replace(light, weight=10.0**k * light.weight * tint)
+        for k, (light, tint) in enumerate(zip(grey, tints, strict=True))
+    ]
     sentences = tinted_alike(NAMES, blocks, lights)
     assert len(sentences) == said
     if said:
-        assert "room0, room1" in sentences[0] and "R : G : B = 0.4" in sentences[0] and "solve.interreflection=off" in sentences[0]
+        assert (
+            "room0, room1" in sentences[0]
+            and "R : G : B = 0.4" in sentences[0]
+            and "solve.interreflection=off" in sentences[0]
+        )

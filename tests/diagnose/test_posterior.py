@@ -20,7 +20,9 @@ def solved():
 
 
 def with_materials(fit, **parts):
-    return msgspec.structs.replace(fit, point=Point(msgspec.structs.replace(fit.point.materials, **parts), fit.point.lights))
+    return msgspec.structs.replace(
+        fit, point=Point(msgspec.structs.replace(fit.point.materials, **parts), fit.point.lights)
+    )
 
 
 def test_a_nil_reflectance_is_not_known_for_sure(solved):
@@ -36,7 +38,9 @@ def test_no_observation_mends_what_the_model_has_wrong(solved):
     problem, _, found = solved
     errors, materials = Posterior(problem, found, PRIOR).standard_errors(), found.point.materials
     wrong = min(1.0, errors.deviation) * MODEL_ERROR
-    assert (errors.materials.roughness >= wrong[6]).all() and (errors.materials.specular >= wrong[3:6] * materials.specular).all()
+    assert (errors.materials.roughness >= wrong[6]).all() and (
+        errors.materials.specular >= wrong[3:6] * materials.specular
+    ).all()
     assert (errors.materials.diffuse >= wrong[:3] * materials.diffuse).all() and (MODEL_ERROR > 0).all()
 
 
@@ -44,7 +48,13 @@ def test_materials_lie_within_a_few_standard_errors(solved):
     problem, _, found = solved
     errors, m = Posterior(problem, found, PRIOR).standard_errors().materials, found.point.materials
     factor = factor_between(m, MATERIALS)
-    off = np.column_stack([m.diffuse * factor - MATERIALS.diffuse, m.specular * factor - MATERIALS.specular, m.roughness - MATERIALS.roughness])
+    off = np.column_stack(
+        [
+            m.diffuse * factor - MATERIALS.diffuse,
+            m.specular * factor - MATERIALS.specular,
+            m.roughness - MATERIALS.roughness,
+        ]
+    )
     scale = np.column_stack([errors.diffuse * factor, errors.specular * factor, errors.roughness])
     assert np.mean(np.abs(off) < scale) > 0.5 and np.mean(np.abs(off) < 3 * scale) > 0.95, np.round(off / scale, 1)
 
@@ -68,7 +78,9 @@ def test_fewer_observations_tell_less(solved):
     problem, _, found = solved
     errors, of_few = (Posterior(p, found, PRIOR).standard_errors().materials for p in (problem, problem.sampled(60, 0)))
     assert np.mean(of_few.vector() > errors.vector()) > 0.8
-    maps, maps_of_few = (Posterior(p, found, PRIOR).relative_standard_errors()["room0"] for p in (problem, problem.sampled(60, 0)))
+    maps, maps_of_few = (
+        Posterior(p, found, PRIOR).relative_standard_errors()["room0"] for p in (problem, problem.sampled(60, 0))
+    )
     assert maps_of_few.mean() > maps.mean()
 
 

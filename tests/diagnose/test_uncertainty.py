@@ -34,7 +34,10 @@ def noisy(seed: int):
         data = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=20)
         radiance = data.radiance + NOISE * rng.normal(size=data.radiance.shape) / data.precision
         blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=np.zeros(len(data), bool)))
-    scaled = [msgspec.structs.replace(light, weight=light.weight / data.unit) for light, data in zip(lights, blocks, strict=True)]
+    scaled = [
+        msgspec.structs.replace(light, weight=light.weight / data.unit)
+        for light, data in zip(lights, blocks, strict=True)
+    ]
     problem = JointProblem(blocks, OPERATOR, LOSS)
     return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), Descent(25, 1e-7)).point
 
@@ -47,7 +50,9 @@ def solved():
 def test_scores_of_clusters_sum_to_the_gradient(solved):
     problem, point = solved
     whole = clustered_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0))
-    np.testing.assert_allclose(whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8)
+    np.testing.assert_allclose(
+        whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8
+    )
     assert len(whole.scores) > 20
     (reduced,) = ArrowSystem([whole], 21).reduced_scores(Point(MATERIALS, point.lights[:1]))
     assert reduced.shape == (len(whole.scores), 21)
@@ -76,10 +81,15 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
     inside = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        blocks = [block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)]
+        blocks = [
+            block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)
+        ]
         problem = JointProblem(blocks, OPERATOR)
         solution = few_lobes(problem, from_nothing(3), Run(FEW_LOBES))
-        found, errors = solution.point.materials, standard_errors(problem.with_loss(solution.loss), solution.point).materials
+        found, errors = (
+            solution.point.materials,
+            standard_errors(problem.with_loss(solution.loss), solution.point).materials,
+        )
         factor = factor_between(found, MATERIALS)
         true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
         inside += (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()

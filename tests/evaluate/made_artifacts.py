@@ -111,7 +111,9 @@ def _row_of_balls(names: list[str], make) -> np.ndarray:
     return np.concatenate(pictures, axis=1)
 
 
-def _photo(made: Made, folders: dict, photo: str, seen: list[str], materials: list[str], light_values: np.ndarray) -> None:
+def _photo(
+    made: Made, folders: dict, photo: str, seen: list[str], materials: list[str], light_values: np.ndarray
+) -> None:
     light = light_of_lat_long(light_values)
     rgb = _row_of_balls(seen, lambda m, n: ball(light, TRUE[m], n))
     found = _row_of_balls(seen, lambda m, n: ball(light, perturbed(TRUE[m], made.error), n))
@@ -142,7 +144,9 @@ def _masks_and_align(folders, photo, rgb, clipped, label, normal) -> None:
         **{f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")}, "view.x": 0 * inside, "view.y": 0 * inside,
         "view.z": -inside, "depth": 4 * inside, "label": label, "object": inside, "confidence": inside,
     })  # fmt: skip
-    write_png(folders["align"] / f"{photo}_overlay.png", (np.stack([label / max(label.max(), 1)] * 3, -1) * 255).astype("u1"))
+    write_png(
+        folders["align"] / f"{photo}_overlay.png", (np.stack([label / max(label.max(), 1)] * 3, -1) * 255).astype("u1")
+    )
 
 
 def _export_and_render(made: Made, folders, photo, seen, light, light_values, found) -> None:
@@ -165,13 +169,19 @@ def lobes_of(seed: int) -> Lobes:
     """A broad light and two lamps, in a camera's frame."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(3, 3)) - [0, 1, 1]
-    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.5, 60.0, 400.0]), rng.uniform(0.2, 1, (3, 3)) * [[0.5], [2], [8]])
+    return Lobes(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        np.array([1.5, 60.0, 400.0]),
+        rng.uniform(0.2, 1, (3, 3)) * [[0.5], [2], [8]],
+    )
 
 
 def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     write_lobes(folders["export"] / "lobes.parquet", {photo: lobes_of(k) for k, photo in enumerate(made.seen)})
     shape = sphere(0.5)
-    halves = msgspec.structs.replace(shape, face_label=1 + (np.arange(len(shape.faces)) % len(materials)).astype(np.int16))
+    halves = msgspec.structs.replace(
+        shape, face_label=1 + (np.arange(len(shape.faces)) % len(materials)).astype(np.int16)
+    )
     write_glb(folders["export"] / "ball.glb", halves, materials, {m: perturbed(TRUE[m], made.error) for m in materials})
     photos = {p: msgspec.json.decode((folders["masks"] / f"{p}.json").read_bytes()) for p in made.seen}
     write_json(folders["masks"] / "photos.json", photos)
@@ -180,7 +190,10 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     write_json(folders["align"] / "poses.json", {p: {"camera": camera, "objects": {"balls": pose}} for p in made.seen})
     entries = {m: msgspec.to_builtins(perturbed(TRUE[m], made.error)) for m in materials}
     for entry in entries.values():
-        entry |= {"alpha": entry["roughness"] ** 2, "stderr": {"diffuse": [0.01] * 3, "specular": [0.005] * 3, "roughness": 0.01}}
+        entry |= {
+            "alpha": entry["roughness"] ** 2,
+            "stderr": {"diffuse": [0.01] * 3, "specular": [0.005] * 3, "roughness": 0.01},
+        }
     model = {"solver": "bundle", "lobes": dict.fromkeys(made.seen, 24)}
     result = {"materials": entries, "gauge": {"rule": "the lights are white on the whole"}, "model": model}
     for stage in ("solve", "export"):
@@ -199,6 +212,10 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     }
     summary = {"median": 0.001, "p95": 0.004, "samples": 100}
     write_json(folders["train"] / "accuracy.json", {"diffuse": summary, "specular": summary | bins})
-    curve = {"part": ["specular"] * 3 + ["diffuse"] * 3, "step": [100, 200, 300] * 2, "training_loss": [0.3, 0.2, 0.1] * 2}
+    curve = {
+        "part": ["specular"] * 3 + ["diffuse"] * 3,
+        "step": [100, 200, 300] * 2,
+        "training_loss": [0.3, 0.2, 0.1] * 2,
+    }
     curve |= {"held_out_median_error": [0.1, 0.05, 0.02] * 2, "held_out_p95_error": [0.3, 0.2, 0.1] * 2}
     pq.write_table(pa.table(curve), folders["train"] / "training.parquet")

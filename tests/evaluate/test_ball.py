@@ -64,7 +64,9 @@ def test_the_matte_ball_is_the_plain_quadrature():
     radiance = lobe_map(20)
     incoming = lat_long_directions(128, 256).reshape(-1, 3)
     weight = np.maximum(NORMALS @ incoming.T, 0) * np.repeat(lat_long_solid_angles(128, 256), 256)
-    assert diffuse_ball(light_of_lat_long(radiance), NORMALS) == pytest.approx(weight @ radiance.reshape(-1, 3) / np.pi, rel=5e-3)
+    assert diffuse_ball(light_of_lat_long(radiance), NORMALS) == pytest.approx(
+        weight @ radiance.reshape(-1, 3) / np.pi, rel=5e-3
+    )
 
 
 def test_the_octahedral_square_keeps_energy_and_directions():

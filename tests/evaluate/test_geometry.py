@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorlib.dataset.schema import Pose
-from factorlib.evaluate.geometry import RANDOM_ROTATION_DEG, averaged_normals, normal_error, pose_error, rotation_angle_deg
+from factorlib.evaluate.geometry import (
+    RANDOM_ROTATION_DEG,
+    averaged_normals,
+    normal_error,
+    pose_error,
+    rotation_angle_deg,
+)
 
 
 @pytest.mark.parametrize("degrees", [0, 1e-3, 30, 90, 179])
@@ -43,6 +49,8 @@ def test_true_normals_are_averaged_as_the_photo_was():
     normal[0, 0], normal[1, 0] = [0.6, 0.0, -0.8], [-0.6, 0.0, -0.8]
     small = averaged_normals(normal, 2)
     assert small.shape == (2, 4, 3)
-    np.testing.assert_allclose(small[:, :3], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-12)  # half of a box is enough
+    np.testing.assert_allclose(
+        small[:, :3], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-12
+    )  # half of a box is enough
     assert (small[:, 3] == 0).all()
     assert averaged_normals(normal, 1) is normal

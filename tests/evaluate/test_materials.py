@@ -52,4 +52,6 @@ def test_unseen_and_untold_materials_are_left_out():
 def test_black_specular_has_no_infinite_error():
     truth = {"chalk": Reflectance((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), 0.5)}
     estimate = {"chalk": Reflectance((0.5, 0.5, 0.5), (0.005, 0.0, 0.0), 0.5)}
-    assert compare_materials(estimate, truth, {"chalk": 0}).materials["chalk"].error.specular[0] == pytest.approx(0.5, rel=0.3)
+    assert compare_materials(estimate, truth, {"chalk": 0}).materials["chalk"].error.specular[0] == pytest.approx(
+        0.5, rel=0.3
+    )

@@ -34,4 +34,9 @@ def test_pairs_that_no_photo_shows_are_told_apart():
 
 @pytest.mark.parametrize("missing", ["materials", "lights"])
 def test_without_a_pair_there_is_nothing(missing):
-    assert compare_relighting(TRUE, {} if missing == "materials" else TRUE, LIGHTS, {} if missing == "lights" else LIGHTS, {}) is None
+    assert (
+        compare_relighting(
+            TRUE, {} if missing == "materials" else TRUE, LIGHTS, {} if missing == "lights" else LIGHTS, {}
+        )
+        is None
+    )

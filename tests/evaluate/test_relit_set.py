@@ -19,7 +19,9 @@ BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 0.5)
 
 
 def times(material, factor):
-    diffuse, specular = (tuple((np.array(colour) * factor).tolist()) for colour in (material.diffuse, material.specular))
+    diffuse, specular = (
+        tuple((np.array(colour) * factor).tolist()) for colour in (material.diffuse, material.specular)
+    )
     return Reflectance(diffuse, specular, material.roughness)
 
 
@@ -53,13 +55,18 @@ def test_an_exposure_of_all_lights_is_no_gauge():
 
 def test_the_pair_is_shown_with_the_true_ball_at_half():
     true = np.full((5, 3), 7.0)  # shown as .5: 10 % more radiance is .5^(1/2.2) (1.1^(1/2.2) − 1) more
-    assert shown_psnr(1.1 * true, true) == pytest.approx(-20 * math.log10(0.5 ** (1 / 2.2) * (1.1 ** (1 / 2.2) - 1)), abs=1e-5)
+    assert shown_psnr(1.1 * true, true) == pytest.approx(
+        -20 * math.log10(0.5 ** (1 / 2.2) * (1.1 ** (1 / 2.2) - 1)), abs=1e-5
+    )
 
 
 def test_a_disc_of_the_true_mean_colour_scores_the_null():
     red, grey = {"red": TRUE["red"]}, {"a": LIGHTS["a"]}
     colour = Appearances(LIGHTS["a"]).ball(TRUE["red"]).mean(axis=0)
-    white, flat = Reflectance((1.0,) * 3, (0.0,) * 3, 0.5), {"a": constant_light(colour)}  # a white ball in constant light is a flat disc
+    white, flat = (
+        Reflectance((1.0,) * 3, (0.0,) * 3, 0.5),
+        {"a": constant_light(colour)},
+    )  # a white ball in constant light is a flat disc
     found = compare_relit_set({"red": white}, red, flat, grey)
     assert found.mean_psnr_db == pytest.approx(found.null_mean_psnr_db, abs=0.01)
 

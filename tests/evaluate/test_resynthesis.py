@@ -14,7 +14,11 @@ def channels():
     rng = np.random.default_rng(5)
     one, none = np.ones(SHAPE), np.zeros(SHAPE)
     label = np.where(np.arange(SHAPE[1]) < 15, 1.0, 2.0) * one
-    photo = {c: rng.uniform(0.2, 0.8, SHAPE) for c in "RGB"} | {"label": label, "valid": one.copy(), "left_out": none.copy()}
+    photo = {c: rng.uniform(0.2, 0.8, SHAPE) for c in "RGB"} | {
+        "label": label,
+        "valid": one.copy(),
+        "left_out": none.copy(),
+    }
     photo |= {f"clipped.{c}": none.copy() for c in "RGB"}
     vector = {f"{kind}.{a}": (-one if a == "z" else none) for kind in ("normal", "view") for a in "xyz"}
     return photo, vector | {"label": label.copy(), "confidence": one}

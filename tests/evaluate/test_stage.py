@@ -20,7 +20,9 @@ LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
 def numbers_in(value) -> list[float]:
     """Every number of nested plain containers."""
     if isinstance(value, dict | list):
-        return [number for inner in (value.values() if isinstance(value, dict) else value) for number in numbers_in(inner)]
+        return [
+            number for inner in (value.values() if isinstance(value, dict) else value) for number in numbers_in(inner)
+        ]
     return [value] if isinstance(value, int | float) else []
 
 

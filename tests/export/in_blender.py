@@ -19,8 +19,12 @@ MISSING = 'Blender is not installed: make setup EXTRAS="blender", or put `blende
 
 def rendered(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> dict[str, np.ndarray]:
     """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
-    jobs = [[photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos]
-    code = f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
+    jobs = [
+        [photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos
+    ]
+    code = (
+        f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
+    )
     run(code)
     return {photo: rgba(scenes / f"{photo}.blender.exr") for photo in photos}
 

@@ -78,7 +78,9 @@ def make(folder: Path) -> Inputs:
     parts = {"ball": {"upper": "red", "lower": "red"}, "egg": {"upper": "red", "lower": "brass"}}
     meshes = {name: {"file": f"{name}.obj", "parts": parts[name], "material": None} for name in parts}
     for photo, name in MESHES.items():
-        _write_photo(folder, photo, rasterise(read_mesh(files[f"{name}.obj"], NAMES, parts[name]), CAMERAS[photo], POSES[photo]))
+        _write_photo(
+            folder, photo, rasterise(read_mesh(files[f"{name}.obj"], NAMES, parts[name]), CAMERAS[photo], POSES[photo])
+        )
     write_json(folder / "align" / "poses.json", {photo: _pose_entry(photo) for photo in MESHES})
     stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
     table = {n: {**m, "alpha": m["roughness"] ** 2, "stderr": stderr} for n, m in MATERIALS.items()}
@@ -90,7 +92,8 @@ def make(folder: Path) -> Inputs:
         "dataset.light": {p: _light_facts(p) for p in MESHES},
         "dataset.ground": {p: {"ground": None} for p in MESHES},
         "dataset.objects": {
-            p: {"camera": {}, "objects": [{"name": "chair", "mesh": m}], "meshes": {m: meshes[m]}} for p, m in MESHES.items()
+            p: {"camera": {}, "objects": [{"name": "chair", "mesh": m}], "meshes": {m: meshes[m]}}
+            for p, m in MESHES.items()
         },
     }
     return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
@@ -116,7 +119,12 @@ def make_result(root: Path, name: str = "set") -> Path:
     for file, path in inputs.files.items():
         (dataset / file).write_bytes(path.read_bytes())
     photos = [
-        {"name": photo, "image": f"{photo}.png", "masks": f"{photo}_mask.png", "objects": [{"name": "chair", "mesh": mesh}]}
+        {
+            "name": photo,
+            "image": f"{photo}.png",
+            "masks": f"{photo}_mask.png",
+            "objects": [{"name": "chair", "mesh": mesh}],
+        }
         for photo, mesh in MESHES.items()
     ]
     photos[1] |= {"illumination": "room", "world_from_camera": WORLD_FROM_CAMERA["side"].tolist()}
@@ -136,14 +144,23 @@ def of_photo(inputs: Inputs, photo: str) -> Inputs:
 
 def _light_facts(photo: str) -> dict:
     world = WORLD_FROM_CAMERA[photo]
-    return {"illumination": "front" if world is None else "room", "world_from_camera": None if world is None else world.tolist()}
+    return {
+        "illumination": "front" if world is None else "room",
+        "world_from_camera": None if world is None else world.tolist(),
+    }
 
 
 def _pose_entry(photo: str) -> dict:
     camera, pose = CAMERAS[photo], POSES[photo]
     return {
         "camera": {"focal_px": camera.focal, "principal_point": list(camera.centre)},
-        "objects": {"chair": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}},
+        "objects": {
+            "chair": {
+                "rotation": pose.rotation.tolist(),
+                "translation": pose.translation.tolist(),
+                "silhouette_iou": 1.0,
+            }
+        },
     }
 
 

@@ -64,7 +64,9 @@ def closed_form(name: str, model) -> tuple[np.ndarray, np.ndarray]:
     i, j = texel_of(direction, camera_from_light)
     light = camera_from_light @ YUP_FROM_CAMERA @ lat_long_directions(ROWS, 2 * ROWS)[i, j]
     energy = 1000.0 * EXPOSURE * lat_long_solid_angles(ROWS, 2 * ROWS)[i]
-    x, y = np.meshgrid(np.arange(VIEW.width) + 0.5 - VIEW.principal_point[0], np.arange(VIEW.height) + 0.5 - VIEW.principal_point[1])
+    x, y = np.meshgrid(
+        np.arange(VIEW.width) + 0.5 - VIEW.principal_point[0], np.arange(VIEW.height) + 0.5 - VIEW.principal_point[1]
+    )
     ray = np.stack([x, y, np.full_like(x, VIEW.focal_px)], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     along, inside = DISTANCE * ray[..., 2], DISTANCE**2 * (ray[..., 2] ** 2 - 1) + 1
@@ -74,7 +76,9 @@ def closed_form(name: str, model) -> tuple[np.ndarray, np.ndarray]:
     ni, no = (normal @ light).clip(0) * (inside > 0), -(normal * ray).sum(axis=-1).clip(max=-0.01)
     angles = Angles(ni, no, (normal * half).sum(axis=-1).clip(0, 1), -(ray * half).sum(axis=-1))
     parts = model(material, angles)
-    return (parts.diffuse + distribution(material.alpha, angles.nh)[..., None] * parts.lobe) * ni[..., None] * energy, ni
+    return (parts.diffuse + distribution(material.alpha, angles.nh)[..., None] * parts.lobe) * ni[
+        ..., None
+    ] * energy, ni
 
 
 @pytest.fixture(scope="module")
@@ -132,12 +136,23 @@ def test_json_holds_the_scene_as_it_was_exported(exported):
     _, out = exported
     scene = read_json(out / "scenes" / "side.json")
     camera, pose = made_export.CAMERAS["side"], made_export.POSES["side"]
-    assert scene["camera"] == {"width": 64, "height": 56, "focal_px": camera.focal, "principal_point": list(camera.centre)}
+    assert scene["camera"] == {
+        "width": 64,
+        "height": 56,
+        "focal_px": camera.focal,
+        "principal_point": list(camera.centre),
+    }
     assert [shape["name"] for shape in scene["shapes"]] == ["chair.red", "chair.brass"]
-    np.testing.assert_allclose(np.array(scene["shapes"][0]["cam_from_object"])[:3], np.c_[pose.rotation, pose.translation])
+    np.testing.assert_allclose(
+        np.array(scene["shapes"][0]["cam_from_object"])[:3], np.c_[pose.rotation, pose.translation]
+    )
     assert scene["light"]["exposure"] == [0.5] * 3 and scene["max_depth"] == 2
     np.testing.assert_allclose(scene["light"]["camera_from_light"], made_export.WORLD_FROM_CAMERA["side"].T)
-    assert set(scene["materials"]) == {"red", "brass"} and set(scene["materials"]["red"]) == {"diffuse", "specular", "roughness"}
+    assert set(scene["materials"]) == {"red", "brass"} and set(scene["materials"]["red"]) == {
+        "diffuse",
+        "specular",
+        "roughness",
+    }
     files = [scene["light"]["file"], *(shape["file"] for shape in scene["shapes"])]
     assert all((out / "scenes" / file).is_file() for file in files)
 

@@ -35,7 +35,9 @@ def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
     before = solved(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
     table = MaterialTable({"a": before}, Gauge(rule="x"))
     found = table_in_gauge(table, 0.5)
-    assert found.materials == {"a": solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))}
+    assert found.materials == {
+        "a": solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
+    }
     assert found.gauge.rule == "x" and found.gauge.export_factor == 0.5
     assert table.materials["a"] == before
 
@@ -46,7 +48,9 @@ def test_materialx_mixes_to_the_solved_reflectances(tmp_path):
     for name, material in CASES.items():
         value = {(n.get("name"), i.get("name")): i.get("value") for n in root for i in n}
         weight = float(value[f"m_{name}_bsdf", "mix"])
-        diffuse, specular = (numbers(value[key]) for key in ((f"m_{name}_diffuse", "color"), (f"m_{name}_specular", "color0")))
+        diffuse, specular = (
+            numbers(value[key]) for key in ((f"m_{name}_diffuse", "color"), (f"m_{name}_specular", "color0"))
+        )
         np.testing.assert_allclose((1 - weight) * diffuse, material.diffuse, atol=1e-12)
         np.testing.assert_allclose(weight * specular, material.specular, atol=1e-12)
         assert numbers(value[f"m_{name}_specular", "roughness"]).tolist() == [material.alpha] * 2
@@ -56,7 +60,10 @@ def test_standard_surface_has_the_solved_reflectances_under_no_fresnel(tmp_path)
     write_materialx(tmp_path / "m.mtlx", CASES)
     root = ET.parse(tmp_path / "m.mtlx").getroot()
     for name, material in CASES.items():
-        value = {i.get("name"): i.get("value") for i in root.find(f"standard_surface[@name='m_{name}_standard_surface_surface']")}
+        value = {
+            i.get("name"): i.get("value")
+            for i in root.find(f"standard_surface[@name='m_{name}_standard_surface_surface']")
+        }
         specular, ior = float(value["specular"]), float(value["specular_IOR"])
         assert ((ior - 1) / (ior + 1)) ** 2 > 1 - 5e-4
         np.testing.assert_allclose(specular * numbers(value["specular_color"]), material.specular, atol=1e-12)
@@ -82,7 +89,13 @@ def test_materialx_is_valid_where_its_library_is_there(tmp_path):
 
 def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    mesh = Mesh(square, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0.0, 0, 1], (4, 1)), np.array([1, 3], np.int16), open=True)
+    mesh = Mesh(
+        square,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.tile([0.0, 0, 1], (4, 1)),
+        np.array([1, 3], np.int16),
+        open=True,
+    )
     write_glb(tmp_path / "m.glb", mesh, ["bright", "unused", "metal"], CASES)
     write_glb(tmp_path / "n.glb", mesh, ["bright", "unused", "metal"], CASES)
     assert (tmp_path / "m.glb").read_bytes() == (tmp_path / "n.glb").read_bytes()
@@ -90,7 +103,11 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
     tree = _gltf(tmp_path / "m.glb")
     for entry in tree["materials"]:
-        material, core, more = CASES[entry["name"]], entry["pbrMetallicRoughness"], entry["extensions"]["KHR_materials_specular"]
+        material, core, more = (
+            CASES[entry["name"]],
+            entry["pbrMetallicRoughness"],
+            entry["extensions"]["KHR_materials_specular"],
+        )
         f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
         np.testing.assert_allclose(f0, material.specular, atol=1e-12)
         np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)

@@ -35,7 +35,14 @@ def pictures(tmp_path_factory):
     write_materialx(folder / "m.mtlx", MATERIALS)
     _write_ball(folder)
     names = [f"m_{material}_{surface}" for material in MATERIALS for surface in SURFACES]
-    script = [sys.executable, str(Path(__file__).with_name("in_materialx.py")), str(folder), str(SIZE), ",".join(map(str, LAMP)), *names]
+    script = [
+        sys.executable,
+        str(Path(__file__).with_name("in_materialx.py")),
+        str(folder),
+        str(SIZE),
+        ",".join(map(str, LAMP)),
+        *names,
+    ]
     done = subprocess.run([*screen, *script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return {name: np.load(folder / f"{name}.npy") for name in names}
@@ -61,4 +68,6 @@ def test_shaders_show_what_the_model_says(pictures, material, surface):
     expected = in_lamp(MATERIALS[material], SURFACES[surface], normal[lit], LAMP)
     error = np.abs(pictures[f"m_{material}_{surface}"][lit] / expected - 1)
     assert lit.sum() > 200
-    assert np.median(error) < 0.015 and np.percentile(error, 95) < 0.06  # MaterialX fits its albedo E by a rational function
+    assert (
+        np.median(error) < 0.015 and np.percentile(error, 95) < 0.06
+    )  # MaterialX fits its albedo E by a rational function

@@ -56,7 +56,9 @@ def test_scene_equals_resynthesis(exported, photo):
     table = read_materials(out / "materials.json").materials
     pixels = whole_pixels(geometry["label"])
     reflector = Reflector(Reference(tolerance=1e-3), light)
-    expected = resynthesised(reflector, [table[n] for n in made_export.NAMES], {"label": masks["label"] * pixels}, geometry)
+    expected = resynthesised(
+        reflector, [table[n] for n in made_export.NAMES], {"label": masks["label"] * pixels}, geometry
+    )
     found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
     error = block_means(found, pixels) / block_means(expected, pixels) - 1
     assert len(error) >= 15
@@ -66,7 +68,13 @@ def test_scene_equals_resynthesis(exported, photo):
 
 # one texel, one side ------------------------------------------------------------------------------------------------
 
-SIDES = {"right": (1, 0, 0), "left": (-1, 0, 0), "above": (0, -1, 0), "below": (0, 1, 0), "viewer": (0, 0, -1)}  # camera frame
+SIDES = {
+    "right": (1, 0, 0),
+    "left": (-1, 0, 0),
+    "above": (0, -1, 0),
+    "below": (0, 1, 0),
+    "viewer": (0, 0, -1),
+}  # camera frame
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +93,11 @@ def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = Fa
     place[2, 3] = 5.0
     shape = Shape("ball", "ball.red.ply", "red", place, two_sided)
     write_scene(
-        folder / "scene.xml", View(32, 32, 70.0, (16.0, 16.0)), [shape], {"red": material}, Environment("light.exr", 1.0, camera_from_light)
+        folder / "scene.xml",
+        View(32, 32, 70.0, (16.0, 16.0)),
+        [shape],
+        {"red": material},
+        Environment("light.exr", 1.0, camera_from_light),
     )
     return folder / "scene.xml"
 
@@ -112,7 +124,9 @@ def test_light_fixed_to_the_world_turns_with_the_camera(folder):
     turn = made_export.WORLD_FROM_CAMERA["side"]
     lambertian = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
     still = rendered(ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
-    turned = rendered(ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64)
+    turned = rendered(
+        ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64
+    )
     np.testing.assert_allclose(centroid(turned), centroid(still), atol=0.01)
     assert turned.mean() == pytest.approx(still.mean(), rel=0.01)
 

@@ -48,7 +48,9 @@ def test_names_that_are_no_identifiers_are_shown_and_get_one_of_their_own():
     assert [json.loads(shown) for _, shown in objects] == ["a_b", "3 chairs", "a-b", 'say "hi"\\\n', "стул"]
     assert all(re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) for name in re.findall(r'def \w+ "([^"\n]*)"', text))
     assert len({name for name, _ in objects}) == len(ODD)
-    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == set(re.findall(r'def Material "(\w+)"', text))
+    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == set(
+        re.findall(r'def Material "(\w+)"', text)
+    )
 
 
 def test_a_name_that_is_an_identifier_is_kept_whatever_stands_before_it():
@@ -68,7 +70,10 @@ def test_matrices_are_written_for_rows_and_turned_y_up():
 
 def test_exposure_is_intensity_times_colour_and_no_light_has_a_colour_too():
     assert "inputs:color = (1.0, 0.5, 0.25)" in (text := text_of(["a"], ["red"])) and "inputs:intensity = 2.0" in text
-    assert "inputs:color = (1.0, 1.0, 1.0)" in (text := text_of(["a"], ["red"], exposure=(0, 0, 0))) and "inputs:intensity = 0.0" in text
+    assert (
+        "inputs:color = (1.0, 1.0, 1.0)" in (text := text_of(["a"], ["red"], exposure=(0, 0, 0)))
+        and "inputs:intensity = 0.0" in text
+    )
 
 
 @pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
@@ -199,10 +204,14 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     assert dome.GetTextureFormatAttr().Get() == "latlong" and file
     found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
     name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
-    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)  # camera frame
+    light = (
+        read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
+    )  # camera frame
     directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
     x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
     rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
     expected = light.radiance(directions)
     assert expected.max() > 3 * np.median(expected)
-    np.testing.assert_allclose(found[rows.astype(int), columns.astype(int)], expected, rtol=0.25, atol=0.01 * expected.max())
+    np.testing.assert_allclose(
+        found[rows.astype(int), columns.astype(int)], expected, rtol=0.25, atol=0.01 * expected.max()
+    )

@@ -105,7 +105,13 @@ def balls(tmp_path_factory):
         light[texel_of(direction, camera_from_light)] = 1000.0
         write_rgb_exr(folder / f"{name}.light.exr", light, LAT_LONG)
         exposed = ExposedMap(f"./{name}.light.exr", EXPOSURE, camera_from_light)
-        write_usd_scene(folder / f"{name}.usda", VIEW, [Shape("ball.red", "ball.ply", "red", place, False)], {"red": LAMBERTIAN}, exposed)
+        write_usd_scene(
+            folder / f"{name}.usda",
+            VIEW,
+            [Shape("ball.red", "ball.ply", "red", place, False)],
+            {"red": LAMBERTIAN},
+            exposed,
+        )
     run(RENDER, [folder / f"{name}.usda" for name in LIT], SIZE=(VIEW.width, VIEW.height))
     return {name: in_blender.rgba(folder / f"{name}.usda.exr") for name in LIT}
 
@@ -116,6 +122,8 @@ def test_dome_lights_the_ball_from_its_side(balls, name):
     expected, ni = closed_form(name, viewers.solved)
     lit = (ni > 0.3) & (balls[name][..., 3] == 1)
     error = balls[name][lit][:, :3] / expected[lit] - 1
-    print(f"{name}: difference {np.median(np.abs(error)):.2%} (median), {np.percentile(np.abs(error), 90):.2%} (90th percentile)")
+    print(
+        f"{name}: difference {np.median(np.abs(error)):.2%} (median), {np.percentile(np.abs(error), 90):.2%} (90th percentile)"
+    )
     assert lit.sum() >= 15
     assert np.median(np.abs(error)) < 0.01 and np.percentile(np.abs(error), 90) < 0.05

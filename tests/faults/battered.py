@@ -39,7 +39,10 @@ def slow_project(root: Path, **texts: str) -> Project:
     write(root / "toylib" / "slowly.py", SLOWLY)
     for name, text in (("upper", toy.UPPER), ("count", toy.COUNT), ("table", toy.TABLE), ("total", toy.TOTAL)):
         slow = re.sub(r"\(out / (.+?)\)\.write_text\((.*)\)$", r"write(out / \1, \2)", text, flags=re.MULTILINE)
-        write(root / "stages" / f"{name}.py", slow.replace("import msgspec\n", "import msgspec\nfrom toylib.slowly import write\n", 1))
+        write(
+            root / "stages" / f"{name}.py",
+            slow.replace("import msgspec\n", "import msgspec\nfrom toylib.slowly import write\n", 1),
+        )
     return made
 
 
@@ -47,7 +50,9 @@ def start(project: Project, *settings: str, **environment: str) -> subprocess.Po
     """A run as a user starts it, in a group of processes of its own, writing slowly."""
     command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
     words = {**os.environ, "PYTHONPATH": str(LIBRARY), "TOY_PAUSE": PAUSE, "PYTHONDONTWRITEBYTECODE": "1"} | environment
-    return subprocess.Popen(command, env=words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, env=words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
 
 
 def make(project: Project, *settings: str) -> int:
@@ -114,7 +119,11 @@ def kill(process: subprocess.Popen, whom: str) -> None:
 
 def results(project: Project) -> dict[str, bytes]:
     """What a user finds under the data set's name, but for the log of runs; drafts of a writer that was killed are hidden files."""
-    return {name: data for name, data in files_of(project.build / "set").items() if name != "log.jsonl" and not name.startswith(("errors/", "."))}
+    return {
+        name: data
+        for name, data in files_of(project.build / "set").items()
+        if name != "log.jsonl" and not name.startswith(("errors/", "."))
+    }
 
 
 def kept(project: Project) -> dict[str, str]:
@@ -143,7 +152,9 @@ def lost_in(project: Project, wanted: dict[str, bytes], *settings: str) -> list[
         found.append(f"made twice: {', '.join(again)}")
     now = results(project)
     if now != wanted:
-        found.append(f"other bytes: {sorted(name for name in now.keys() | wanted.keys() if now.get(name) != wanted.get(name))}")
+        found.append(
+            f"other bytes: {sorted(name for name in now.keys() | wanted.keys() if now.get(name) != wanted.get(name))}"
+        )
     if verbs.verify(project, None) != 0:
         found.append("damaged afterwards")
     return found

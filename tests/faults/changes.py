@@ -44,15 +44,33 @@ def of_no_account(text: str) -> dict[str, str]:
     """By what was done: texts that say the same to Python."""
     tokens, words = tokens_of(text), _docstrings(text)
     lines = text.splitlines(keepends=True)
-    ends = {token.start[0]: token.start[1] for token in tokens if token.type in (tokenize.NEWLINE, tokenize.NL) and _stands_alone(token, tokens)}
-    remarked = "".join(f"{line[: ends[k]]}  # a remark{line[ends[k] :]}" if k in ends else line for k, line in enumerate(lines, 1))
+    ends = {
+        token.start[0]: token.start[1]
+        for token in tokens
+        if token.type in (tokenize.NEWLINE, tokenize.NL) and _stands_alone(token, tokens)
+    }
+    remarked = "".join(
+        f"{line[: ends[k]]}  # a remark{line[ends[k] :]}" if k in ends else line for k, line in enumerate(lines, 1)
+    )
     rewritten = list(lines)
     for token in reversed([token for token in tokens if token.start in words]):
-        rewritten = _with(rewritten, token, f'{token.string[0] if token.string[0] in "rR" else ""}"""Other words."""').splitlines(keepends=True)
-    bare = "".join(line for k, line in enumerate(lines, 1) if not any(t.type == tokenize.COMMENT and t.start[0] == k and not t.line[: t.start[1]].strip() for t in tokens))
+        rewritten = _with(
+            rewritten, token, f'{token.string[0] if token.string[0] in "rR" else ""}"""Other words."""'
+        ).splitlines(keepends=True)
+    bare = "".join(
+        line
+        for k, line in enumerate(lines, 1)
+        if not any(t.type == tokenize.COMMENT and t.start[0] == k and not t.line[: t.start[1]].strip() for t in tokens)
+    )
     statements = sorted({token.end[0] for token in tokens if token.type == tokenize.NEWLINE})
     spread = "".join(line + ("\n" if k in statements else "") for k, line in enumerate(lines, 1))
-    return {"remarks": remarked, "docstrings": "".join(rewritten), "no comments": bare, "empty lines": spread, "formatted anew": ast.unparse(ast.parse(text))}
+    return {
+        "remarks": remarked,
+        "docstrings": "".join(rewritten),
+        "no comments": bare,
+        "empty lines": spread,
+        "formatted anew": ast.unparse(ast.parse(text)),
+    }
 
 
 def _stands_alone(token: Token, tokens: list[Token]) -> bool:
@@ -63,7 +81,9 @@ def _stands_alone(token: Token, tokens: list[Token]) -> bool:
 def _code_of(text: str) -> Iterator[Token]:
     words = _docstrings(text)
     for token in tokens_of(text):
-        if token.type in (tokenize.NAME, tokenize.NUMBER, tokenize.OP) or (token.type == tokenize.STRING and token.start not in words):
+        if token.type in (tokenize.NAME, tokenize.NUMBER, tokenize.OP) or (
+            token.type == tokenize.STRING and token.start not in words
+        ):
             yield token
 
 

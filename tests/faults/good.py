@@ -361,7 +361,9 @@ def with_cameras(source: str, **more: str):
 def run_masks(folder: Path, name: str) -> None:
     """The stage `masks` of a photo, whose image, mask or mask of an object is the file."""
     photo = {"image": "7.png", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "a"}
-    photo = msgspec.to_builtins(PhotoSlice(**photo | ({} if name in ("7.png", "mask.png") else {"image": name}), objects=[]))
+    photo = msgspec.to_builtins(
+        PhotoSlice(**photo | ({} if name in ("7.png", "mask.png") else {"image": name}), objects=[])
+    )
     files = {path.name: path for path in folder.iterdir() if path.is_file()}
     facts = {"dataset.photo": photo, "dataset.materials": DATASET["materials"]}
     (folder / "out").mkdir(exist_ok=True)

@@ -11,7 +11,24 @@ from factorlib.runner import verbs
 from tests.runner import toy
 from tests.runner.toy import files_of, write
 
-NO_NAMES = ["", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "compare", "data/..", "build/store", "x\0y", "x" * 256]
+NO_NAMES = [
+    "",
+    "/",
+    "//",
+    ".",
+    "..",
+    "./",
+    "../",
+    "../..",
+    "store",
+    "bench",
+    "studies",
+    "compare",
+    "data/..",
+    "build/store",
+    "x\0y",
+    "x" * 256,
+]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +70,9 @@ def test_what_is_no_name_deletes_nothing(project, word):
     assert everything(project) == before
 
 
-@pytest.mark.parametrize("word", ["mine", "data", "nowhere", "elsewhere/set", "/nowhere/set", "../set", "data/elsewhere/../../set", "stages"])
+@pytest.mark.parametrize(
+    "word", ["mine", "data", "nowhere", "elsewhere/set", "/nowhere/set", "../set", "data/elsewhere/../../set", "stages"]
+)
 def test_a_name_that_has_no_results_of_its_own_deletes_nobody_elses(project, word):
     before = everything(project)
     clean(project, word)
@@ -79,7 +98,9 @@ def test_results_of_a_dataset_that_is_gone_go_by_its_name_and_by_its_path(projec
     for word in ("set", str(project.root / "data" / "set")):
         again = toy.copy(project, tmp_path / f"again{len(word)}")
         shutil.rmtree(again.root / "data" / "set")
-        assert clean(again, word.replace(str(project.root), str(again.root))) == 0 and not (again.build / "set").exists()
+        assert (
+            clean(again, word.replace(str(project.root), str(again.root))) == 0 and not (again.build / "set").exists()
+        )
 
 
 def test_a_dataset_without_results_is_no_error(project, capsys):
@@ -92,7 +113,11 @@ def test_what_a_user_put_beside_the_results_stays_and_is_named(project, capsys):
     assert clean(project, "set") == 0
     assert [p.name for p in (project.build / "set").iterdir()] == ["notes.txt"]
     said = capsys.readouterr().out
-    assert "deleted build/set/total\n" in said and "deleted build/set/dataset.txt\n" in said and "left    build/set/notes.txt" in said
+    assert (
+        "deleted build/set/total\n" in said
+        and "deleted build/set/dataset.txt\n" in said
+        and "left    build/set/notes.txt" in said
+    )
 
 
 def test_no_link_is_followed(project, tmp_path):
@@ -115,7 +140,11 @@ def test_a_home_that_is_a_link_is_not_taken(project, tmp_path):
 
 
 def test_without_a_name_the_store_and_every_home_go_and_nothing_else(project, capsys):
-    outside = [p for p in everything(project) if not p.startswith(str(project.build / "set")) and not p.startswith(str(project.build / "store"))]
+    outside = [
+        p
+        for p in everything(project)
+        if not p.startswith(str(project.build / "set")) and not p.startswith(str(project.build / "store"))
+    ]
     assert clean(project, None) == 0
     assert everything(project) == outside
     said = capsys.readouterr().out.splitlines()

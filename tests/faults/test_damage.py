@@ -33,7 +33,11 @@ def make(project, **options):
 
 
 def shown(project) -> dict[str, bytes]:
-    return {name: data for name, data in files_of(project.build / "set").items() if "log" not in name and "current" not in name}
+    return {
+        name: data
+        for name, data in files_of(project.build / "set").items()
+        if "log" not in name and "current" not in name
+    }
 
 
 def overwrite(path: Path, text: str, keep_times: bool = False) -> None:
@@ -73,7 +77,10 @@ DAMAGES = {
     "another file": lambda path: replace(path, "OTHER"),
     "cut": lambda path: os.truncate(path, 2),
     "missing": lambda path: path.unlink(),
-    "a link": lambda path: (path.rename(path.parent.parent / "elsewhere"), path.symlink_to(path.parent.parent / "elsewhere")),
+    "a link": lambda path: (
+        path.rename(path.parent.parent / "elsewhere"),
+        path.symlink_to(path.parent.parent / "elsewhere"),
+    ),
     "one too many": lambda path: write(path.with_name("more.txt"), "1"),
     "all gone": lambda path: shutil.rmtree(path.parent),
 }
@@ -95,7 +102,9 @@ def test_a_damaged_result_is_made_again_and_nothing_else_is(project, damage, sta
     assert new_runs(project) == [] and verbs.verify(project, None) == 0
 
 
-@pytest.mark.parametrize("damage", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in DAMAGES])
+@pytest.mark.parametrize(
+    "damage", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in DAMAGES]
+)
 def test_what_a_user_does_to_a_file_under_the_datasets_name_is_noticed(project, damage):
     before = shown(project)
     DAMAGES[damage]((project.build / "set" / "upper").resolve() / "a.txt")
@@ -179,7 +188,10 @@ def test_verify_names_a_view_and_a_key_that_are_damaged(project, capsys):
     assert verbs.verify(project, "set") == 1
     said = capsys.readouterr().out
     assert (
-        "build/set/upper" in said and "sizes.json: other content" in said and "build/set/count" in said and "a.json: other content" in said
+        "build/set/upper" in said
+        and "sizes.json: other content" in said
+        and "build/set/count" in said
+        and "a.json: other content" in said
     )
     assert "store/keys" in said and "not readable" in said
     assert make(project) == 0 and verbs.verify(project, "set") == 0
@@ -198,7 +210,10 @@ def test_damage_that_comes_while_a_run_goes_on_is_noticed_where_it_is_used(proje
     """The table spoils a result that the total reads after it."""
     path = project.build / "set" / "count" / "a.json"
     code = f"    p = __import__('pathlib').Path({str(path)!r}); p.chmod(0o644); p.write_text('{{\"letters\": 100}}')\n    (out /"
-    write(project.root / "stages" / "table.py", toy.TABLE.replace("    (out /", code).replace("params.scale)", "params.scale + 1)"))
+    write(
+        project.root / "stages" / "table.py",
+        toy.TABLE.replace("    (out /", code).replace("params.scale)", "params.scale + 1)"),
+    )
     assert make(project) == 0
     assert (project.build / "set" / "total" / "total.txt").read_text() == "total: 27"
     assert verbs.verify(project, None) == 0
@@ -216,6 +231,8 @@ def test_an_input_edited_while_it_is_read_gives_no_result(project, capsys):
 def test_a_disk_that_gives_back_something_else_does_not_loop(project, monkeypatch, capsys):
     from factorlib.runner.integrity import Inspector
 
-    monkeypatch.setattr(Inspector, "damage", lambda self, output, files: ["total.txt: other content"] if "total.txt" in files else [])
+    monkeypatch.setattr(
+        Inspector, "damage", lambda self, output, files: ["total.txt: other content"] if "total.txt" in files else []
+    )
     assert make(project) == 1
     assert "is the disk failing" in capsys.readouterr().err

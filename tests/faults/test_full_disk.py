@@ -181,7 +181,9 @@ def without_rights(project):
         pytest.skip("setpriv is not there, and root may write everywhere")
     command = [*drop, sys.executable, "-c", code, str(project.root), "all", "--dataset", "set"]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "PYTHONDONTWRITEBYTECODE": "1"}
-    return subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60)
+    return subprocess.run(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60
+    )
 
 
 def test_a_file_that_may_not_be_read_is_no_full_folder(tmp_path, monkeypatch):

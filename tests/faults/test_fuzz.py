@@ -65,14 +65,58 @@ MOST_MEMORY = 16 << 30  # of addresses, libraries included
 
 NUMBERS = [0, -1, 255, 2**31, 2**63, 2**64, 10**30, 10**400, 1e300, -1e300, 1e-300, 5e-324, -0.0, 5126, 5123]
 WORDS = ["", ".", "..", "/", "../x", "\0", "x" * 300, "é" * 200, "z/" * 3000, "²", "7", "NaN", "red.png", "model"]
-WORDS += ["link.png", "pipe.png", "` - at `$.a[0]`", "a\nb", "*a", "!!int", "VEC3", "POSITION", "data:;base64,AAAA", "data:,x"]
-ODD = st.none() | st.booleans() | st.sampled_from(NUMBERS + WORDS) | st.integers(-3, 300) | st.floats() | st.text(max_size=8)
-ODDER = st.recursive(
-    ODD, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3), max_leaves=6
+WORDS += [
+    "link.png",
+    "pipe.png",
+    "` - at `$.a[0]`",
+    "a\nb",
+    "*a",
+    "!!int",
+    "VEC3",
+    "POSITION",
+    "data:;base64,AAAA",
+    "data:,x",
+]
+ODD = (
+    st.none()
+    | st.booleans()
+    | st.sampled_from(NUMBERS + WORDS)
+    | st.integers(-3, 300)
+    | st.floats()
+    | st.text(max_size=8)
 )
-HUGE = [b"\xff" * 8, b"\0" * 8, b"\xff" * 4, b"\x7f\xff\xff\xff", b"\0\0\xc0\x7f", struct.pack("<Q", 10**9), b"[[[[", b'"', b"&a [*a]"]
+ODDER = st.recursive(
+    ODD,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+HUGE = [
+    b"\xff" * 8,
+    b"\0" * 8,
+    b"\xff" * 4,
+    b"\x7f\xff\xff\xff",
+    b"\0\0\xc0\x7f",
+    struct.pack("<Q", 10**9),
+    b"[[[[",
+    b'"',
+    b"&a [*a]",
+]
 TOKENS = ["0", "-1", "5", "1e300", "1e999", "nan", "9" * 5000, "4294967295", "2.5", "", "²", "\0", "1" + "0" * 12]
-TOKENS += ["v", "f", "usemtl", "g", "mtllib", "element", "property", "list", "uchar", "face", "end_header", "OFF", "endsolid"]
+TOKENS += [
+    "v",
+    "f",
+    "usemtl",
+    "g",
+    "mtllib",
+    "element",
+    "property",
+    "list",
+    "uchar",
+    "face",
+    "end_header",
+    "OFF",
+    "endsolid",
+]
 TOKENS += ["#", "\\", "1/2/3", "1//", "a" * 300, "ü", "../x"]
 
 
@@ -128,7 +172,9 @@ def spoiled_words(draw, content: bytes) -> bytes:
         word = draw(st.integers(0, max(len(lines[line]) - 1, 0)))
         kind = draw(st.sampled_from(["word"] * 4 + ["double", "remove", "cut"]))
         if kind == "word":
-            lines[line][word : word + 1] = [draw(st.sampled_from(TOKENS) | st.text(max_size=9)).encode("utf-8", "replace")]
+            lines[line][word : word + 1] = [
+                draw(st.sampled_from(TOKENS) | st.text(max_size=9)).encode("utf-8", "replace")
+            ]
         elif kind == "double":
             lines.insert(draw(st.integers(0, len(lines))), list(lines[line]))
         elif kind == "remove" and len(lines) > 1:
@@ -237,9 +283,13 @@ A_PNG = st.builds(
     spoiled_bytes(PIXELS) | st.just(PIXELS),
     spoiled_bytes(PALETTE) | st.just(PALETTE),
 )
-KINDS = st.tuples(st.sampled_from([1, 2, 4, 8, 16]), st.sampled_from([0, 2, 3, 4, 6]), st.binary(min_size=50, max_size=800))
+KINDS = st.tuples(
+    st.sampled_from([1, 2, 4, 8, 16]), st.sampled_from([0, 2, 3, 4, 6]), st.binary(min_size=50, max_size=800)
+)
 ANY_PNG = KINDS.map(lambda kind: png(png_header(W, H, *kind[:2]), zlib.compress(kind[2] * 4), PALETTE))
-A_DATASET = st.sampled_from([{}, *({"cameras": source} for source in SOURCES.values())]).flatmap(lambda c: spoiled(DATASET | c))
+A_DATASET = st.sampled_from([{}, *({"cameras": source} for source in SOURCES.values())]).flatmap(
+    lambda c: spoiled(DATASET | c)
+)
 
 
 def plain(name: str) -> st.SearchStrategy:
@@ -326,7 +376,9 @@ def fuzz(folder, part: str, **options) -> None:
     note("fuzz", part, came.total(), **came)
 
 
-@pytest.mark.parametrize("part", [part if part in QUICK else pytest.param(part, marks=pytest.mark.long) for part in PARTS])
+@pytest.mark.parametrize(
+    "part", [part if part in QUICK else pytest.param(part, marks=pytest.mark.long) for part in PARTS]
+)
 def test_a_spoiled_file_is_read_or_refused(folder, part):
     fuzz(folder, part, max_examples=FEW, derandomize=True, phases=(Phase.generate,))
 

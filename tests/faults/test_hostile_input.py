@@ -147,7 +147,9 @@ def widened(width: int, height: int, **values):
     """An EXR whose header promises another size, long enough to be believed."""
 
     def write(path):
-        write_exr(path, {name: np.full((H, W), v, np.float32) for name, v in (values or dict.fromkeys("RGB", 1)).items()})
+        write_exr(
+            path, {name: np.full((H, W), v, np.float32) for name, v in (values or dict.fromkeys("RGB", 1)).items()}
+        )
         content = path.read_bytes()
         for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
             at = content.index(name) + len(name) + 4
@@ -225,7 +227,11 @@ REFUSED = {
         ("a.gltf", '{"extras": ' + DEEP, "."),
         ("a.gltf", gltf_text().replace("shell", "stühle").encode("latin-1"), "."),
         ("a.gltf", gltf_text(extensionsRequired=["KHR_draco_mesh_compression"]), "compress"),
-        ("a.gltf", gltf_text(nodes=[]).replace('"nodes": []', '"nodes": [{}' + ",{}" * 2_000_001 + "]", 1), "more than"),
+        (
+            "a.gltf",
+            gltf_text(nodes=[]).replace('"nodes": []', '"nodes": [{}' + ",{}" * 2_000_001 + "]", 1),
+            "more than",
+        ),
         *(("a.gltf", text, ".") for text in JSONS),
         *(("a.gltf", of_buffer(uri), ".") for uri in ("data:;base64,!!!", "http://x/y.bin", "a%00b", "m/circle")),
         ("a.gltf", of_buffer("m/pipe"), "is a pipe"),
@@ -289,22 +295,45 @@ REFUSED = {
         ("truth.yaml", edited(TRUTH, "poses", "hall", "vase", "rotation", value=[[2, 0, 0]] * 3), "rotation"),
     ],
     "mask": [
-        *(("mask.png", content, "not readable as a PNG") for content in (b"", b"GIF89a", MASK[:40], MASK[:16] + bytes(99))),
+        *(
+            ("mask.png", content, "not readable as a PNG")
+            for content in (b"", b"GIF89a", MASK[:40], MASK[:16] + bytes(99))
+        ),
         ("mask.png", MASK[:33] + chunk(b"zTXt", TEXT) + MASK[33:], "not readable as a PNG"),
         ("mask.png", long_png(30_000, 30_000), "the mask is 30000 × 30000 pixels, the photo 16 × 12"),
-        ("mask.png", png(png_header(W, H, kind=2), zlib.compress(b"".join(b"\0" + bytes(range(48)) for _ in range(H)))), "colour"),
+        (
+            "mask.png",
+            png(png_header(W, H, kind=2), zlib.compress(b"".join(b"\0" + bytes(range(48)) for _ in range(H)))),
+            "colour",
+        ),
         ("mask.png", png(png_header(W, H), zlib.compress(bytes([0, *[7] * W]) * H)), "unknown label 7"),
         ("mask.png", png(png_header(W, H), zlib.compress(bytes(W + 1) * H)), "the mask is empty"),
         *(
             ("coco.json", coco({"size": [H, W], "counts": counts}), ".")
-            for counts in ([10**30], [-5, 5, H * W], [], "o" * 2_000_000, "_" * 2_000_000 + "0", "P" * 50 + "0", "~", "é", 5)
+            for counts in (
+                [10**30],
+                [-5, 5, H * W],
+                [],
+                "o" * 2_000_000,
+                "_" * 2_000_000 + "0",
+                "P" * 50 + "0",
+                "~",
+                "é",
+                5,
+            )
         ),
         ("coco.json", coco({"size": [10**9, 10**9], "counts": [10**18]}), "."),
         ("coco.json", coco({"size": [-1, -1], "counts": [1]}), "."),
-        *(("coco.json", coco(shape), ".") for shape in ("x", 5, [], [[]], [[1, 2, 3]], [["a"] * 6], [[0, 0, 1e300, 0, 0, 1]])),
+        *(
+            ("coco.json", coco(shape), ".")
+            for shape in ("x", 5, [], [[]], [[1, 2, 3]], [["a"] * 6], [[0, 0, 1e300, 0, 0, 1]])
+        ),
         ("coco.json", coco([ZIGZAG]), "pixels long"),
         ("coco.json", coco(*[[[0, 0, W, 0, W, H, 0, H]] * 400] * 400), "longer than any drawing"),
-        *(("coco.json", coco([[2, 2, 8, 2, 8, 8]], image=i), ".") for i in ({"file_name": 5}, {"id": None}, {"width": 10**15})),
+        *(
+            ("coco.json", coco([[2, 2, 8, 2, 8, 8]], image=i), ".")
+            for i in ({"file_name": 5}, {"id": None}, {"width": 10**15})
+        ),
         *(("coco.json", text, "not readable as COCO|.") for text in (*JSONS, '{"images": 5}')),
     ],
     "masks": [
@@ -315,7 +344,11 @@ REFUSED = {
     "photo": [
         ("8.png", b"no photo", "8.png"),
         ("8.png", long_png(30_000, 30_000, kind=2), "megapixels"),
-        ("mask.png", png(png_header(W, H + 1), zlib.compress(bytes(W + 1) * (H + 1))), "the mask is 16 × 13 pixels, the photo 16 × 12"),
+        (
+            "mask.png",
+            png(png_header(W, H + 1), zlib.compress(bytes(W + 1) * (H + 1))),
+            "the mask is 16 × 13 pixels, the photo 16 × 12",
+        ),
     ],
     "objects": [
         ("m/chair.obj", OBJ.replace("g shell", "g shell2"), "has no material|no part 'shell'"),
@@ -327,7 +360,10 @@ REFUSED = {
         ("light.exr", widened(2000, 1500, R=1, G=1, B=1, **{f"C{k:03}": 0 for k in range(900)}), "million values"),
     ],
     "colmap": [
-        *(("model/cameras.bin", cameras_bin(cameras=n), "not readable as a COLMAP model") for n in (2, 2**40, 2**64 - 1)),
+        *(
+            ("model/cameras.bin", cameras_bin(cameras=n), "not readable as a COLMAP model")
+            for n in (2, 2**40, 2**64 - 1)
+        ),
         *(("model/images.bin", images_bin(images=n), "not readable as a COLMAP model") for n in (2, 2**40, 2**64 - 1)),
         ("model/images.bin", images_bin(points=2**63), "not readable as a COLMAP model"),
         ("model/cameras.bin", cameras_bin(model=77), "77 is no camera model"),
@@ -350,7 +386,10 @@ REFUSED = {
     ],
     "transforms": [
         *(("t.json", text, ".") for text in (*JSONS, '{"frames": null}', '{"w": ' + LONG + "}", '{"frames": [[]]}')),
-        *(("t.json", transforms(matrix), ".") for matrix in ([[1e300, 0, 0, 0]] * 3, [[0] * 4] * 3, [], [[1, 0, 0]] * 3)),
+        *(
+            ("t.json", transforms(matrix), ".")
+            for matrix in ([[1e300, 0, 0, 0]] * 3, [[0] * 4] * 3, [], [[1, 0, 0]] * 3)
+        ),
         *(("t.json", frame_of(angle, w=200, h=150), r"frames\[0\]") for angle in (0.0, -1.0, 1e-300, 4.0)),
         *(("t.json", transforms(w=w), r"\bw\b") for w in (1e30, 1e12, -200, 0.4)),
         *(("t.json", transforms(fl_x=f), "fl_x") for f in (1e300, 1e-300, -3)),
@@ -359,7 +398,10 @@ REFUSED = {
         ("t.json", transforms(camera_model="X" * 10_000), "camera_model"),
     ],
     "bop": [
-        *(("model/scene_camera.json", {name: {"cam_K": CAM_K}}, "not the id of an image") for name in ("²", "", "-1", LONG)),
+        *(
+            ("model/scene_camera.json", {name: {"cam_K": CAM_K}}, "not the id of an image")
+            for name in ("²", "", "-1", LONG)
+        ),
         ("model/scene_camera.json", {"7": {"cam_K": [1e300, 0, 103.5, 0, 1e300, 70.5, 0, 0, 1.0]}}, "cam_K"),
         ("model/scene_camera.json", {"7": {"cam_K": [300, 0, 1e9, 0, 300, 70.5, 0, 0, 1.0]}}, "cam_K"),
         ("model/scene_camera.json", [], "."),
@@ -382,8 +424,16 @@ REFUSED = {
         ("a.parquet", rewritten(weight=pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has empty places"),
         ("a.parquet", rewritten(weight=pa.array(["a"] * 5)), "of type string"),
         ("a.parquet", rewritten(x=pa.array([HUGE] * 5)), "not readable"),
-        ("a.parquet", rewritten(normal=pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10)), 2)), "'normal' is of type"),
-        ("a.parquet", rewritten(visibility=pa.array([b"x" * 10_000] * 5, pa.binary(10_000))), "'visibility' is of type"),
+        (
+            "a.parquet",
+            rewritten(normal=pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10)), 2)),
+            "'normal' is of type",
+        ),
+        (
+            "a.parquet",
+            rewritten(visibility=pa.array([b"x" * 10_000] * 5, pa.binary(10_000))),
+            "'visibility' is of type",
+        ),
     ],
     "lobes": [
         ("a.parquet", many_rows, "200,000,000 rows, more than 100,000,000"),
@@ -391,7 +441,9 @@ REFUSED = {
     ],
     "yaml": [("a.yaml", text, "more than 2,000 values") for text in (LAUGHS, "[" + "a," * 100_000 + "]")],
     "json": [("a.json", text, "not readable as JSON") for text in (DEEP, LONG, "", "\x00", "{'a': 1}")],
-    "poses": [("poses.json", text, "poses.json") for text in ("[]", '{"a": {"camera": {"focal_px": -1}, "objects": {}}}')],
+    "poses": [
+        ("poses.json", text, "poses.json") for text in ("[]", '{"a": {"camera": {"focal_px": -1}, "objects": {}}}')
+    ],
 }
 CASES = [(reader, *case) for reader, cases in REFUSED.items() for case in cases]
 
@@ -421,7 +473,13 @@ def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name, c
     assert error.file and error.cure and "\n" not in error.found and len(str(error)) < 1500
 
 
-SPECIAL = [("set", "dataset.yaml"), ("set", "truth.yaml"), ("set", "m/box.gltf"), ("mask", "mask.png"), ("mask", "coco.json")]
+SPECIAL = [
+    ("set", "dataset.yaml"),
+    ("set", "truth.yaml"),
+    ("set", "m/box.gltf"),
+    ("mask", "mask.png"),
+    ("mask", "coco.json"),
+]
 SPECIAL += [("colmap", "model/cameras.bin"), ("colmap", "model/images.bin"), ("colmap text", "text/images.txt")]
 SPECIAL += [("transforms", "t.json"), ("bop", "model/scene_camera.json"), ("bop", "model/scene_gt.json")]
 SPECIAL += [("observations", "observations.parquet"), ("lobes", "solve/lobes.parquet"), ("poses", "poses.json")]
@@ -446,7 +504,9 @@ def test_what_is_no_plain_file_of_a_sane_size_is_never_opened(folder, reader, na
     assert caught.value.file and caught.value.cure
 
 
-@pytest.mark.parametrize("reader, name", [case for case in SPECIAL if case[0] not in ("colmap", "colmap text", "transforms", "bop")])
+@pytest.mark.parametrize(
+    "reader, name", [case for case in SPECIAL if case[0] not in ("colmap", "colmap text", "transforms", "bop")]
+)
 def test_what_another_user_may_not_read_says_so(open_folder, as_other_user, reader, name):
     folder = make_set(open_folder / "set")
     READERS[reader](folder, name)  # loads what another user may not: Python may lie in root's home
@@ -459,7 +519,9 @@ def test_what_another_user_may_not_read_says_so(open_folder, as_other_user, read
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])
 SIDES = [[3, 2, 1, 0], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
-PYRAMID = "".join("{} {} {}\n".format(*v) for v in SQUARE) + "".join(f"{len(f)} {' '.join(map(str, f))}\n" for f in SIDES)
+PYRAMID = "".join("{} {} {}\n".format(*v) for v in SQUARE) + "".join(
+    f"{len(f)} {' '.join(map(str, f))}\n" for f in SIDES
+)
 PYRAMID_HEADER = PLY_HEADER.replace("vertex 4", "vertex 5").replace("face 4", "face 5")
 PYRAMID_BIG = (
     PYRAMID_HEADER.format("binary_big_endian").encode()

@@ -42,7 +42,9 @@ def editing(text, file, content):
         ("stages:note.txt", "stages/note.txt", "other"),
     ],
 )
-def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old_key(project, capsys, name, file, content):
+def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old_key(
+    project, capsys, name, file, content
+):
     path = project.root / file
     write(project.root / "toylib" / "more.py", "NUMBER = 1\n")
     write(project.root / "stages" / "note.txt", "one")
@@ -73,7 +75,9 @@ def test_a_syntax_error_half_typed_while_a_step_runs_is_no_defect(project, capsy
 
 def test_a_remark_typed_while_a_step_runs_loses_nothing(project):
     path = project.root / "stages" / "table.py"
-    text = toy.TABLE.replace("(out /", f"f = Path({str(path)!r}); f.write_text('# a remark\\n' + f.read_text())\n    (out /", 1)
+    text = toy.TABLE.replace(
+        "(out /", f"f = Path({str(path)!r}); f.write_text('# a remark\\n' + f.read_text())\n    (out /", 1
+    )
     write(path, text.replace("import json", "import json\nfrom pathlib import Path", 1))
     assert make(project, targets=["table"]) == 0 and path.read_text().startswith("# a remark")
 
@@ -103,7 +107,15 @@ def test_every_file_in_the_package_of_a_module_counts_whatever_it_is_called(proj
 
 
 @pytest.mark.parametrize(
-    "name", [".letters.py.swp", "letters.py~", "#letters.py#", ".hidden/x.c", "__pycache__/letters.cpython-311.pyc", "letters.pyc"]
+    "name",
+    [
+        ".letters.py.swp",
+        "letters.py~",
+        "#letters.py#",
+        ".hidden/x.c",
+        "__pycache__/letters.cpython-311.pyc",
+        "letters.pyc",
+    ],
 )
 def test_what_python_or_an_editor_leaves_does_not_count(project, name):
     assert make(project) == 0
@@ -125,9 +137,19 @@ def test_no_module_is_named_only_at_run_time():
     The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it, and all import the package.
     """
     runner, door = LIBRARY / "factorlib" / "runner", LIBRARY / "factorlib" / "__init__.py"
-    files = [p for folder in ("factorlib", "stages") for p in (LIBRARY / folder).rglob("*.py") if runner not in p.parents and p != door]
+    files = [
+        p
+        for folder in ("factorlib", "stages")
+        for p in (LIBRARY / folder).rglob("*.py")
+        if runner not in p.parents and p != door
+    ]
     assert not [p for p in (LIBRARY / "stages").glob("*.py") if "load_result" in p.read_text()]
-    hidden = [f"{p}: {n.id if isinstance(n, ast.Name) else n.attr}" for p in files for n in ast.walk(ast.parse(p.read_text())) if _loads(n)]
+    hidden = [
+        f"{p}: {n.id if isinstance(n, ast.Name) else n.attr}"
+        for p in files
+        for n in ast.walk(ast.parse(p.read_text()))
+        if _loads(n)
+    ]
     assert not hidden
 
 

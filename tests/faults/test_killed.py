@@ -15,7 +15,7 @@ from tests.runner import toy
 from tests.runner.toy import state, write
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-C_STACK = '''
+C_STACK = """
 import ctypes, os, signal
 libc = ctypes.CDLL(None)
 @ctypes.CFUNCTYPE(None, ctypes.c_int)
@@ -23,7 +23,7 @@ def _c_stack(number):
     os.write(2, b"*** SIGTERM received by PID 1; stack trace: ***\\n")
     os._exit(1)
 libc.signal(signal.SIGTERM, _c_stack)  # what pycolmap does where it is imported
-'''
+"""
 
 
 @pytest.fixture
@@ -34,7 +34,9 @@ def project(tmp_path):
 def start(project, *settings):
     command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
 
 
 def wait_until(true, seconds=60):
@@ -74,7 +76,9 @@ def test_a_killed_worker_does_not_fail_the_step_beside_it(project):
     made = state(project)
     assert sorted(made[f"upper/{photo}"] for photo in "ab") == ["current", "to run"]
     events = [json.loads(line) for line in (project.build / "set" / "log.jsonl").read_text().splitlines()]
-    assert sum(event["event"] == "done" and event["stage"] == "upper" for event in events) == 1, "the step beside it ran again"
+    assert sum(event["event"] == "done" and event["stage"] == "upper" for event in events) == 1, (
+        "the step beside it ran again"
+    )
 
 
 def told_to_end(project, target):

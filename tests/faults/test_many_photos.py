@@ -49,9 +49,18 @@ def planning(photos, outputs):
 
 def slicing(photos):
     entry = {"image": "i.png", "masks": "m.png", "objects": [{"name": "o", "mesh": "m"}]}
-    file = {"format": 1, "materials": ["a"], "meshes": {"m": {"file": "m.obj"}}, "photos": [{"name": f"p{k}", **entry} for k in range(photos)]}
+    file = {
+        "format": 1,
+        "materials": ["a"],
+        "meshes": {"m": {"file": "m.obj"}},
+        "photos": [{"name": f"p{k}", **entry} for k in range(photos)],
+    }
     dataset = Dataset(Path(), msgspec.convert(file, DatasetFile))
-    return lambda: [dataset_slice(dataset, name, photo.name) for photo in dataset.spec.photos for name in ("photo", "objects", "light")]
+    return lambda: [
+        dataset_slice(dataset, name, photo.name)
+        for photo in dataset.spec.photos
+        for name in ("photo", "objects", "light")
+    ]
 
 
 @pytest.mark.parametrize("outputs", [{}, Everything()], ids=["nothing made", "all made"])

@@ -53,7 +53,16 @@ def command(project):
 
 def run(project, **more):
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "PYTHONDONTWRITEBYTECODE": "1"} | more.pop("env", {})
-    return subprocess.run(command(project), env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=120, check=False, **more)
+    return subprocess.run(
+        command(project),
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        check=False,
+        **more,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +85,25 @@ def check(what, stage, project, done, wanted):
     said = done.stdout
     assert done.returncode == 1 and f"error: {stage}" in said and WORDS[what] in said and "MB are free" in said, said
     assert "Traceback" not in said and "defect" not in said
-    assert not any((project.build / "store" / "tmp").iterdir()) and stage not in {step.partition("/")[0] for step in battered.kept(project).values()}
+    assert not any((project.build / "store" / "tmp").iterdir()) and stage not in {
+        step.partition("/")[0] for step in battered.kept(project).values()
+    }
     losses = lost_in(project, wanted)
-    note("faults", {"disk": "a disk that is full", "quota": "a quota that is used up", "limit": "a limit on the size of files"}[what], 1, int(bool(losses)), stages={stage: 1})
+    note(
+        "faults",
+        {"disk": "a disk that is full", "quota": "a quota that is used up", "limit": "a limit on the size of files"}[
+            what
+        ],
+        1,
+        int(bool(losses)),
+        stages={stage: 1},
+    )
     assert not losses
 
 
-stages = pytest.mark.parametrize("stage", [stage if stage in SHORT else pytest.param(stage, marks=pytest.mark.long) for stage in STAGES])
+stages = pytest.mark.parametrize(
+    "stage", [stage if stage in SHORT else pytest.param(stage, marks=pytest.mark.long) for stage in STAGES]
+)
 
 
 @stages
@@ -121,7 +142,9 @@ def test_a_quota_that_is_used_up(tmp_path, whole, stage):
     if compiler is None or not sys.platform.startswith("linux"):
         pytest.skip("the quota is a library in C")
     library, left = tmp_path / "quota.so", tmp_path / "left"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, Path(__file__).with_name("quota.c"), "-ldl"], check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", "-O1", "-o", library, Path(__file__).with_name("quota.c"), "-ldl"], check=True
+    )
     left.write_bytes(struct.pack("<q", SIZE // 2))
     project = heavy(tmp_path / "root", stage)
     make_above(project, stage)
@@ -145,7 +168,9 @@ def test_wherever_a_quota_ends_nothing_is_lost(tmp_path, left):
     if compiler is None or not sys.platform.startswith("linux"):
         pytest.skip("the quota is a library in C")
     library, file = tmp_path / "quota.so", tmp_path / "left"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, Path(__file__).with_name("quota.c"), "-ldl"], check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", "-O1", "-o", library, Path(__file__).with_name("quota.c"), "-ldl"], check=True
+    )
     file.write_bytes(struct.pack("<q", left))
     project, usual = slow_project(tmp_path / "root"), slow_project(tmp_path / "usual")
     assert make(usual) == 0

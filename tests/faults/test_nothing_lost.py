@@ -17,7 +17,20 @@ from pathlib import Path
 
 import pytest
 from faults import battered
-from faults.battered import STAGES, done, end, half_written, kept, kill, lost_in, make, results, slow_project, start, wait_until
+from faults.battered import (
+    STAGES,
+    done,
+    end,
+    half_written,
+    kept,
+    kill,
+    lost_in,
+    make,
+    results,
+    slow_project,
+    start,
+    wait_until,
+)
 from faults.tries import note
 
 from factorlib.runner import verbs
@@ -92,7 +105,9 @@ def struck(project, seed, whom):
         time.sleep(chance.uniform(0, 6 * float(battered.PAUSE)))
     else:
         time.sleep(chance.uniform(0, 3))
-    writing = half_written(project) - {step.partition("/")[0] for step in kept(project).values()} | ({stage} & half_written(project))
+    writing = half_written(project) - {step.partition("/")[0] for step in kept(project).values()} | (
+        {stage} & half_written(project)
+    )
     kill(process, whom)
     end(process)
     return writing
@@ -103,7 +118,10 @@ def test_drafts_of_killed_writers_go_once_they_are_old_and_those_of_others_stay(
     gone = subprocess.Popen(["true"])
     gone.wait()
     folders = [project.build / "set", *(project.build / "store" / name for name in ("keys", "logs", "cache"))]
-    old, new, own = ([folder / f".{name}.json.{pid}" for folder in folders] for name, pid in (("old", gone.pid), ("new", gone.pid), ("own", os.getpid())))
+    old, new, own = (
+        [folder / f".{name}.json.{pid}" for folder in folders]
+        for name, pid in (("old", gone.pid), ("new", gone.pid), ("own", os.getpid()))
+    )
     for path in (*old, *new, *own):
         write(path, "{")
         os.utime(path, (time.time() - 7200 * (path not in new),) * 2)
@@ -156,7 +174,10 @@ def test_a_photo_that_vanishes_in_mid_run_is_named_and_costs_its_own_steps(fresh
 def test_a_photo_that_vanishes_before_it_is_read_is_no_defect(fresh, again, capfd):
     project = again(fresh)
     text = (project.root / "stages" / "upper.py").read_text()
-    write(project.root / "stages" / "upper.py", text.replace("    text =", "    inputs.file('a.txt').unlink() if inputs.photo == 'a' else None\n    text ="))
+    write(
+        project.root / "stages" / "upper.py",
+        text.replace("    text =", "    inputs.file('a.txt').unlink() if inputs.photo == 'a' else None\n    text ="),
+    )
     assert make(project) == 1
     said = capfd.readouterr().err
     assert "a.txt: the file changed while it was being read" in said and "defect" not in said
@@ -178,7 +199,15 @@ def test_a_result_that_vanishes_while_it_is_read_is_made_again(fresh, finished, 
 CLOCK = "import time\n_now, _now_ns = time.time, time.time_ns\ntime.time = lambda: _now() - {0}\ntime.time_ns = lambda: _now_ns() - {0} * 10**9\n"
 
 
-@pytest.mark.parametrize("days", [1, pytest.param(400, marks=pytest.mark.long), pytest.param(-1, marks=pytest.mark.long), pytest.param(-4000, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "days",
+    [
+        1,
+        pytest.param(400, marks=pytest.mark.long),
+        pytest.param(-1, marks=pytest.mark.long),
+        pytest.param(-4000, marks=pytest.mark.long),
+    ],
+)
 def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(finished, again, tmp_path, days):
     """All files are from the time before: theirs is the future, and what is edited now is older than what is remembered."""
     project, seconds = again(finished), days * 86400
@@ -194,7 +223,10 @@ def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(finished, again,
     ran = sorted(done(project)[before:])
     write(photo, photo.read_text().swapcase())
     (project.root / "data" / "set" / "c.txt").unlink()
-    no_loss("a clock that goes back", [([] if ran == ["count/c", "total", "upper/a", "upper/c"] else ran) + lost_in(project, results(finished))])
+    no_loss(
+        "a clock that goes back",
+        [([] if ran == ["count/c", "total", "upper/a", "upper/c"] else ran) + lost_in(project, results(finished))],
+    )
 
 
 def test_a_checkout_that_is_moved_in_mid_life_keeps_its_keys(fresh, finished, again, tmp_path):
@@ -209,7 +241,21 @@ def test_a_checkout_that_is_moved_in_mid_life_keeps_its_keys(fresh, finished, ag
     no_loss("a checkout that is moved", losses)
 
 
-@pytest.mark.parametrize("gone", ["store", "store/trees", "store/keys", "store/views", "store/logs", "store/locks", "store/cache", "store/tmp", "set", "."])
+@pytest.mark.parametrize(
+    "gone",
+    [
+        "store",
+        "store/trees",
+        "store/keys",
+        "store/views",
+        "store/logs",
+        "store/locks",
+        "store/cache",
+        "store/tmp",
+        "set",
+        ".",
+    ],
+)
 def test_a_folder_of_results_that_is_deleted_is_made_again(finished, again, gone):
     project, wanted = again(finished), results(finished)
     shutil.rmtree(project.build / gone)
@@ -266,7 +312,11 @@ def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(fi
     for seed in seeds:
         project = again(several)
         keys = len(kept(project))
-        process = subprocess.Popen([sys.executable, "-c", SLOW_GC, str(project.root)], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, stdout=subprocess.PIPE)
+        process = subprocess.Popen(
+            [sys.executable, "-c", SLOW_GC, str(project.root)],
+            env={**os.environ, "PYTHONPATH": str(LIBRARY)},
+            stdout=subprocess.PIPE,
+        )
         process.stdout.readline()
         time.sleep(random.Random(seed).uniform(0, 1.0))
         process.kill()
@@ -274,7 +324,11 @@ def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(fi
         half += 0 < keys - len(kept(project))
         found = lost_in(project, results(finished))
         collect(project)
-        found += ["gc left something"] if sorted(kept(project)) != sorted(kept(finished)) or list((project.build / "store/tmp").glob("gc-*")) else []
+        found += (
+            ["gc left something"]
+            if sorted(kept(project)) != sorted(kept(finished)) or list((project.build / "store/tmp").glob("gc-*"))
+            else []
+        )
         capfd.readouterr()
         remade = make(project, "table.scale=5", "upper.times=5")
         found += ["what was freed cannot be made again"] if remade or results(project) != other else []

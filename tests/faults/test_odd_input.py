@@ -11,7 +11,20 @@ from factorlib.runner import verbs
 from tests.runner import toy
 from tests.runner.toy import state, write
 
-DAMAGED = [b"", b"{", b"[]", b"[1, 2]", b"5", b"null", b'"x"', b"\xff\xfe", b'{"total": 5}', b'{"total": "../../x"}', b'{"a": {"b": []}}', b"[" * 5000]
+DAMAGED = [
+    b"",
+    b"{",
+    b"[]",
+    b"[1, 2]",
+    b"5",
+    b"null",
+    b'"x"',
+    b"\xff\xfe",
+    b'{"total": 5}',
+    b'{"total": "../../x"}',
+    b'{"a": {"b": []}}',
+    b"[" * 5000,
+]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +51,21 @@ def call(monkeypatch, project, *words):
 # ── DATASET ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("word", ["loop", "data/loop", "loop/set", "x" * 300, "data/" + "y" * 300, "a/" * 3000, "nul\0", "data/nul\0/x", "\udcff", "data/\udcff"])
+@pytest.mark.parametrize(
+    "word",
+    [
+        "loop",
+        "data/loop",
+        "loop/set",
+        "x" * 300,
+        "data/" + "y" * 300,
+        "a/" * 3000,
+        "nul\0",
+        "data/nul\0/x",
+        "\udcff",
+        "data/\udcff",
+    ],
+)
 @pytest.mark.parametrize("verb", ["all", "plan", "status", "validate", "clean"])
 def test_a_path_that_leads_nowhere(project, monkeypatch, verb, word):
     for folder in (project.root, project.root / "data"):
@@ -58,10 +85,31 @@ def test_a_folder_whose_name_is_no_text(project, monkeypatch):
 
 @pytest.mark.parametrize(
     "setting",
-    ["table.scale=.inf", "table.scale=-.inf", "table.scale=.nan", "table.scale=[1, .nan]", "table.scale={a: .inf}", "upper.sleep=.inf"]
+    [
+        "table.scale=.inf",
+        "table.scale=-.inf",
+        "table.scale=.nan",
+        "table.scale=[1, .nan]",
+        "table.scale={a: .inf}",
+        "upper.sleep=.inf",
+    ]
     + ["table.scale=" + "9" * 5000, "table.scale=" + "9" * 4000, f"table.scale={2**63}", "table.scale=0x" + "f" * 30]
-    + ["table.scale=" + "[" * 500 + "]" * 500, "table.scale=" + "[" * 2400, "table.scale=" + "{a: " * 1000, "table" + ".a" * 3000 + "=1"]
-    + ["table.scale='\"\\0\"'", "table.scale='\"\\ud800\"'", "table.scale='", 'table.scale="', "=", ".=", "table.=1", "table.scale=&a [*a]"]
+    + [
+        "table.scale=" + "[" * 500 + "]" * 500,
+        "table.scale=" + "[" * 2400,
+        "table.scale=" + "{a: " * 1000,
+        "table" + ".a" * 3000 + "=1",
+    ]
+    + [
+        "table.scale='\"\\0\"'",
+        "table.scale='\"\\ud800\"'",
+        "table.scale='",
+        'table.scale="',
+        "=",
+        ".=",
+        "table.=1",
+        "table.scale=&a [*a]",
+    ]
     + ["table.scale=!!python/object:os.system x", "table.scale='{a: 1, a: 2}'", "\udcff.scale=1", "table.scale=\udcff"],
 )
 @pytest.mark.parametrize("verb", ["plan", "table"])
@@ -98,7 +146,9 @@ def test_a_damaged_current_json_loses_nothing(project, monkeypatch, content, cap
     assert json.loads(mark.read_bytes()) == before
 
 
-@pytest.mark.parametrize("content", [*DAMAGED, b'{"contents": [], "sources": 5}', b'{"contents": {"a": 5}, "sources": {"a": [[1], 2]}}'])
+@pytest.mark.parametrize(
+    "content", [*DAMAGED, b'{"contents": [], "sources": 5}', b'{"contents": {"a": 5}, "sources": {"a": [[1], 2]}}']
+)
 @pytest.mark.parametrize("cache", ["files.json", "packages.json"])
 def test_a_damaged_cache_is_made_anew(project, cache, content):
     (project.build / "store" / "cache").mkdir(exist_ok=True)
@@ -106,7 +156,20 @@ def test_a_damaged_cache_is_made_anew(project, cache, content):
     assert set(state(project).values()) == {"current"}
 
 
-@pytest.mark.parametrize("line", [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b'{"event": "warning", "text": [1]}', b"[" * 5000])
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"5",
+        b"\xff",
+        b'{"no": "event"}',
+        b'{"event": 5}',
+        b'{"event": "warning", "text": [1]}',
+        b"[" * 5000,
+    ],
+)
 def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, line, capsys):
     write(project.root / "data" / "set" / "a.txt", "odd")
     assert verbs.make(project, verbs.Wish("set")) == 0
@@ -133,7 +196,9 @@ def test_a_mark_that_names_nobody(project):
 def foreign(made_once, open_folder, monkeypatch):
     """A checkout of somebody else's, with everything current."""
     checkout = toy.copy(made_once, open_folder / "checkout")
-    assert call(monkeypatch, checkout, "plan", "--dataset", "set") == 0  # loads what another user may not: Python may lie in root's home
+    assert (
+        call(monkeypatch, checkout, "plan", "--dataset", "set") == 0
+    )  # loads what another user may not: Python may lie in root's home
     return checkout
 
 
@@ -144,14 +209,26 @@ def test_what_only_shows_needs_no_right_to_write(foreign, as_other_user, monkeyp
     assert capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["table", "--dataset", "set", "--set", "table.scale=3"], ["all", "--dataset", "set", "--force"], ["gc"], ["clean"], ["clean", "-d", "set"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["table", "--dataset", "set", "--set", "table.scale=3"],
+        ["all", "--dataset", "set", "--force"],
+        ["gc"],
+        ["clean"],
+        ["clean", "-d", "set"],
+    ],
+)
 def test_a_build_folder_that_is_read_only(foreign, as_other_user, monkeypatch, words):
     with as_other_user():
         said = call(monkeypatch, foreign, *words)
     assert said.lower().startswith("error: ") and "permission denied" in said.lower() and str(foreign.build) in said
 
 
-@pytest.mark.parametrize("place", ["data/set", "data", "build", "build/set", "build/store/keys", "build/set/current.json", "pipeline.yaml", "stages"])
+@pytest.mark.parametrize(
+    "place",
+    ["data/set", "data", "build", "build/set", "build/store/keys", "build/set/current.json", "pipeline.yaml", "stages"],
+)
 @pytest.mark.parametrize("verb", ["all", "plan", "status", "clean"])
 def test_what_may_not_be_read(foreign, as_other_user, monkeypatch, verb, place):
     (foreign.root / place).chmod(0)

@@ -151,7 +151,22 @@ def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
 
 # ── it writes nothing outside build/ ─────────────────────────────────────────────────────────────────────────────────
 
-NAMES = ["../up", "a/b", ".", "", "a\0b", "a b", "~", "$(touch x)", "é", "a\n", "CON:", EVIL_HTML, "\x1b[31m", "n" * 101]
+NAMES = [
+    "../up",
+    "a/b",
+    ".",
+    "",
+    "a\0b",
+    "a b",
+    "~",
+    "$(touch x)",
+    "é",
+    "a\n",
+    "CON:",
+    EVIL_HTML,
+    "\x1b[31m",
+    "n" * 101,
+]
 NAMED = [("photos", 0, "name"), ("photos", 0, "illumination"), ("photos", 0, "objects", 0, "name"), ("materials", 0)]
 
 

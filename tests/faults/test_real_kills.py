@@ -19,10 +19,21 @@ from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.runner.store import Store
 
-pytestmark = [pytest.mark.long, pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")]
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
+]
 STAGES = ("masks", "align", "urm", "train", "solve", "export", "render", "evaluate", "report")
 EACH = 5
-QUICK = ["masks.pixels=3000", "urm.most=5000", "urm.directions=0", "solve.rounds=1", "solve.lobes=12", "solve.iterations=2", "solve.polish=1"]
+QUICK = [
+    "masks.pixels=3000",
+    "urm.most=5000",
+    "urm.directions=0",
+    "solve.rounds=1",
+    "solve.lobes=12",
+    "solve.iterations=2",
+    "solve.polish=1",
+]
 QUICK += ["solve.solver=few_lobes", "export.height=32", "export.mitsuba_height=32"]
 LEFT_OUT = "study"  # the photo whose poses are searched
 
@@ -75,9 +86,19 @@ def test_a_stage_that_is_killed_while_it_writes_ends_in_the_same_bytes(whole, st
         if hits == EACH:
             break
         without(whole, stage)
-        words = [sys.executable, "-m", "factorlib", stage, "--dataset", "synthetic", *(f"--set={word}" for word in QUICK)]
+        words = [
+            sys.executable,
+            "-m",
+            "factorlib",
+            stage,
+            "--dataset",
+            "synthetic",
+            *(f"--set={word}" for word in QUICK),
+        ]
         environment = {**os.environ, "FACTORLIB_ROOT": str(whole.root), "PYTHONPATH": str(LIBRARY)}
-        process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+        process = subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
         wait_until(lambda process=process: begun(whole, stage) or process.poll() is not None, seconds=300, every=0.0005)
         time.sleep(0.003 * (number % 3))
         hit = begun(whole, stage)

@@ -83,7 +83,9 @@ class Remembered(Sources):
     """Closures as they were found, while no code is edited."""
 
     def closure(self, package, stage, pipeline_file):
-        if self.hashes is not MEMORY or any(path.is_relative_to(LIBRARY / code) for path in MEMORY.edits for code in ("factorlib", "stages")):
+        if self.hashes is not MEMORY or any(
+            path.is_relative_to(LIBRARY / code) for path in MEMORY.edits for code in ("factorlib", "stages")
+        ):
             return super().closure(package, stage, pipeline_file)
         if stage not in CLOSURES:
             CLOSURES[stage] = super().closure(package, stage, pipeline_file)
@@ -167,7 +169,14 @@ def reached_by(stage):
 def all_modules():
     """The modules of the project that any stage runs, with their files."""
     sources = Sources([LIBRARY], MEMORY)
-    names = sorted({name for stage in PIPELINE.stages for name in reached_by(stage) if name.partition(".")[0] in ("factorlib", "stages")})
+    names = sorted(
+        {
+            name
+            for stage in PIPELINE.stages
+            for name in reached_by(stage)
+            if name.partition(".")[0] in ("factorlib", "stages")
+        }
+    )
     return {name: sources.find(name) for name in names}
 
 
@@ -220,7 +229,11 @@ def check_module(module, now):
 def check_defaults(module, now):
     """A change of names and defaults reaches no stage that does not run the module."""
     others = [stage for stage in PIPELINE.stages if stage not in users(module)]
-    of = lambda: [Sources([LIBRARY], MEMORY).stage_params("stages", stage, LIBRARY / "pipeline.yaml") for stage in others]  # noqa: E731
+
+    def of():
+        """Return the parameters of the stages that do not run the module."""
+        return [Sources([LIBRARY], MEMORY).stage_params("stages", stage, LIBRARY / "pipeline.yaml") for stage in others]
+
     before = of()
     MEMORY.edits[all_modules()[module]] = now
     try:
@@ -357,14 +370,18 @@ def test_all_parameters_at_their_defaults_are_none():
     assert other_keys(words) == set()
 
 
-@pytest.mark.parametrize("stage, param", [(stage, param) for stage, found in PIPELINE.stages.items() for param in found.given])
+@pytest.mark.parametrize(
+    "stage, param", [(stage, param) for stage, found in PIPELINE.stages.items() for param in found.given]
+)
 def test_a_folder_that_is_given_reruns_its_stage_and_what_is_below_by_content(tmp_path, stage, param):
     for folder in ("one", "same"):
         (tmp_path / folder).mkdir()
         for file in PIPELINE.stages[stage].given[param]:
             (tmp_path / folder / file).write_text("{}")
     given, same = (keys([f"{stage}.{param}={tmp_path / folder}"]) for folder in ("one", "same"))
-    assert given == same and {step for step in given if given[step] != usual(DATA)[step]} == with_those_below(steps_of({stage}))
+    assert given == same and {step for step in given if given[step] != usual(DATA)[step]} == with_those_below(
+        steps_of({stage})
+    )
     note("reruns", "a folder that is given", 1)
 
 
@@ -373,7 +390,9 @@ def without_field(text, class_, field):
     tree = ast.parse(text)
     for node in tree.body:
         if getattr(node, "name", None) == class_:
-            at = next(k for k, item in enumerate(node.body) if getattr(getattr(item, "target", None), "id", None) == field)
+            at = next(
+                k for k, item in enumerate(node.body) if getattr(getattr(item, "target", None), "id", None) == field
+            )
             del node.body[at]
     return ast.unparse(tree)
 
@@ -401,13 +420,17 @@ def test_a_parameter_that_is_removed_is_seen_named_and_refused(stage, field):
 def test_a_parameter_taken_out_of_pipeline_yaml_is_seen(tmp_path):
     project = copied(tmp_path)
     words = (project.root / "pipeline.yaml").read_text()
-    (project.root / "pipeline.yaml").write_text(words.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1))
+    (project.root / "pipeline.yaml").write_text(
+        words.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1)
+    )
     assert other_keys(project=project) == with_those_below(steps_of({"solve"}))
     (project.root / "pipeline.yaml").write_text(words)
     assert other_keys(project=project) == set()
 
 
-CONDITIONAL = "import msgspec\nGAIN = 1\nif msgspec:\n    GAIN = 2\nclass Params(msgspec.Struct):\n    gain: int = GAIN\n"
+CONDITIONAL = (
+    "import msgspec\nGAIN = 1\nif msgspec:\n    GAIN = 2\nclass Params(msgspec.Struct):\n    gain: int = GAIN\n"
+)
 
 
 def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default():
@@ -441,8 +464,17 @@ def readers(dataset, file):
         masks = photo["masks"] if isinstance(photo["masks"], dict) else {"": photo["masks"]}
         own = {obj.get("mask") for obj in photo["objects"]}
         meshes = {spec["meshes"][obj["mesh"]]["file"] for obj in photo["objects"]}
-        near = {str(Path(mesh).parent / line.split()[1]) for mesh in meshes if mesh.endswith(".obj") for line in _lines(folder / mesh, "mtllib")}
-        found |= _takers("dataset.photo", photo["name"], dataset) if file in {photo["image"], *masks.values(), *own} else set()
+        near = {
+            str(Path(mesh).parent / line.split()[1])
+            for mesh in meshes
+            if mesh.endswith(".obj")
+            for line in _lines(folder / mesh, "mtllib")
+        }
+        found |= (
+            _takers("dataset.photo", photo["name"], dataset)
+            if file in {photo["image"], *masks.values(), *own}
+            else set()
+        )
         found |= _takers("dataset.objects", photo["name"], dataset) if file in meshes | near | own else set()
     truth = yaml.safe_load((folder / spec["truth"]).read_text()) if spec.get("truth") else {}
     maps = {*truth.get("illumination", {}).values(), *truth.get("normals", {}).values()}
@@ -492,7 +524,11 @@ def in_package(file):
 def test_a_file_of_a_package_reruns_who_runs_that_package(file):
     MEMORY.edits[file] = "0" * 32
     package = in_package(file)
-    stages = {stage for stage in PIPELINE.stages if package in reached_by(stage) or any(m.rpartition(".")[0] == package for m in reached_by(stage))}
+    stages = {
+        stage
+        for stage in PIPELINE.stages
+        if package in reached_by(stage) or any(m.rpartition(".")[0] == package for m in reached_by(stage))
+    }
     assert stages and other_keys() == with_those_below(steps_of(stages))
     note("reruns", "a file of a package", 1)
 
@@ -501,7 +537,9 @@ def test_a_file_of_a_package_reruns_who_runs_that_package(file):
 def test_remarks_and_layout_of_a_data_sets_yaml_change_no_key(tmp_path, name):
     project = copied(tmp_path)
     file = project.root / "data" / DATA / name
-    file.write_text("# a remark\n" + yaml.safe_dump(yaml.safe_load(file.read_text()), default_flow_style=True, sort_keys=False))
+    file.write_text(
+        "# a remark\n" + yaml.safe_dump(yaml.safe_load(file.read_text()), default_flow_style=True, sort_keys=False)
+    )
     assert other_keys(project=project) == set()
 
 
@@ -522,7 +560,10 @@ def test_an_edit_that_keeps_size_and_time_is_seen(tmp_path, monkeypatch):
         stat, content = path.stat(), path.read_bytes()
         path.write_bytes(_one_other(content, name))
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-        assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns) and path.read_bytes() != content
+        assert (path.stat().st_size, path.stat().st_mtime_ns) == (
+            stat.st_size,
+            stat.st_mtime_ns,
+        ) and path.read_bytes() != content
         assert keys(project=project) != before, name
         path.write_bytes(content)
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
@@ -558,7 +599,10 @@ def packages():
 def test_another_version_of_a_package_reruns_who_imports_it(monkeypatch, distribution):
     class Newer(Packages):
         def versions(self, imports):
-            return {name: f"{version}.1" if name == distribution else version for name, version in super().versions(imports).items()}
+            return {
+                name: f"{version}.1" if name == distribution else version
+                for name, version in super().versions(imports).items()
+            }
 
     monkeypatch.setattr(survey_module, "Packages", Newer)
     stages = {stage for stage in PIPELINE.stages if packages()[distribution] & reached_by(stage)}

@@ -28,7 +28,7 @@ TRIES = [
 ]
 VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
 OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
-ODD = "it's $(touch pwned) \"two\" `touch pwned` \\ ;&|<>*?~ $HOME %s é\n#last"
+ODD = 'it\'s $(touch pwned) "two" `touch pwned` \\ ;&|<>*?~ $HOME %s é\n#last'
 
 
 @pytest.fixture
@@ -51,7 +51,13 @@ def checkout(tmp_path):
 def make(checkout, *words, **environment):
     clean = {k: v for k, v in os.environ.items() if k not in (*VARIABLES, *OWN, "MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
     done = subprocess.run(
-        ["make", *words], cwd=checkout, env=clean | environment, capture_output=True, text=True, timeout=600, check=False
+        ["make", *words],
+        cwd=checkout,
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
     )
     assert not [p for p in checkout.rglob(PWNED) if p.name == PWNED], "a command was run"
     assert "Traceback" not in done.stderr
@@ -64,7 +70,10 @@ def test_no_variable_is_expanded_on_its_way(checkout, shift):
     spy = f"#!{sys.executable}\nimport json, os, sys\nprint(json.dumps([sys.argv[1:], dict(os.environ)]))\n"
     (checkout / ".venv" / "bin" / "python").write_text(spy)
     given = dict(zip((*VARIABLES, *OWN), cycle(TRIES[shift:] + TRIES[:shift])))
-    for done in (make(checkout, "plan", *(f"{name}={text}" for name, text in given.items())), make(checkout, "plan", **given)):
+    for done in (
+        make(checkout, "plan", *(f"{name}={text}" for name, text in given.items())),
+        make(checkout, "plan", **given),
+    ):
         arguments, environment = json.loads(done.stdout)
         assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
         assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}

@@ -52,7 +52,10 @@ FAULTS = {  # file -> what is in it, and what is said
 def test_each_fault_is_found_without_running_anything(project, folder, capsys, name):
     content, words = FAULTS[name]
     put(folder / name, content)
-    for verb in (lambda: verbs.validate(project, str(folder), []), lambda: verbs.make(project, verbs.Wish(str(folder)))):
+    for verb in (
+        lambda: verbs.validate(project, str(folder), []),
+        lambda: verbs.make(project, verbs.Wish(str(folder))),
+    ):
         code, said = said_by(verb, capsys)
         assert code == 1 and re.search(words, said), said
     assert not list((project.root / "build").glob("set/*")), "something was run"
@@ -119,7 +122,9 @@ def test_a_run_looks_at_what_is_new_and_no_more(tmp_path, capsys):
 
         def faults(slice_, photo, params, settings):
             asked.append((slice_, photo))
-            return [InputError("a fault", file=f"{photo}.txt")] if "fault" in (folder / f"{photo}.txt").read_text() else []
+            return (
+                [InputError("a fault", file=f"{photo}.txt")] if "fault" in (folder / f"{photo}.txt").read_text() else []
+            )
 
         return Data(data.folder, data.photos, data.slice, faults)
 

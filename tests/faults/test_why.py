@@ -19,10 +19,18 @@ FILES = ["kitchen.jpg", "hall.jpg", "mask.png", "own.png", "chair.obj", "vase.pl
 SET = {
     "format": 1,
     "materials": ["red", "white"],
-    "meshes": {"chair": {"file": "chair.obj", "parts": {"shell": "red", "legs": "white"}}, "vase": {"file": "vase.ply", "material": "white"}},
+    "meshes": {
+        "chair": {"file": "chair.obj", "parts": {"shell": "red", "legs": "white"}},
+        "vase": {"file": "vase.ply", "material": "white"},
+    },
     "photos": [
         {"name": "kitchen", "image": "kitchen.jpg", "masks": "mask.png", "objects": [{"name": "c", "mesh": "chair"}]},
-        {"name": "hall", "image": "hall.jpg", "masks": {"red": "mask.png"}, "objects": [{"name": "c", "mesh": "chair"}, {"name": "v", "mesh": "vase"}]},
+        {
+            "name": "hall",
+            "image": "hall.jpg",
+            "masks": {"red": "mask.png"},
+            "objects": [{"name": "c", "mesh": "chair"}, {"name": "v", "mesh": "vase"}],
+        },
     ],
 }
 
@@ -63,8 +71,18 @@ def why(project, change, settings=(), before=()):
         (("photos", 0), "camera", {"focal_px": 812.0}, "dataset.yaml: photos.*.camera.focal_px: not given -> 812.0"),
         (("photos", 0), "illumination", "hall", 'dataset.yaml: photos.*.illumination: "kitchen" -> "hall"'),
         (("photos", 0), "masks", "own.png", 'dataset.yaml: photos.*.masks: "mask.png" -> "own.png"'),
-        (("photos", 1, "objects", 1), "mask", "own.png", 'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"'),
-        (("photos", 1, "objects", 0), "materials", {"legs": "red"}, 'photos.*.objects[0].materials.legs: not given -> "red"'),
+        (
+            ("photos", 1, "objects", 1),
+            "mask",
+            "own.png",
+            'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"',
+        ),
+        (
+            ("photos", 1, "objects", 0),
+            "materials",
+            {"legs": "red"},
+            'photos.*.objects[0].materials.legs: not given -> "red"',
+        ),
         (("meshes", "chair", "parts"), "legs", "red", 'dataset.yaml: meshes.chair.parts.legs: "white" -> "red"'),
         ((), "materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' came"),
         ((), "materials", ["white", "red"], 'dataset.yaml: materials: ["red", "white"] -> ["white", "red"]'),
@@ -109,7 +127,9 @@ def test_what_changed_in_every_photo_is_said_once(project):
 names = st.text("ab", min_size=1, max_size=2)
 facts = st.recursive(
     st.none() | st.booleans() | st.integers(0, 2) | names | st.lists(st.integers(0, 2), max_size=2),
-    lambda inner: st.dictionaries(names, inner, max_size=2) | st.lists(st.dictionaries(names, inner, max_size=2), max_size=2),
+    lambda inner: (
+        st.dictionaries(names, inner, max_size=2) | st.lists(st.dictionaries(names, inner, max_size=2), max_size=2)
+    ),
     max_leaves=6,
 )
 

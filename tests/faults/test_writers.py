@@ -45,7 +45,12 @@ GLOSS = {name: Reflectance((0.1, 0.2, 0.3), (0.1, 0.1, 0.1), 0.5) for name in ("
 def mesh() -> Mesh:
     vertices = RNG(0).normal(size=(300, 3))
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return Mesh(vertices, RNG(0).integers(0, 300, (400, 3)).astype(np.int32), normals, RNG(0).integers(1, 3, 400).astype(np.int16))
+    return Mesh(
+        vertices,
+        RNG(0).integers(0, 300, (400, 3)).astype(np.int32),
+        normals,
+        RNG(0).integers(1, 3, 400).astype(np.int16),
+    )
 
 
 def observations(n: int = 2000) -> Observations:
@@ -53,12 +58,26 @@ def observations(n: int = 2000) -> Observations:
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     index, names = np.zeros(n, dtype=int), ("red",)
     return Observations(
-        unit, unit, RNG(0).random((n, 3)), np.zeros((n, 3), bool), index, index, index, index, index, np.ones(n), names, names, names
+        unit,
+        unit,
+        RNG(0).random((n, 3)),
+        np.zeros((n, 3), bool),
+        index,
+        index,
+        index,
+        index,
+        index,
+        np.ones(n),
+        names,
+        names,
+        names,
     )
 
 
 def layers() -> Layers:
-    return Layers(torch.zeros(8), torch.ones(8), [torch.ones(32, 8), torch.ones(1, 32)], [torch.ones(32), torch.ones(1)])
+    return Layers(
+        torch.zeros(8), torch.ones(8), [torch.ones(32, 8), torch.ones(1, 32)], [torch.ones(32), torch.ones(1)]
+    )
 
 
 WRITERS = {
@@ -104,7 +123,9 @@ def unlimited(write):
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_file_that_finds_no_room_is_an_error_and_is_not_there(tmp_path, monkeypatch, kind, missing):
     name, write = WRITERS[kind]
-    if name.endswith(".jpg"):  # libjpeg ends the process where it finds no room, so it must never write to a disk itself
+    if name.endswith(
+        ".jpg"
+    ):  # libjpeg ends the process where it finds no room, so it must never write to a disk itself
         monkeypatch.setattr("factorlib.images.write.bytes_of", unlimited)
     write(tmp_path / name)
     size = (tmp_path / name).stat().st_size
@@ -121,7 +142,10 @@ def test_a_file_that_finds_no_room_is_an_error_and_is_not_there(tmp_path, monkey
 
 @pytest.mark.parametrize(
     "name, write",
-    [("a.json", lambda path: replace_file(path, b"{}" * 2000)), ("a.pt", lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)}))],
+    [
+        ("a.json", lambda path: replace_file(path, b"{}" * 2000)),
+        ("a.pt", lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)})),
+    ],
 )
 def test_what_is_replaced_stays_whole_where_the_new_finds_no_room(tmp_path, name, write):
     path = tmp_path / name
@@ -153,7 +177,16 @@ def test_an_image_goes_through_memory_to_the_same_bytes(tmp_path):
     assert (tmp_path / "direct.exr").read_bytes() == (tmp_path / "memory.exr").read_bytes()
 
 
-WRITING = {"write_text", "write_bytes", "save_file", "savefig", "imwrite", "tofile", "savez", "save_image"}  # methods that write to a path
+WRITING = {
+    "write_text",
+    "write_bytes",
+    "save_file",
+    "savefig",
+    "imwrite",
+    "tofile",
+    "savez",
+    "save_image",
+}  # methods that write to a path
 OWN = (  # the writers themselves, what is no result, and words of progress
     "factorlib/wholefile.py",
     "factorlib/images/write.py",
@@ -164,7 +197,12 @@ OWN = (  # the writers themselves, what is no result, and words of progress
 
 
 def test_nothing_is_written_past_the_writers_that_check():
-    files = [p for folder in ("factorlib", "stages", "studies") for p in (LIBRARY / folder).rglob("*.py") if str(p.relative_to(LIBRARY)) not in OWN]
+    files = [
+        p
+        for folder in ("factorlib", "stages", "studies")
+        for p in (LIBRARY / folder).rglob("*.py")
+        if str(p.relative_to(LIBRARY)) not in OWN
+    ]
     past = [f"{p.relative_to(LIBRARY)}:{node.lineno}" for p in files for node in _calls(p) if _writes_past(node)]
     assert not past
 
@@ -172,7 +210,12 @@ def test_nothing_is_written_past_the_writers_that_check():
 def _calls(path: Path) -> list[ast.Call]:
     """Calls that are not inside `with writing(…)`."""
     tree = ast.parse(path.read_text())
-    inside = {id(n) for w in ast.walk(tree) if isinstance(w, ast.With) and "writing(" in ast.unparse(w.items[0]) for n in ast.walk(w)}
+    inside = {
+        id(n)
+        for w in ast.walk(tree)
+        if isinstance(w, ast.With) and "writing(" in ast.unparse(w.items[0])
+        for n in ast.walk(w)
+    }
     return [node for node in ast.walk(tree) if isinstance(node, ast.Call) and id(node) not in inside]
 
 
@@ -181,7 +224,11 @@ def _writes_past(call: ast.Call) -> bool:
     if text.endswith((".write_table", "ImageOutput.create", "torch.save")):
         return "stream" not in ast.unparse(call)
     if text in ("open", "os.fdopen"):
-        modes = [a.value for a in [*call.args[1:], *(k.value for k in call.keywords if k.arg == "mode")] if isinstance(a, ast.Constant)]
+        modes = [
+            a.value
+            for a in [*call.args[1:], *(k.value for k in call.keywords if k.arg == "mode")]
+            if isinstance(a, ast.Constant)
+        ]
         return (
             any(isinstance(m, str) and set(m) & set("wax+") for m in modes)
             and "/proc/" not in ast.unparse(call)

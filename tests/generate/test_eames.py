@@ -67,7 +67,9 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
     apart, nearest = cKDTree(traced.vertices).query(mesh.vertices)
     assert apart.max() < 1e-6 and len(set(nearest)) == len(traced.vertices)
     alike = np.linalg.norm(mesh.normals - traced.normals[nearest], axis=1) < 1e-6
-    assert alike.mean() > 0.97  # of flat ends of legs, which stand on the floor or in the seat, the reader takes its own
+    assert (
+        alike.mean() > 0.97
+    )  # of flat ends of legs, which stand on the floor or in the seat, the reader takes its own
 
 
 def test_behind_the_chairs_a_distant_light_is_its_map(tmp_path):

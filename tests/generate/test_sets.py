@@ -43,7 +43,11 @@ def chairs(tmp_path_factory) -> Path:
 
 
 def hashes(out: Path) -> dict[str, str]:
-    return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(out.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
+    }
 
 
 def test_the_same_seed_is_the_same_bytes(small, tmp_path):
@@ -81,7 +85,9 @@ def test_a_matte_pixel_is_its_irradiance(small):
     normal = np.stack([maps[f"normal.{axis}"] for axis in "xyz"], axis=-1)[labels == 1] @ YUP_FROM_CAMERA
     irradiance = irradiance_of(normal, light)
     diffuse = np.array(read_dataset(small).truth.materials["red"].diffuse) / np.pi * irradiance
-    beyond = (radiance[labels == 1] / diffuse - 1)[:, 0]  # in red, where the specular part is small: it adds, and little
+    beyond = (radiance[labels == 1] / diffuse - 1)[
+        :, 0
+    ]  # in red, where the specular part is small: it adds, and little
     assert 0 < np.median(beyond) < 0.2
     assert np.quantile(beyond, 0.05) > -0.1 and np.quantile(beyond, 0.95) < 0.5  # with the noise of few samples
 

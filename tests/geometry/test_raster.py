@@ -47,8 +47,13 @@ def test_bending_a_normal_keeps_its_plane():
 def test_turning_object_and_pose_together_changes_nothing():
     caster, camera, pose = photo_of(chair(), seed=2)
     turn = Rotation.random(rng=np.random.default_rng(3)).as_matrix()
-    turned = msgspec.structs.replace(caster.mesh, vertices=caster.mesh.vertices @ turn.T, normals=caster.mesh.normals @ turn.T)
-    first, second = rasterise(caster, camera, pose), rasterise(turned, camera, Pose(pose.rotation @ turn.T, pose.translation))
+    turned = msgspec.structs.replace(
+        caster.mesh, vertices=caster.mesh.vertices @ turn.T, normals=caster.mesh.normals @ turn.T
+    )
+    first, second = (
+        rasterise(caster, camera, pose),
+        rasterise(turned, camera, Pose(pose.rotation @ turn.T, pose.translation)),
+    )
     assert np.mean(first.label != second.label) < 1e-4
     assert np.quantile(np.abs(first.normal - second.normal), 0.999) < 1e-4
 

@@ -159,7 +159,9 @@ def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     material, faces = np.divmod(past.met[hidden].astype(int), BINS)
     assert (material == 2).all()
     row, k = np.nonzero(hidden)
-    assert (np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1) < 0.2).all()  # toward the floor, to the width of a bin
+    assert (
+        np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1) < 0.2
+    ).all()  # toward the floor, to the width of a bin
 
 
 def with_met():
@@ -188,7 +190,9 @@ def test_codes_are_kept_in_parquet_taken_and_merged(tmp_path):
 
 def test_codes_that_name_no_material_are_refused(tmp_path):
     seen = with_met()
-    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, met=seen.met * 0 + BINS * len(seen.materials)))
+    write_observations(
+        tmp_path / "a.parquet", msgspec.structs.replace(seen, met=seen.met * 0 + BINS * len(seen.materials))
+    )
     with pytest.raises(InputError, match="met"):
         read_observations(tmp_path / "a.parquet")
     write_observations(tmp_path / "b.parquet", msgspec.structs.replace(seen, met=seen.met[:, :32]))

@@ -10,11 +10,29 @@ import numpy as np
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 FORM = {BYTE: "B", ASCII: "B", SHORT: "H", LONG: "I", RATIONAL: "II", SRATIONAL: "ii"}
-XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)  # a sensor that sees Rec. 709
+XYZ_TO_SRGB = (
+    3.2406,
+    -1.5372,
+    -0.4986,
+    -0.9689,
+    1.8758,
+    0.0415,
+    0.0557,
+    -0.2040,
+    1.0570,
+)  # a sensor that sees Rec. 709
 WHITE, BLACK = 4000, 64
 
 
-def write_dng(path: Path, sensor: np.ndarray, *, orientation: int = 1, neutral=(1.0, 1.0, 1.0), exif: dict | None = None, crop=None) -> Path:
+def write_dng(
+    path: Path,
+    sensor: np.ndarray,
+    *,
+    orientation: int = 1,
+    neutral=(1.0, 1.0, 1.0),
+    exif: dict | None = None,
+    crop=None,
+) -> Path:
     """sensor: [h, w] codes under red, green / green, blue; neutral: as the camera's white balance sees grey;
     exif: tag -> (type, values); crop: (left, top, width, height) of the picture in it.  The preview is bright magenta."""
     height, width = sensor.shape
@@ -66,4 +84,6 @@ def _directory(entries: list, at: int) -> bytes:
 def _packed(kind: int, values) -> bytes:
     if kind in (RATIONAL, SRATIONAL):
         values = [part for v in values for part in Fraction(v).limit_denominator(10**6).as_integer_ratio()]
-    return struct.pack(f"<{len(values) if kind not in (RATIONAL, SRATIONAL) else len(values) // 2 * 2}{FORM[kind][0]}", *values)
+    return struct.pack(
+        f"<{len(values) if kind not in (RATIONAL, SRATIONAL) else len(values) // 2 * 2}{FORM[kind][0]}", *values
+    )

@@ -39,7 +39,9 @@ def test_heif_is_the_radiance_that_was_written(tmp_path, deep, tolerance):
 
 
 def test_ten_bits_are_read_as_ten(tmp_path):
-    step = srgb_decode(np.full((8, 64, 3), 1.0) * (np.arange(64)[None, :, None] // 8 + 400) / 1023)  # an eighth of 8 bits' steps
+    step = srgb_decode(
+        np.full((8, 64, 3), 1.0) * (np.arange(64)[None, :, None] // 8 + 400) / 1023
+    )  # an eighth of 8 bits' steps
     radiance = read_photo(save(tmp_path / "a.heic", step, deep=True)).radiance
     assert len(np.unique(radiance[4, ::8, 1])) == 8
 
@@ -65,7 +67,9 @@ def test_what_the_camera_wrote_is_read_and_averaging_is_as_for_any_file(tmp_path
     path = save(tmp_path / "a.heic", SMOOTH, exif=exif_of())
     whole, small = read_photo(path), decoded(open_photo(path), None, 4, path)
     assert whole.exposure == pytest.approx(200 / 50 / 4)
-    assert whole.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(W, H)) and small.focal_px == pytest.approx(whole.focal_px / 4)
+    assert whole.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(W, H)) and small.focal_px == pytest.approx(
+        whole.focal_px / 4
+    )
     np.testing.assert_allclose(small.radiance, whole.radiance.reshape(12, 4, 16, 4, 3).mean((1, 3)), rtol=1e-5)
 
 
@@ -102,13 +106,17 @@ def test_a_picture_of_another_size_than_its_header_says_is_refused(tmp_path):
     whole = save(tmp_path / "a.heic", SMOOTH).read_bytes()
     at = whole.index(b"clap") + 12  # the height of the crop: past the name and the width, a fraction
     (tmp_path / "a.heic").write_bytes(whole[:at] + (255).to_bytes(4, "big") + whole[at + 4 :])
-    with pytest.raises(InputError, match=r"truncated or damaged \(its header says .*×255 pixels, the picture in it has ") as caught:
+    with pytest.raises(
+        InputError, match=r"truncated or damaged \(its header says .*×255 pixels, the picture in it has "
+    ) as caught:
         read_photo(tmp_path / "a.heic", key="photos[0].image")
     assert "photos[0].image" in str(caught.value) and caught.value.cure
 
 
 def test_a_file_in_a_curve_of_hdr_video_is_refused(tmp_path):
-    path = save(tmp_path / "a.heic", SMOOTH, deep=True, save_nclx_profile=True, transfer_characteristics=18, color_primaries=9)
+    path = save(
+        tmp_path / "a.heic", SMOOTH, deep=True, save_nclx_profile=True, transfer_characteristics=18, color_primaries=9
+    )
     with pytest.raises(InputError, match="HLG"):
         read_photo(path)
 

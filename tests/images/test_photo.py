@@ -19,7 +19,9 @@ RADIANCE = RNG.uniform(0, 0.9, (12, 18, 3)).astype(np.float32)  # 3:2, below cli
 
 def save(path, pixels, names=None, **attributes):
     """Write an image in the type of `pixels`; attribute names with `__` for `:`."""
-    kind = {np.uint8: oiio.UINT8, np.uint16: oiio.UINT16, np.float16: oiio.HALF, np.float32: oiio.FLOAT}[pixels.dtype.type]
+    kind = {np.uint8: oiio.UINT8, np.uint16: oiio.UINT16, np.float16: oiio.HALF, np.float32: oiio.FLOAT}[
+        pixels.dtype.type
+    ]
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if names:
@@ -58,7 +60,9 @@ def test_every_kind_of_file_gives_the_same_radiance(tmp_path, file, pixels, tole
     assert photo.encoding == ("linear" if pixels.dtype.kind == "f" else "srgb")
 
 
-@pytest.mark.parametrize("encoding, encode", [("srgb", srgb_encode), ("gamma2.2", gamma_encode), ("linear", np.asarray)])
+@pytest.mark.parametrize(
+    "encoding, encode", [("srgb", srgb_encode), ("gamma2.2", gamma_encode), ("linear", np.asarray)]
+)
 def test_a_given_encoding_goes_before_what_the_file_implies(tmp_path, encoding, encode):
     for file, pixels in (("a.png", codes(encode(RADIANCE), np.uint16)), ("a.exr", encode(RADIANCE))):
         photo = read_photo(save(tmp_path / file, pixels), encoding)
@@ -98,7 +102,9 @@ def averaged(path, factor, rows_at_once):
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 5])
-@pytest.mark.parametrize("file, pixels", [("a.jpg", codes(RADIANCE)), ("a.png", codes(RADIANCE, np.uint16)), ("a.exr", RADIANCE)])
+@pytest.mark.parametrize(
+    "file, pixels", [("a.jpg", codes(RADIANCE)), ("a.png", codes(RADIANCE, np.uint16)), ("a.exr", RADIANCE)]
+)
 def test_how_many_rows_are_read_at_once_changes_no_bit(tmp_path, factor, file, pixels):
     path = save(tmp_path / file, pixels)
     once = averaged(path, factor, 100)
@@ -127,7 +133,11 @@ def test_a_clipped_part_clips_the_average_and_what_is_not_finite_has_no_part_in_
     pixels = np.full((4, 4, 3), 2.0, np.float32)
     pixels[0, 0, 1], pixels[2:, 2:] = np.nan, np.inf
     photo = decoded(open_photo(save(tmp_path / "a.exr", pixels)), None, 2, "a.exr")
-    assert photo.finite.tolist() == [[True, True], [True, False]] and (photo.radiance[0] == 2).all() and (photo.radiance[1, 1] == 0).all()
+    assert (
+        photo.finite.tolist() == [[True, True], [True, False]]
+        and (photo.radiance[0] == 2).all()
+        and (photo.radiance[1, 1] == 0).all()
+    )
 
 
 def test_a_file_cut_in_the_rows_that_averaging_drops_is_refused_too(tmp_path):
@@ -158,7 +168,10 @@ def test_a_focal_length_is_in_pixels_of_the_averaged_photo(tmp_path):
     [
         ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 125}, 125 / 60 / 1.8**2),
         ({"ExposureTime": 1 / 60, "FNumber": 1.8}, None),
-        ({"ExposureTime": 1 / 60, "FNumber": 0.0, "Exif__PhotographicSensitivity": 125}, None),  # a lens that says nothing
+        (
+            {"ExposureTime": 1 / 60, "FNumber": 0.0, "Exif__PhotographicSensitivity": 125},
+            None,
+        ),  # a lens that says nothing
         ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 65535}, None),  # "more than fits"
     ],
 )
@@ -227,7 +240,12 @@ def test_what_is_no_image_is_refused(tmp_path):
 
 def test_focal_of_35mm_film_is_the_same_for_any_size_and_orientation(tmp_path):
     for size, orientation in (((40, 60), 1), ((80, 120), 6)):
-        path = save(tmp_path / "a.jpg", np.zeros((*size, 3), dtype=np.uint8), Orientation=orientation, Exif__FocalLengthIn35mmFilm=50)
+        path = save(
+            tmp_path / "a.jpg",
+            np.zeros((*size, 3), dtype=np.uint8),
+            Orientation=orientation,
+            Exif__FocalLengthIn35mmFilm=50,
+        )
         photo = read_photo(path)
         half = np.hypot(photo.width, photo.height) / 2
         assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))

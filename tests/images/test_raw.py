@@ -9,7 +9,13 @@ from factorlib.images.photo import decoded, open_photo, read_photo
 from tests.images.made_dng import BLACK, LONG, RATIONAL, SHORT, WHITE, write_dng
 
 H, W = 48, 64
-EXIF = {33434: (RATIONAL, [1 / 50]), 33437: (RATIONAL, [2.0]), 34855: (SHORT, [200]), 41989: (SHORT, [26]), 40962: (LONG, [W])}
+EXIF = {
+    33434: (RATIONAL, [1 / 50]),
+    33437: (RATIONAL, [2.0]),
+    34855: (SHORT, [200]),
+    41989: (SHORT, [26]),
+    40962: (LONG, [W]),
+}
 
 
 def sensor_of(rgb: np.ndarray) -> np.ndarray:
@@ -32,7 +38,11 @@ def test_a_dng_is_what_the_sensor_saw_by_whatever_name(tmp_path, name):
     path = write_dng(tmp_path / name, sensor_of(halves()))
     photo = read_photo(path)
     assert (photo.width, photo.height, photo.encoding) == (W, H, "linear")
-    inner = (slice(H // 3 + 4, -4), slice(4, W // 2 - 4)), (slice(H // 3 + 4, -4), slice(W // 2 + 4, -4)), (slice(4, H // 3 - 4), slice(4, W // 2 - 4))
+    inner = (
+        (slice(H // 3 + 4, -4), slice(4, W // 2 - 4)),
+        (slice(H // 3 + 4, -4), slice(W // 2 + 4, -4)),
+        (slice(4, H // 3 - 4), slice(4, W // 2 - 4)),
+    )
     for where, expected in zip(inner, [(0.2, 0.2, 0.2), (0.4, 0.3, 0.2), (0.1, 0.1, 0.1)]):
         np.testing.assert_allclose(photo.radiance[where].mean((0, 1)), expected, rtol=0.02)
     assert not photo.clipped.any()
@@ -41,7 +51,10 @@ def test_a_dng_is_what_the_sensor_saw_by_whatever_name(tmp_path, name):
 def test_the_cameras_white_balance_is_applied(tmp_path):
     seen = halves() * (0.5, 1.0, 0.8)  # the sensor sees less red and blue
     photo = read_photo(write_dng(tmp_path / "a.dng", sensor_of(seen), neutral=(0.5, 1.0, 0.8)))
-    grey, coloured = photo.radiance[H // 2 :, 6 : W // 2 - 6].mean((0, 1)), photo.radiance[H // 2 : -4, W // 2 + 6 : -4].mean((0, 1))
+    grey, coloured = (
+        photo.radiance[H // 2 :, 6 : W // 2 - 6].mean((0, 1)),
+        photo.radiance[H // 2 : -4, W // 2 + 6 : -4].mean((0, 1)),
+    )
     np.testing.assert_allclose(grey / grey[1], 1, rtol=0.02)
     np.testing.assert_allclose(coloured / grey, (2, 1.5, 1), rtol=0.03)
 
@@ -50,7 +63,9 @@ def test_what_the_sensors_white_level_cut_is_clipped_in_all_channels(tmp_path):
     sensor = sensor_of(halves())
     sensor[24:26, 40:42] = WHITE
     clipped = read_photo(write_dng(tmp_path / "a.dng", sensor)).clipped
-    assert clipped[24:26, 40:42].all() and not clipped[:20].any() and not clipped[30:].any() and not clipped[:, :36].any()
+    assert (
+        clipped[24:26, 40:42].all() and not clipped[:20].any() and not clipped[30:].any() and not clipped[:, :36].any()
+    )
 
 
 def test_brightness_is_the_files_own_whatever_is_in_the_picture(tmp_path):

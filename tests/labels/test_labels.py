@@ -55,7 +55,9 @@ def coco(folder, annotations, images=None, categories=MATERIALS):
         "info": {"year": 2020},
         "images": images or [{"id": 7, "file_name": "kitchen.jpg", "width": W, "height": H, "license": 1}],
         "categories": [{"id": 10 + k, "name": name, "supercategory": "material"} for k, name in enumerate(categories)],
-        "annotations": [{"id": k, "image_id": 7, "iscrowd": 0, **annotation} for k, annotation in enumerate(annotations)],
+        "annotations": [
+            {"id": k, "image_id": 7, "iscrowd": 0, **annotation} for k, annotation in enumerate(annotations)
+        ],
     }
     (folder / "coco.json").write_text(json.dumps(content))
     return "coco.json"
@@ -88,7 +90,10 @@ def forms(folder):
             "wood": save(folder / "w.png", wood.astype(np.uint8) * 255),
             "red": save(folder / "r.png", red.astype(np.uint8) * 255),
         },
-        "one each, 1": lambda: {"red": save(folder / "r.png", red.astype(np.uint8)), "wood": save(folder / "w.png", wood.astype(np.uint8))},
+        "one each, 1": lambda: {
+            "red": save(folder / "r.png", red.astype(np.uint8)),
+            "wood": save(folder / "w.png", wood.astype(np.uint8)),
+        },
         "one each, 1 bit": lambda: {"red": save(folder / "r.png", red), "wood": save(folder / "w.png", wood)},
         "polygons": lambda: coco(
             folder,
@@ -174,7 +179,9 @@ def test_unknown_label(tmp_path):
 @pytest.mark.parametrize("masks", ["label", "per material", "coco"])
 def test_empty(tmp_path, masks):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
-    message = refusal(tmp_path, {"label": name, "per material": {"red": name, "wood": name}, "coco": coco(tmp_path, [])}[masks])
+    message = refusal(
+        tmp_path, {"label": name, "per material": {"red": name, "wood": name}, "coco": coco(tmp_path, [])}[masks]
+    )
     assert "the mask is empty" in message and KEY in message
 
 
@@ -195,7 +202,10 @@ def test_transparency(tmp_path):
 
 def test_materials_that_overlap(tmp_path):
     red, wood = LABEL == 1, LABEL > 0
-    masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * wood), "red": save(tmp_path / "r.png", np.uint8(255) * red)}
+    masks = {
+        "wood": save(tmp_path / "w.png", np.uint8(255) * wood),
+        "red": save(tmp_path / "r.png", np.uint8(255) * red),
+    }
     message = refusal(tmp_path, masks)
     assert f"'red' and 'wood' share {red.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
@@ -251,7 +261,9 @@ def test_objects_are_numbered_in_their_order(tmp_path):
     np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
 
 
-@pytest.mark.parametrize("second, said", [(LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")])
+@pytest.mark.parametrize(
+    "second, said", [(LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")]
+)
 def test_bad_object_masks(tmp_path, second, said):
     masks = [("a", save(tmp_path / "a.png", LABEL == 1)), ("b", save(tmp_path / "b.png", second))]
     with pytest.raises(InputError, match=said) as caught:

@@ -22,7 +22,10 @@ def folder(tmp_path):
     rng = np.random.default_rng(1)
     (tmp_path / "maps").mkdir()
     for name in "abc":
-        write_rgb_exr(tmp_path / f"maps/{name}.exr", np.exp(np.linspace(1, -1, 16)[:, None, None] + 0.5 * rng.normal(size=(16, 32, 3))))
+        write_rgb_exr(
+            tmp_path / f"maps/{name}.exr",
+            np.exp(np.linspace(1, -1, 16)[:, None, None] + 0.5 * rng.normal(size=(16, 32, 3))),
+        )
     return tmp_path / "maps"
 
 

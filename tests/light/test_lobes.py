@@ -13,7 +13,11 @@ from factorlib.results.lobes import read_lobes, write_lobes
 def some_lobes(count: int = 6, seed: int = 0) -> Lobes:
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(count, 3))
-    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.geomspace(0.1, 5000, count), rng.uniform(0.1, 2, (count, 3)))
+    return Lobes(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        np.geomspace(0.1, 5000, count),
+        rng.uniform(0.1, 2, (count, 3)),
+    )
 
 
 @pytest.mark.parametrize("sharpness", [1e-6, 5e-4, 2e-3, 0.1, 3.0, 500.0])

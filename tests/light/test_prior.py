@@ -67,7 +67,9 @@ def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():
     precision, log_determinant = KNOWN.precision(directions)
     np.testing.assert_allclose(precision @ unmix @ of_y @ unmix.T, np.eye(36), atol=1e-8)
     other, log_of_other = KNOWN.precision(directions, (2.0, 1.0, 0.5))  # a constant apart, the determinant's logarithm
-    assert log_of_other - log_determinant == pytest.approx(np.linalg.slogdet(other)[1] - np.linalg.slogdet(precision)[1])
+    assert log_of_other - log_determinant == pytest.approx(
+        np.linalg.slogdet(other)[1] - np.linalg.slogdet(precision)[1]
+    )
 
 
 def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
@@ -98,7 +100,10 @@ def test_the_likelihood_without_bounds_of_freedom_is_the_gaussian():
     cells = fibonacci_sphere(20)
     gaussian = msgspec.structs.replace(KNOWN, freedom=(1e9,) * 3)
     logs = drawn(gaussian, cells, 4)
-    expected = sum(multivariate_normal(gaussian.mean(cells, UP)[k], gaussian.covariance(k, cells)).logpdf(logs[k]) for k in range(3))
+    expected = sum(
+        multivariate_normal(gaussian.mean(cells, UP)[k], gaussian.covariance(k, cells)).logpdf(logs[k])
+        for k in range(3)
+    )
     np.testing.assert_allclose(log_likelihood(gaussian, logs, cells, UP), expected, rtol=1e-5)
 
 
@@ -107,13 +112,18 @@ def test_a_map_of_much_contrast_has_little_weight():
     logs = drawn(msgspec.structs.replace(KNOWN, freedom=(1e4,) * 3), cells, 12)
     before, logs[1:, 0] = fitted(logs, cells), 30 * logs[1:, 0]
     after = fitted(logs, cells)
-    assert all(after.variance[k] < 3 * before.variance[k] and after.freedom[k] < 0.1 * before.freedom[k] for k in (1, 2))
+    assert all(
+        after.variance[k] < 3 * before.variance[k] and after.freedom[k] < 0.1 * before.freedom[k] for k in (1, 2)
+    )
 
 
 def test_the_likelihood_is_highest_at_the_truth():
     cells = fibonacci_sphere(60)
     logs = drawn(KNOWN, cells, 60)
-    wrong = [msgspec.structs.replace(KNOWN, **change) for change in ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})]
+    wrong = [
+        msgspec.structs.replace(KNOWN, **change)
+        for change in ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})
+    ]
     truth = log_likelihood(KNOWN, logs, cells, UP).mean()
     assert all(log_likelihood(prior, logs, cells, UP).mean() < truth for prior in wrong)
     assert log_likelihood(KNOWN, logs, cells, None).mean() < truth
@@ -122,7 +132,9 @@ def test_the_likelihood_is_highest_at_the_truth():
 def test_brighter_maps_give_the_same_prior():
     cells, rng = fibonacci_sphere(40), np.random.default_rng(0)
     maps = np.exp(rng.normal(size=(4, 16, 32, 3)))
-    dim, bright = (fitted(log_cells(np.stack([cell_means(scale * one, cells) for one in maps])), cells) for scale in (1e-4, 1e4))
+    dim, bright = (
+        fitted(log_cells(np.stack([cell_means(scale * one, cells) for one in maps])), cells) for scale in (1e-4, 1e4)
+    )
     for name in ("variance", "decay_deg", "level", "nugget", "profile"):
         np.testing.assert_allclose(getattr(dim, name), getattr(bright, name), rtol=1e-3, atol=1e-4)
 

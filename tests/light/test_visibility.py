@@ -32,7 +32,9 @@ def behind(edge, d):
 
 
 def tangents(axis):
-    helper = torch.where(axis[:, :1].abs() < 0.6, torch.tensor([[1.0, 0, 0]]).double(), torch.tensor([[0, 1.0, 0]]).double())
+    helper = torch.where(
+        axis[:, :1].abs() < 0.6, torch.tensor([[1.0, 0, 0]]).double(), torch.tensor([[0, 1.0, 0]]).double()
+    )
     first = torch.linalg.cross(axis, helper)
     first = first / first.norm(dim=1, keepdim=True)
     return first, torch.linalg.cross(axis, first)
@@ -51,7 +53,9 @@ PARTS = pytest.mark.parametrize("part", ["diffuse", "specular"])
 def test_who_sees_everything_sees_all_of_every_lobe(part):
     (normals, views), d = points(), directions()
     lobes = kernel(d, unit(20), torch.logspace(-1, 3, 20).double())
-    np.testing.assert_array_equal(seen_share(torch.ones(30, 256).double(), weights_of(part, normals, views, d)[0], lobes), 1)
+    np.testing.assert_array_equal(
+        seen_share(torch.ones(30, 256).double(), weights_of(part, normals, views, d)[0], lobes), 1
+    )
 
 
 def test_constant_light_is_seen_through_the_cosine_weighted_open_part_of_the_hemisphere():
@@ -84,7 +88,9 @@ def test_derivatives_are_differences(part):
     visibility, turn = torch.from_numpy(RNG.random((30, 128))), tangents(axis)
 
     def share(axis, log_sharpness, roughness):
-        return seen_share(visibility, weights_of(part, normals, views, d, roughness)[0], kernel(d, axis, log_sharpness.exp()))
+        return seen_share(
+            visibility, weights_of(part, normals, views, d, roughness)[0], kernel(d, axis, log_sharpness.exp())
+        )
 
     def turned(by):
         moved = axis + by
@@ -93,12 +99,21 @@ def test_derivatives_are_differences(part):
     weights, by_roughness = weights_of(part, normals, views, d)
     found = seen(visibility, weights, d, MovingLobes(axis, log_sharpness.exp(), turn), by_roughness)
     expected = {
-        "by_first": (share(turned(step * turn[0]), log_sharpness, 0.4) - share(turned(-step * turn[0]), log_sharpness, 0.4)) / (2 * step),
-        "by_second": (share(turned(step * turn[1]), log_sharpness, 0.4) - share(turned(-step * turn[1]), log_sharpness, 0.4)) / (2 * step),
-        "by_log_sharpness": (share(axis, log_sharpness + step, 0.4) - share(axis, log_sharpness - step, 0.4)) / (2 * step),
+        "by_first": (
+            share(turned(step * turn[0]), log_sharpness, 0.4) - share(turned(-step * turn[0]), log_sharpness, 0.4)
+        )
+        / (2 * step),
+        "by_second": (
+            share(turned(step * turn[1]), log_sharpness, 0.4) - share(turned(-step * turn[1]), log_sharpness, 0.4)
+        )
+        / (2 * step),
+        "by_log_sharpness": (share(axis, log_sharpness + step, 0.4) - share(axis, log_sharpness - step, 0.4))
+        / (2 * step),
     }
     if part == "specular":
-        expected["by_roughness"] = (share(axis, log_sharpness, 0.4 + step) - share(axis, log_sharpness, 0.4 - step)) / (2 * step)
+        expected["by_roughness"] = (share(axis, log_sharpness, 0.4 + step) - share(axis, log_sharpness, 0.4 - step)) / (
+            2 * step
+        )
     np.testing.assert_allclose(found.share, share(axis, log_sharpness, 0.4), rtol=1e-12)
     light = weights @ kernel(d, axis, log_sharpness.exp()) > 1e-4  # behind the surface there is nothing to see
     for name, slope in expected.items():
@@ -111,7 +126,9 @@ def test_turning_everything_changes_nothing(part):
     sharpness, visibility = torch.full((9,), 30.0).double(), torch.from_numpy(RNG.random((30, 256)))
     turn = torch.linalg.qr(torch.from_numpy(RNG.normal(size=(3, 3))))[0]
     one, other = (
-        seen_share(visibility, weights_of(part, normals @ t.T, views @ t.T, d @ t.T)[0], kernel(d @ t.T, axis @ t.T, sharpness))
+        seen_share(
+            visibility, weights_of(part, normals @ t.T, views @ t.T, d @ t.T)[0], kernel(d @ t.T, axis @ t.T, sharpness)
+        )
         for t in (torch.eye(3).double(), turn)
     )
     np.testing.assert_allclose(one, other, rtol=1e-9)

@@ -43,11 +43,15 @@ def test_triangles_and_quads_may_be_mixed_in_ply_and_off(tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])
     faces = [[3, 2, 1, 0], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
     header = PLY_HEADER.replace("vertex 4", "vertex 5").replace("face 4", "face 5")
-    rows = "".join("{} {} {}\n".format(*v) for v in vertices) + "".join(f"{len(f)} {' '.join(map(str, f))}\n" for f in faces)
+    rows = "".join("{} {} {}\n".format(*v) for v in vertices) + "".join(
+        f"{len(f)} {' '.join(map(str, f))}\n" for f in faces
+    )
     binary = {}
     for order, word in (("<", "little"), (">", "big")):
         polygons = b"".join(struct.pack(f"{order}B{len(f)}i", len(f), *f) for f in faces)
-        binary[f"{word}.ply"] = header.format(f"binary_{word}_endian").encode() + vertices.astype(f"{order}f4").tobytes() + polygons
+        binary[f"{word}.ply"] = (
+            header.format(f"binary_{word}_endian").encode() + vertices.astype(f"{order}f4").tobytes() + polygons
+        )
     for name, content in {"a.ply": header.format("ascii") + rows, "a.off": f"OFF 5 5 0\n{rows}", **binary}.items():
         mesh = read(put(tmp_path / name, content))
         assert len(mesh.faces) == 6 and not mesh.open, name
@@ -61,8 +65,15 @@ def test_gltf_strips_fans_and_sparse_accessors_are_read(tmp_path):
         data = DATA[:48] + np.array([0, 1, 2, 3], "<u2").tobytes().ljust(24, b"\0")
         assert len(read(put(tmp_path / "a.glb", glb(header, data))).faces) == 2
     header = gltf_header()
-    header["accessors"][0]["sparse"] = {"count": 1, "indices": {"bufferView": 2, "componentType": 5121}, "values": {"bufferView": 3}}
-    header["bufferViews"] += [{"buffer": 0, "byteOffset": 72, "byteLength": 1}, {"buffer": 0, "byteOffset": 76, "byteLength": 12}]
+    header["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 2, "componentType": 5121},
+        "values": {"bufferView": 3},
+    }
+    header["bufferViews"] += [
+        {"buffer": 0, "byteOffset": 72, "byteLength": 1},
+        {"buffer": 0, "byteOffset": 76, "byteLength": 12},
+    ]
     header["buffers"][0]["byteLength"] = 88
     data = DATA + b"\3\0\0\0" + np.array([0, 0, 5], "<f4").tobytes()
     assert read(put(tmp_path / "a.glb", glb(header, data))).vertices[:, 2].max() == 5
@@ -74,12 +85,18 @@ def test_the_same_gltf_is_the_same_mesh_each_time(tmp_path):
     header["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
     path = put(tmp_path / "a.glb", glb(header))
     first, second = read(path), read(path)
-    assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces) and len(first.faces) == 8
+    assert (
+        np.array_equal(first.vertices, second.vertices)
+        and np.array_equal(first.faces, second.faces)
+        and len(first.faces) == 8
+    )
 
 
 def test_a_normal_of_any_length_does_no_harm(tmp_path):
     for normal in ("1e300 0 1", "nan 0 1", "inf inf 1", "0 0 0"):
-        plain, odd = (read(put(tmp_path / "a.obj", OBJ.replace("vn 0 0 1", f"vn {words}"))) for words in ("0 0 0", normal))
+        plain, odd = (
+            read(put(tmp_path / "a.obj", OBJ.replace("vn 0 0 1", f"vn {words}"))) for words in ("0 0 0", normal)
+        )
         assert np.array_equal(plain.normals, odd.normals)
 
 

@@ -15,7 +15,10 @@ def mesh_of(vertices, faces, normals=None, crease_deg=60.0):
     faces = np.asarray(faces)
     supplied = no_normals(len(faces)) if normals is None else normals
     return usable(
-        Soup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied), np.ones(len(faces), int), crease_deg, "m"
+        Soup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied),
+        np.ones(len(faces), int),
+        crease_deg,
+        "m",
     )
 
 
@@ -72,7 +75,8 @@ def test_open_patch_keeps_the_winding_of_most_of_its_area():
 def test_a_moebius_strip_is_left_as_it_is():
     t = np.linspace(0, 2 * np.pi, 21)[:-1]
     rim = [
-        np.stack([(2 + s * np.cos(t / 2)) * np.cos(t), (2 + s * np.cos(t / 2)) * np.sin(t), s * np.sin(t / 2)], axis=1) for s in (-0.5, 0.5)
+        np.stack([(2 + s * np.cos(t / 2)) * np.cos(t), (2 + s * np.cos(t / 2)) * np.sin(t), s * np.sin(t / 2)], axis=1)
+        for s in (-0.5, 0.5)
     ]
     a, b = np.arange(20), np.arange(20) + 20
     a_next, b_next = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]

@@ -47,7 +47,9 @@ def area_of(mesh, label):
     return np.linalg.norm(area_vectors(mesh.vertices, mesh.faces[mesh.face_label == label]), axis=1).sum()
 
 
-@pytest.mark.parametrize("parts", [{"shell": "red", "legs": "oak"}, {"plastic": "red", "wood": "oak"}, {"shell": "red", "wood": "oak"}])
+@pytest.mark.parametrize(
+    "parts", [{"shell": "red", "legs": "oak"}, {"plastic": "red", "wood": "oak"}, {"shell": "red", "wood": "oak"}]
+)
 def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts):
     mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, parts)
     assert len(mesh.faces) == 12  # quads and negative indices
@@ -89,7 +91,9 @@ def test_unknown_material_is_named(tmp_path):
 
 def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "factorlib.meshes"):
-        mesh = read_mesh(obj(tmp_path, QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, {"shell": "red", "legs": "oak"})
+        mesh = read_mesh(
+            obj(tmp_path, QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, {"shell": "red", "legs": "oak"}
+        )
     assert len(mesh.faces) == 12  # 4 3 2 is half of the first quad, in either winding
     assert "1 zero-area" in caplog.text and "2 duplicate" in caplog.text
 
@@ -133,7 +137,10 @@ def test_submesh_holds_one_material(tmp_path):
 
 
 def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
-    turn, quaternion = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]), Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_quat().tolist()
+    turn, quaternion = (
+        Rotation.from_euler("xyz", [0.3, -0.8, 1.1]),
+        Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_quat().tolist(),
+    )
     header = gltf_header()
     outer = np.eye(4)
     outer[:3, 3] = (5, 6, 7)
@@ -153,7 +160,9 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
     tilted = ball.vertex_normals + 0.2 * np.roll(ball.vertex_normals, 1, axis=1)
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
-    (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **({"vertex_normal": True} if suffix == "ply" else {})))
+    (tmp_path / f"ball.{suffix}").write_bytes(
+        made.export(file_type=suffix, **({"vertex_normal": True} if suffix == "ply" else {}))
+    )
     mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "red")
     nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
     assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
@@ -161,9 +170,14 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "glb", "obj"])
 def test_what_trimesh_writes_and_reads_is_read_the_same(tmp_path, suffix):
-    made = trimesh.util.concatenate([trimesh.creation.torus(2, 0.5), trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))])
+    made = trimesh.util.concatenate(
+        [trimesh.creation.torus(2, 0.5), trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))]
+    )
     made.export(tmp_path / f"a.{suffix}")
     theirs = trimesh.load_mesh(tmp_path / f"a.{suffix}")
     ours = read_mesh(tmp_path / f"a.{suffix}", MATERIALS, "red")
-    triangles = [np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0) for t in (theirs.triangles, ours.vertices[ours.faces])]
+    triangles = [
+        np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0)
+        for t in (theirs.triangles, ours.vertices[ours.faces])
+    ]
     assert triangles[0].shape == triangles[1].shape and np.allclose(*triangles, atol=2e-3)

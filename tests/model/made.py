@@ -16,7 +16,9 @@ OPERATOR = reflection_operator("closed_form", dtype="float64")
 def guessed(rng: np.random.Generator, data, curves: bool) -> Illumination:
     """A block of two photos in a wrong light of four lobes, with tone curves or without."""
     guess, tone = random_light(rng, 4, photos=2), np.log([1.3, 0.8]) if curves else np.zeros(0)
-    return Illumination(data, Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone), MATERIALS, OPERATOR)
+    return Illumination(
+        data, Light(guess.axis, guess.log_sharpness, guess.weight / 10, guess.log_exposure, tone), MATERIALS, OPERATOR
+    )
 
 
 def clipped_photos(curves: bool) -> Illumination:
@@ -39,6 +41,10 @@ def three_rooms() -> tuple[JointProblem, Point]:
     """Three materials in three lights, and a wrong point."""
     rng = np.random.default_rng(4)
     lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)]
+    blocks = [
+        block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)
+    ]
     guess = [random_light(rng, 4) for _ in range(3)]
-    return JointProblem(blocks, OPERATOR), Point(MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess])
+    return JointProblem(blocks, OPERATOR), Point(
+        MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]
+    )

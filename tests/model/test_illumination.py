@@ -26,7 +26,9 @@ def test_atoms_are_what_a_lobe_adds_to_the_residual(given):
     lobe, weight = UnitLobes(np.array([[0.6, 0.0, -0.8]]), np.array([20.0])), np.array([[0.3, 0.2, 0.1]])
     rows = np.flatnonzero(~given.block.clipped.any(1))
     added = with_light(straight, joined(straight.light, lobe, weight)).residuals() - straight.residuals()
-    np.testing.assert_allclose(straight.atoms(rows, lobe)[:, :, 0].T * weight, added[rows], atol=1e-9 * np.abs(added).max())
+    np.testing.assert_allclose(
+        straight.atoms(rows, lobe)[:, :, 0].T * weight, added[rows], atol=1e-9 * np.abs(added).max()
+    )
 
 
 def test_a_clipped_channel_pulls_only_from_below(given):

@@ -41,7 +41,9 @@ def bowl(albedo, depth=0.5, size=40, count=1024, name="bowl") -> Observations:
     d = fibonacci_sphere(count)
     out = -n[:, None] + 2 * (n @ d.T)[..., None] * d  # where a ray from −n leaves the sphere
     hidden = (out[..., 2] > 1 - 2 * depth) & (n @ d.T > 0)
-    met = np.where(hidden, met_codes(np.zeros(out.shape[:2], int).reshape(-1), -out.reshape(-1, 3)).reshape(hidden.shape), UNMET)
+    met = np.where(
+        hidden, met_codes(np.zeros(out.shape[:2], int).reshape(-1), -out.reshape(-1, 3)).reshape(hidden.shape), UNMET
+    )
     radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
     return Observations(
         normal=n, view=np.tile([0.0, 0.0, -1.0], (len(n), 1)), radiance=radiance, clipped=np.zeros((len(n), 3), bool),
@@ -64,11 +66,18 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
 def test_facing_plates_of_red_and_white_bleed_and_keep_their_colours():
     """Two plates that hide three quarters of the light from each other, in constant light 1, with all bounces."""
     albedo, count, each = np.array([[0.8, 0.8, 0.8], [0.8, 0.1, 0.05]]), 1024, 30
-    open_, hidden = 0.25, 0.75  # of the cosine-weighted hemisphere: what lies within 60° of a plate's normal is the other plate
-    radiance = np.stack([np.linalg.solve([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T], axis=1)
+    open_, hidden = (
+        0.25,
+        0.75,
+    )  # of the cosine-weighted hemisphere: what lies within 60° of a plate's normal is the other plate
+    radiance = np.stack(
+        [np.linalg.solve([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T], axis=1
+    )
     material, normal = np.repeat([0, 1], each), np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], each, axis=0)
     facing = normal @ fibonacci_sphere(count).T > 0.5
-    met = np.where(facing, np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None], UNMET)
+    met = np.where(
+        facing, np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None], UNMET
+    )
     n = len(material)
     seen = Observations(
         normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance[material], clipped=np.zeros((n, 3), bool),
@@ -91,7 +100,9 @@ def test_nothing_hidden_sends_nothing():
 def test_brighter_photos_send_more_in_their_own_unit_alike():
     seen, factor = bowl(0.5), 1e4
     brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
-    np.testing.assert_allclose(bounced_light(brighter, brighter.radiance), factor * bounced_light(seen, seen.radiance), rtol=1e-5)
+    np.testing.assert_allclose(
+        bounced_light(brighter, brighter.radiance), factor * bounced_light(seen, seen.radiance), rtol=1e-5
+    )
     one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (seen, brighter))
     np.testing.assert_allclose(one, other, rtol=1e-5)
 

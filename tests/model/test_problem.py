@@ -39,5 +39,7 @@ def test_where_none_is_held_out_all_are_judged(given):
     problem, point = given
     everything = problem.with_none_held_out()
     losses = np.concatenate(everything.held_out_losses(point))
-    assert len(losses) == sum(map(len, problem.blocks)) and everything.held_out_loss(point) == pytest.approx(losses.mean())
+    assert len(losses) == sum(map(len, problem.blocks)) and everything.held_out_loss(point) == pytest.approx(
+        losses.mean()
+    )
     assert len(np.concatenate(problem.held_out_losses(point))) == sum(int(b.held_out.sum()) for b in problem.blocks)

@@ -19,7 +19,9 @@ from tests.solve.made import OPERATOR, drawn, on_even_cells
 CELLS, ALL = 60, Loss(1e6)  # no outliers
 
 
-def made(seed: int, photos: int = 1, toned: bool = False, hidden: bool = False, bounced: bool = False, clipped: bool = False) -> Illumination:
+def made(
+    seed: int, photos: int = 1, toned: bool = False, hidden: bool = False, bounced: bool = False, clipped: bool = False
+) -> Illumination:
     """Two materials of random reflectances in one light of several photos, with its table; what the photos show is of another light."""
     rng = np.random.default_rng(seed)
     exposure = [0.0, *rng.normal(0, 0.5, photos - 1)]
@@ -41,7 +43,13 @@ def made(seed: int, photos: int = 1, toned: bool = False, hidden: bool = False, 
     return msgspec.structs.replace(one, table=Reflections(one.block, light.unit_lobes, OPERATOR))
 
 
-ANY = {"seed": st.integers(0, 10_000), "photos": st.integers(1, 3), "toned": st.booleans(), "hidden": st.booleans(), "bounced": st.booleans()}
+ANY = {
+    "seed": st.integers(0, 10_000),
+    "photos": st.integers(1, 3),
+    "toned": st.booleans(),
+    "hidden": st.booleans(),
+    "bounced": st.booleans(),
+}
 FEW_EXAMPLES = settings(max_examples=8, deadline=None, derandomize=True)
 
 
@@ -66,7 +74,9 @@ def check_against_differences(one: Illumination, moved, found: np.ndarray, step:
     """moved: the illumination at a multiple of a change; what is held out or where a bound of the residual is passed is left out."""
     high, low = (moved(sign * step).residuals() for sign in (1, -1))
     difference = (high - low) / (2 * step)
-    counts = ~one.block.held_out[:, None] & ~(one.block.clipped & (np.minimum(high, low) < 0) & (np.maximum(high, low) >= 0))
+    counts = ~one.block.held_out[:, None] & ~(
+        one.block.clipped & (np.minimum(high, low) < 0) & (np.maximum(high, low) >= 0)
+    )
     np.testing.assert_allclose(found[counts], difference[counts], rtol=0.01, atol=0.003 * np.abs(difference).max())
     assert not found[np.broadcast_to(one.block.held_out[:, None], found.shape)].any()
 
@@ -77,7 +87,9 @@ def check_derivatives(one: Illumination) -> None:
     rng, m, k = np.random.default_rng(0), len(one.materials), len(one.block.photos)
     du = rng.normal(size=light.log_radiance.shape)
     found = linear(one, lambda part, by: (part.diffuse + part.specular) @ by[part.channel], du)
-    check_against_differences(one, lambda s: replaced(one, light=light.with_log_radiance(light.log_radiance + s * du)), found, 5e-3)
+    check_against_differences(
+        one, lambda s: replaced(one, light=light.with_log_radiance(light.log_radiance + s * du)), found, 5e-3
+    )
 
     dm = rng.normal(size=(m, 7)) * np.array([1.0] * 6 + [0.05])
 
@@ -91,7 +103,9 @@ def check_derivatives(one: Illumination) -> None:
     for places in (slice(0, 3), slice(3, 6), slice(6, 7)):
         alone = np.zeros_like(dm)
         alone[:, places] = dm[:, places]
-        check_against_differences(one, lambda s, by=alone: with_materials(s * by), linear(one, by_material, alone), 1e-2)
+        check_against_differences(
+            one, lambda s, by=alone: with_materials(s * by), linear(one, by_material, alone), 1e-2
+        )
 
     dp = rng.normal(size=k - 1 + len(light.log_tone))
     for own in ([True] * (k - 1) + [False] * len(light.log_tone), [False] * (k - 1) + [True] * len(light.log_tone)):
@@ -101,7 +115,9 @@ def check_derivatives(one: Illumination) -> None:
 
         def with_photos(s, by=by):
             exposure = light.log_exposure + s * np.concatenate([[0.0], by[: k - 1]])
-            return replaced(one, light=replaced(light, log_exposure=exposure, log_tone=light.log_tone + s * by[k - 1 :]))
+            return replaced(
+                one, light=replaced(light, log_exposure=exposure, log_tone=light.log_tone + s * by[k - 1 :])
+            )
 
         check_against_differences(one, with_photos, linear(one, lambda part, by: part.by_photo @ by, by), 5e-3)
 
@@ -137,7 +153,9 @@ def test_outliers_and_temperature_are_factors_on_residual_and_derivatives():
 def test_roughness_moves_residuals_by_the_sum_over_cells():
     one = made(5)
     for part in one.linearise(one.shown(), ALL):
-        np.testing.assert_allclose(part.by_roughness.sum(1), part.by_material[:, 2], rtol=1e-3, atol=1e-4 * np.abs(part.by_material).max())
+        np.testing.assert_allclose(
+            part.by_roughness.sum(1), part.by_material[:, 2], rtol=1e-3, atol=1e-4 * np.abs(part.by_material).max()
+        )
 
 
 @pytest.mark.parametrize("sharpness", [None, 500.0])  # None: of the cells; 500: every node is needed

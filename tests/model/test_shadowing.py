@@ -16,6 +16,8 @@ from factorlib.urm.observations import Observations
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 NAMES = ("red", "green", "blue")
+
+
 def bowl_sees(normals, directions):
     """A ray from −n leaves the sphere at −n + 2(n·d)d; it is free where that lies before the rim."""
     exit_z = -normals[:, 2:] + 2 * (normals @ directions.T) * directions[:, 2]
@@ -36,7 +38,9 @@ def traced(normals, sees, light: Light, material, materials: Materials, count=12
 
     highlight = square / (np.pi * (nh**2 * (square - 1) + 1) ** 2) * smith(ni) * smith(no) / (4 * no)
     weight = sees(normals, d) * 4 * np.pi / count
-    return (weight * ni / np.pi) @ incoming * materials.diffuse[material] + (weight * highlight) @ incoming * materials.specular[material]
+    return (weight * ni / np.pi) @ incoming * materials.diffuse[material] + (
+        weight * highlight
+    ) @ incoming * materials.specular[material]
 
 
 def bowls(name, light, size=16, count=512) -> Observations:
@@ -70,7 +74,8 @@ def test_model_in_shadow_is_the_traced_radiance(rooms):
         light = rough_light(seed)
         light = msgspec.structs.replace(light, weight=light.weight / data.unit)
         with_, without = (
-            Illumination(b, light, MATERIALS, reflection_operator("network")).radiance() for b in (data, data.without_shadows())
+            Illumination(b, light, MATERIALS, reflection_operator("network")).radiance()
+            for b in (data, data.without_shadows())
         )
         error, ignored = (np.sqrt(np.mean((found - data.radiance) ** 2)) for found in (with_, without))
         assert ignored > 0.15 * data.radiance.mean()

@@ -17,7 +17,9 @@ from factorlib.yamlfile import load_yaml, read_yaml
 
 EAMES = LIBRARY / "data" / "eames"
 RECIPES = sorted((LIBRARY / "recipes").glob("*.yaml")) + sorted((LIBRARY / "recipes" / "eames").glob("*.yaml"))
-OF_OTHER_SETS = sorted(set((LIBRARY / "recipes").rglob("*.yaml")) - set(RECIPES))  # sets that do not come with the project
+OF_OTHER_SETS = sorted(
+    set((LIBRARY / "recipes").rglob("*.yaml")) - set(RECIPES)
+)  # sets that do not come with the project
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,10 @@ def test_every_kind_has_a_recipe_that_comes_with_the_project(dataset):
         ("kind: insert\nmesh: char", ["there is no mesh 'char'", "did you mean 'chair'"]),
         ("kind: insert\nmesh: x.obj", ["there is no file 'x.obj'"]),
         ("kind: insert\nmaterial: redd", ["did you mean 'red'"]),
-        ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos that have it"]),
+        (
+            "kind: insert\nphotos: [kitchen]\nbeside: red_chair",
+            ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos that have it"],
+        ),
         ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
         ("kind: insert\nmesh: read.py", ["there is no file", "read.py"]),
         ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh", ".obj"]),

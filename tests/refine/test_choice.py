@@ -44,7 +44,11 @@ def test_a_pose_gives_way_only_to_one_that_is_surely_better(others, chosen, rule
 
 def test_the_order_of_candidates_is_no_matter():
     others = [one("moved", 0.1), one("runner_up", 0.3)]
-    assert choice_of([FOUND, *others], STANDARDS).chosen == choice_of([FOUND, *others[::-1]], STANDARDS).chosen == "runner_up"
+    assert (
+        choice_of([FOUND, *others], STANDARDS).chosen
+        == choice_of([FOUND, *others[::-1]], STANDARDS).chosen
+        == "runner_up"
+    )
 
 
 def test_a_gain_is_as_sure_as_its_cells_agree():

@@ -33,7 +33,9 @@ def test_what_is_held_out_has_no_say():
 def test_a_pursued_light_explains_a_light_it_knows_nothing_of():
     found = pursued_light(SHOWN, SURFACES)
     residual = SURFACES.under(found, SHOWN).residuals()
-    assert np.sqrt(np.mean(residual[~SHOWN.held_out] ** 2)) < 1 and np.sqrt(np.mean(residual[SHOWN.held_out] ** 2)) < 1.5
+    assert (
+        np.sqrt(np.mean(residual[~SHOWN.held_out] ** 2)) < 1 and np.sqrt(np.mean(residual[SHOWN.held_out] ** 2)) < 1.5
+    )
 
 
 def test_outliers_pull_little():
@@ -56,5 +58,7 @@ def test_a_pose_sees_nothing_that_the_light_explains():
     other = RNG.normal(size=as_light.shape)
     hessian, gradient = projected_equations(np.stack([as_light, other], -1), lit.residuals(), lit)
     alone = (as_light**2).sum()
-    assert abs(hessian[0, 0]) < 1e-4 * hessian[1, 1] * alone / (other**2).sum() and abs(gradient[0]) < 1e-2 * np.sqrt(alone)
+    assert abs(hessian[0, 0]) < 1e-4 * hessian[1, 1] * alone / (other**2).sum() and abs(gradient[0]) < 1e-2 * np.sqrt(
+        alone
+    )
     assert hessian[1, 1] > 0 and np.linalg.eigvalsh(hessian).min() > -1e-6 * hessian[1, 1]

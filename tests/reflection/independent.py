@@ -19,7 +19,9 @@ def directions(rows: int, columns: int):
     return i, 2 * np.pi / (rows * columns)
 
 
-def brute_force(roughness: float, sharpness: float, no: float, nz: float, oz: float, size: int = 1500) -> tuple[float, float]:
+def brute_force(
+    roughness: float, sharpness: float, no: float, nz: float, oz: float, size: int = 1500
+) -> tuple[float, float]:
     """Diffuse and specular reflection of a unit lobe, the BRDF written out in vectors."""
     n, o, z = frame(no, nz, oz)
     i, cell = directions(size, 2 * size)

@@ -45,7 +45,9 @@ def test_without_lobes_or_points_there_is_nothing():
     operator = reflection_operator("network")
     none = operator.response(torch.tensor(0.5), torch.ones(0), torch.ones(3), torch.ones(3, 0), torch.ones(3, 0))
     assert none.specular.shape == (3, 0)
-    assert operator.response(torch.tensor(0.5), torch.ones(2), torch.ones(0), torch.ones(0, 2), torch.ones(0, 2)).diffuse.shape == (0, 2)
+    assert operator.response(
+        torch.tensor(0.5), torch.ones(2), torch.ones(0), torch.ones(0, 2), torch.ones(0, 2)
+    ).diffuse.shape == (0, 2)
 
 
 def test_without_a_compiler_torch_computes_the_same(monkeypatch):
@@ -58,7 +60,7 @@ def test_without_a_compiler_torch_computes_the_same(monkeypatch):
 def test_a_compiler_that_fails_is_said_and_torch_is_not_taken_instead(monkeypatch, tmp_path):
     """Which form runs is in the keys of steps: a form that nobody asked for would be kept as the other."""
     compiler = tmp_path / "cc"
-    compiler.write_text("#!/bin/sh\ntest \"$1\" = --version || { echo out of order >&2; exit 1; }\n")
+    compiler.write_text('#!/bin/sh\ntest "$1" = --version || { echo out of order >&2; exit 1; }\n')
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -79,7 +81,10 @@ def test_derivatives_on_a_tape_are_those_of_autograd():
     tape = Tape()
     x, y = tape.input("x"), tape.input("y")
     result = formula(x, y)
-    lines = tape.c_code(dict(zip(("r", "dx", "dy"), (result, *tape.gradient([(result, 1.0)], [x, y])), strict=True)), {"x": "x", "y": "y"})
+    lines = tape.c_code(
+        dict(zip(("r", "dx", "dy"), (result, *tape.gradient([(result, 1.0)], [x, y])), strict=True)),
+        {"x": "x", "y": "y"},
+    )
     functions = {
         "sqrtf": torch.sqrt,
         "expf": torch.exp,
@@ -121,7 +126,11 @@ def test_the_bits_do_not_depend_on_the_instructions_that_the_compiler_may_use(mo
     layers = reflection_operator("network").layers["specular"]
     roughness, *point = grid(0.3, torch.float32, rows=40)
     found = []
-    for flags in (fused.FLAGS, fused.FLAGS.replace("-march=native", OLDEST), fused.FLAGS.replace("-O3 -march=native", f"-O1 {OLDEST}")):
+    for flags in (
+        fused.FLAGS,
+        fused.FLAGS.replace("-march=native", OLDEST),
+        fused.FLAGS.replace("-O3 -march=native", f"-O1 {OLDEST}"),
+    ):
         monkeypatch.setattr(fused, "FLAGS", flags)
         fused.compiled.cache_clear()
         found.append(b"".join(t.numpy().tobytes() for t in fused.Fused("specular", layers)(float(roughness), *point)))

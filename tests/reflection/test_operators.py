@@ -17,7 +17,11 @@ from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers,
 from factorlib.reflection.reference import diffuse_quadrature
 from factorlib.reflection.samples import diffuse_samples, specular_samples
 
-FAST = {(name, dtype): reflection_operator(name, dtype=dtype) for name in ("closed_form", "network") for dtype in ("float32", "float64")}
+FAST = {
+    (name, dtype): reflection_operator(name, dtype=dtype)
+    for name in ("closed_form", "network")
+    for dtype in ("float32", "float64")
+}
 EVERY = FAST | {("reference", "float64"): reflection_operator("reference")}
 fast = pytest.mark.parametrize("operator", FAST.values(), ids=map("-".join, FAST))
 every = pytest.mark.parametrize("operator", EVERY.values(), ids=map("-".join, EVERY))
@@ -31,7 +35,9 @@ def unit(generator, *shape):
 def scene(seed=0, points=40, lobes=5):
     g = torch.Generator().manual_seed(seed)
     light = SimpleNamespace(
-        axis=unit(g, lobes), sharpness=torch.logspace(0, 2.5, lobes, dtype=torch.float64), weight=torch.rand(lobes, 3, generator=g).double()
+        axis=unit(g, lobes),
+        sharpness=torch.logspace(0, 2.5, lobes, dtype=torch.float64),
+        weight=torch.rand(lobes, 3, generator=g).double(),
     )
     material = SimpleNamespace(
         diffuse=torch.tensor([0.3, 0.2, 0.1]).double(),
@@ -52,9 +58,14 @@ def test_radiance_is_not_negative_and_linear_in_light_and_reflectance(operator):
     light, material, normals, views = scene()
     radiance = operator(light, material, normals, views)
     assert (radiance >= 0).all() and radiance.shape == (40, 3)
-    torch.testing.assert_close(operator(changed(light, weight=3 * light.weight), material, normals, views), 3 * radiance)
     torch.testing.assert_close(
-        operator(light, changed(material, diffuse=2 * material.diffuse, specular=2 * material.specular), normals, views), 2 * radiance
+        operator(changed(light, weight=3 * light.weight), material, normals, views), 3 * radiance
+    )
+    torch.testing.assert_close(
+        operator(
+            light, changed(material, diffuse=2 * material.diffuse, specular=2 * material.specular), normals, views
+        ),
+        2 * radiance,
     )
 
 
@@ -73,7 +84,10 @@ def test_surfaces_that_face_away_reflect_nothing(operator):
     assert (operator(light, material, normals, -views) == 0).all()
 
 
-STATED = {"network": read_json(SHIPPED / "accuracy.json"), "closed_form": {"diffuse": {"p99": 0.0068}, "specular": {"p99": 0.53}}}  # docs/operator.md
+STATED = {
+    "network": read_json(SHIPPED / "accuracy.json"),
+    "closed_form": {"diffuse": {"p99": 0.0068}, "specular": {"p99": 0.53}},
+}  # docs/operator.md
 
 
 @pytest.mark.parametrize("name, dtype", EVERY)
@@ -83,7 +97,9 @@ def test_no_more_is_reflected_than_arrives(name, dtype):
     most = 1 + (0.4 * stated["diffuse"]["p99"] + 0.6 * stated["specular"]["p99"] if stated else 1e-4)
     _, material, normals, views = scene()
     light = SimpleNamespace(
-        axis=torch.tensor([[0.0, 0, 1]]).double(), sharpness=torch.tensor([1e-4]).double(), weight=torch.ones(1, 3).double()
+        axis=torch.tensor([[0.0, 0, 1]]).double(),
+        sharpness=torch.tensor([1e-4]).double(),
+        weight=torch.ones(1, 3).double(),
     )
     for roughness in (0.1, 0.5, 1.0):
         white = changed(
@@ -102,8 +118,12 @@ def test_a_point_light_is_the_brdf(operator):
         pytest.skip("in its own tests")
     no, nz, oz = (torch.tensor(v, dtype=operator.dtype) for v in ([0.6], [[0.7]], [[0.2]]))
     lam = torch.tensor([1e6], dtype=operator.dtype)
-    exact = EVERY["reference", "float64"].specular(torch.tensor(0.7).double(), lam.double(), no.double(), nz.double(), oz.double())
-    assert operator.specular(torch.tensor(0.7, dtype=operator.dtype), lam, no, nz, oz).item() == pytest.approx(exact.item(), rel=5e-3)
+    exact = EVERY["reference", "float64"].specular(
+        torch.tensor(0.7).double(), lam.double(), no.double(), nz.double(), oz.double()
+    )
+    assert operator.specular(torch.tensor(0.7, dtype=operator.dtype), lam, no, nz, oz).item() == pytest.approx(
+        exact.item(), rel=5e-3
+    )
 
 
 @fast
@@ -117,7 +137,9 @@ def test_values_and_gradients_are_finite_everywhere(operator, roughness, log_sha
     nz = math.cos(tilt)
     oz = no * nz + math.sqrt(max(0, 1 - no * no)) * math.sin(tilt) * math.cos(turn)
     cosines = (torch.tensor(v, dtype=d) for v in ([no], [[nz]], [[oz]]))
-    response = operator.response(torch.tensor(roughness, dtype=d), torch.tensor([log_sharpness], dtype=d).exp(), *cosines)
+    response = operator.response(
+        torch.tensor(roughness, dtype=d), torch.tensor([log_sharpness], dtype=d).exp(), *cosines
+    )
     for name in response.__struct_fields__:
         assert getattr(response, name).isfinite().all(), name
     assert (response.diffuse >= 0).all() and (response.specular >= 0).all()
@@ -176,7 +198,10 @@ def test_response_is_value_and_finite_differences(name, roughness):
 def test_gradients_are_those_of_the_reference(name):
     errors = []
     for roughness in (0.2, 0.4, 0.8):
-        found, exact = (o.response(*grid(roughness, o.dtype, rows=12)) for o in (FAST[name, "float32"], EVERY["reference", "float64"]))
+        found, exact = (
+            o.response(*grid(roughness, o.dtype, rows=12))
+            for o in (FAST[name, "float32"], EVERY["reference", "float64"])
+        )
         floor = exact.specular + lobe_integral(grid(roughness)[1]) / 100
         for field in exact.__struct_fields__[4:]:
             true = getattr(exact, field)
@@ -190,7 +215,10 @@ def test_response_of_many_is_that_of_each(operator):
     no, lam = torch.rand(3000, generator=g).to(operator.dtype), torch.logspace(-1, 3, 9, dtype=operator.dtype)
     nz, oz = (2 * torch.rand(3000, 9, generator=g).to(operator.dtype) - 1 for _ in range(2))
     roughness = torch.tensor(0.4, dtype=operator.dtype)
-    whole, part = operator.response(roughness, lam, no, nz, oz), operator.response(roughness, lam, no[-7:], nz[-7:], oz[-7:])
+    whole, part = (
+        operator.response(roughness, lam, no, nz, oz),
+        operator.response(roughness, lam, no[-7:], nz[-7:], oz[-7:]),
+    )
     for name in whole.__struct_fields__:
         torch.testing.assert_close(getattr(whole, name)[-7:], getattr(part, name), rtol=2e-3, atol=1e-4)
 
@@ -235,7 +263,9 @@ def test_moments_of_a_lobe():
         mean_square = (weight * t * t).sum() / weight.sum()
         expected = mean, (weight * (t - mean) ** 2).sum() / weight.sum(), (1 - mean_square) / 2
         assert [m[k].item() for m in lobe_moments(lam)] == pytest.approx([e.item() for e in expected], rel=1e-4)
-        assert lobe_integral(lam)[k].item() == pytest.approx(2 * math.pi * (weight.sum() * math.pi / 2_000_000).item(), rel=1e-4)
+        assert lobe_integral(lam)[k].item() == pytest.approx(
+            2 * math.pi * (weight.sum() * math.pi / 2_000_000).item(), rel=1e-4
+        )
 
 
 def test_unknown_names_say_what_is_known():
@@ -251,7 +281,9 @@ def test_weights_that_are_not_there_are_named(tmp_path):
 def test_weights_of_another_version_are_refused(tmp_path):
     for part in ("diffuse", "specular"):
         layers = read_layers(SHIPPED / f"{part}.safetensors", FEATURES[part])
-        fewer = Layers(layers.mean[1:], layers.scale[1:], [layers.weights[0][:, 1:], *layers.weights[1:]], layers.biases)
+        fewer = Layers(
+            layers.mean[1:], layers.scale[1:], [layers.weights[0][:, 1:], *layers.weights[1:]], layers.biases
+        )
         write_layers(tmp_path / f"{part}.safetensors", fewer)
     with pytest.raises(InputError, match="a network of 7 features, not 8"):
         reflection_operator("network", weights=tmp_path)

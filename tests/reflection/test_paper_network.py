@@ -36,10 +36,13 @@ def points(count=200, lobes=7, seed=0):
     """A light of white lobes, normals and views that see them; float64."""
     g = torch.Generator().manual_seed(seed)
     axis, normals, tilts = (
-        torch.nn.functional.normalize(torch.randn(n, 3, generator=g, dtype=torch.float64), dim=1) for n in (lobes, count, count)
+        torch.nn.functional.normalize(torch.randn(n, 3, generator=g, dtype=torch.float64), dim=1)
+        for n in (lobes, count, count)
     )
     light = SimpleNamespace(
-        axis=axis, sharpness=torch.logspace(-0.5, 3.5, lobes).double(), weight=torch.rand(lobes, 3, generator=g).double()
+        axis=axis,
+        sharpness=torch.logspace(-0.5, 3.5, lobes).double(),
+        weight=torch.rand(lobes, 3, generator=g).double(),
     )
     return light, normals, torch.nn.functional.normalize(normals + 0.8 * tilts, dim=1)
 
@@ -70,7 +73,9 @@ def test_channels_know_nothing_of_each_other():
     order = [2, 0, 1]
     turned = SimpleNamespace(**(vars(light) | {"weight": light.weight[:, order]}))
     swapped = material(diffuse=MATERIAL["diffuse"][order], specular=MATERIAL["specular"][order])
-    torch.testing.assert_close(EXACT(turned, swapped, normals, views), EXACT(light, material(), normals, views)[:, order])
+    torch.testing.assert_close(
+        EXACT(turned, swapped, normals, views), EXACT(light, material(), normals, views)[:, order]
+    )
 
 
 def test_the_frame_of_the_cosines_has_the_cosines_and_the_half_vector_of_the_conventions():
@@ -112,7 +117,10 @@ def test_response_is_value_and_finite_differences(roughness):
     }  # fmt: skip
 
     def parts(roughness, log_sharpness, no, nz, oz):
-        return {"diffuse": EXACT.diffuse(log_sharpness.exp(), nz), "specular": EXACT.specular(roughness, log_sharpness.exp(), no, nz, oz)}
+        return {
+            "diffuse": EXACT.diffuse(log_sharpness.exp(), nz),
+            "specular": EXACT.specular(roughness, log_sharpness.exp(), no, nz, oz),
+        }
 
     response, values = EXACT.response(*(point | {"log_sharpness": light.sharpness}).values()), parts(**point)
     for part, keys in {"diffuse": ("log_sharpness", "nz"), "specular": tuple(point)}.items():
@@ -132,7 +140,10 @@ def test_errors_of_the_shipped_weights():
         specular = OPERATOR.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
         d = diffuse_samples(2048, 78)
         diffuse = OPERATOR.diffuse(d.sharpness[:, None].float(), d.nz[:, None].float())[:, 0].double()
-    found = {"specular": quantiles((specular - s.value) / s.scale()), "diffuse": quantiles((diffuse - d.value) / d.scale())}
+    found = {
+        "specular": quantiles((specular - s.value) / s.scale()),
+        "diffuse": quantiles((diffuse - d.value) / d.scale()),
+    }
     assert found["specular"]["median"] < 0.018 and found["specular"]["p95"] < 0.14, found
     assert found["diffuse"]["median"] < 0.014 and found["diffuse"]["p95"] < 0.1, found
 
@@ -140,10 +151,15 @@ def test_errors_of_the_shipped_weights():
 def test_training_lessens_the_error_and_gives_the_same_bytes_again():
     g, threads = torch.Generator().manual_seed(2), torch.get_num_threads()
     sharpness, cosine = 10 ** torch.rand(2048, generator=g), 2 * torch.rand(2048, generator=g) - 1
-    examples = Examples(torch.stack([sharpness.log(), cosine], 1), sharpness, lobe_integral(sharpness) * torch.exp(cosine))
+    examples = Examples(
+        torch.stack([sharpness.log(), cosine], 1), sharpness, lobe_integral(sharpness) * torch.exp(cosine)
+    )
     errors = []
     torch.set_num_threads(1)
-    first, again = (trained(examples, Schedule(200, 128, 1e-2, 16, 2, 0), lambda step, error: errors.append(error)) for _ in range(2))
+    first, again = (
+        trained(examples, Schedule(200, 128, 1e-2, 16, 2, 0), lambda step, error: errors.append(error))
+        for _ in range(2)
+    )
     torch.set_num_threads(threads)
     assert errors[19] < 0.05 < errors[0]
     assert all(torch.equal(a, b) for a, b in zip(first.weights, again.weights, strict=True))
@@ -165,7 +181,10 @@ def test_rendered_spheres_are_what_the_reference_says(monkeypatch):
         normal, z, lam = (torch.from_numpy(t) for t in (pixels.normal[k], axis[k], spheres.sharpness[k : k + 1]))
         front = torch.from_numpy(FRONT)
         no, nz, oz = normal @ front, (normal @ z)[:, None], (front @ z).expand(len(normal), 1)
-        exact = {"diffuse": reference.diffuse(lam, nz), "specular": reference.specular(torch.tensor(spheres.roughness[k]), lam, no, nz, oz)}
+        exact = {
+            "diffuse": reference.diffuse(lam, nz),
+            "specular": reference.specular(torch.tensor(spheres.roughness[k]), lam, no, nz, oz),
+        }
         for part, value in exact.items():
             value = value[:, 0].numpy()
             error = (getattr(pixels, part)[k] - value) / (value + float(lobe_integral(lam)) / 100)

@@ -89,7 +89,9 @@ def test_a_mirror_reflects_the_light_behind_it():
 def test_ggx_is_normalised():
     c = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000
     for alpha in (0.05, 0.5, 1.0):
-        assert 2 * math.pi * (ggx(torch.tensor(alpha, dtype=torch.float64), c) * c).mean().item() == pytest.approx(1, rel=1e-5)
+        assert 2 * math.pi * (ggx(torch.tensor(alpha, dtype=torch.float64), c) * c).mean().item() == pytest.approx(
+            1, rel=1e-5
+        )
 
 
 def test_gradients_are_finite_differences():
@@ -99,7 +101,9 @@ def test_gradients_are_finite_differences():
     gradients = torch.autograd.grad(converged(*leaves, tolerance=tolerance).sum(), leaves)
     for k, gradient in enumerate(gradients):
         size = step * (inputs[k] if k < 2 else torch.ones_like(inputs[k]))
-        plus, minus = (converged(*[t + s * size * (j == k) for j, t in enumerate(inputs)], tolerance=tolerance) for s in (1, -1))
+        plus, minus = (
+            converged(*[t + s * size * (j == k) for j, t in enumerate(inputs)], tolerance=tolerance) for s in (1, -1)
+        )
         expected = (plus - minus) / (2 * size)
         scale = gradient.abs() + converged(*inputs, tolerance=1e-6) / (inputs[k] if k < 2 else 1) + 1e-9
         assert ((gradient - expected).abs() / scale).quantile(0.8) < 1e-4

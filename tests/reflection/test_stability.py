@@ -14,7 +14,10 @@ from benchmarks.operator.cases import ALL, CASES, case, found, gradient_error, v
 from benchmarks.operator.variants import made
 from factorlib.reflection import reflection_operator
 
-COMPILED, TORCH = reflection_operator("network"), made("network", "float32", compiled=False) or reflection_operator("network")
+COMPILED, TORCH = (
+    reflection_operator("network"),
+    made("network", "float32", compiled=False) or reflection_operator("network"),
+)
 FAST = {
     "closed_form": reflection_operator("closed_form"), "network": COMPILED, "network in torch": TORCH,
     "closed_form float64": reflection_operator("closed_form", dtype="float64"), "network float64": reflection_operator("network", dtype="float64"),
@@ -80,7 +83,10 @@ def reference_values(given, some) -> dict:
     no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
     sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
     with torch.no_grad():
-        return {"diffuse": REFERENCE.diffuse(sharpness, nz)[:, 0], "specular": REFERENCE.specular(roughness, sharpness, no, nz, oz)[:, 0]}
+        return {
+            "diffuse": REFERENCE.diffuse(sharpness, nz)[:, 0],
+            "specular": REFERENCE.specular(roughness, sharpness, no, nz, oz)[:, 0],
+        }
 
 
 # gradients of the call ------------------------------------------------------------------------------------------------
@@ -96,14 +102,17 @@ def leaves_of(light, material, normals, views, dtype) -> dict[str, torch.Tensor]
 
 def called(operator, leaves):
     light, material = (
-        SimpleNamespace(**{k: leaves[k] for k in keys}) for keys in (("axis", "sharpness", "weight"), ("diffuse", "specular", "roughness"))
+        SimpleNamespace(**{k: leaves[k] for k in keys})
+        for keys in (("axis", "sharpness", "weight"), ("diffuse", "specular", "roughness"))
     )
     return operator(light, material, leaves["normals"], leaves["views"])
 
 
 def gradients(operator, leaves) -> dict[str, torch.Tensor]:
     radiance = called(operator, leaves)
-    return {"radiance": radiance.detach()} | dict(zip(leaves, torch.autograd.grad(radiance.sum(), list(leaves.values())), strict=True))
+    return {"radiance": radiance.detach()} | dict(
+        zip(leaves, torch.autograd.grad(radiance.sum(), list(leaves.values())), strict=True)
+    )
 
 
 @fast
@@ -112,15 +121,21 @@ def gradients(operator, leaves) -> dict[str, torch.Tensor]:
     normal=vector, view=vector, axis=vector, place=st.sampled_from(PLACES), roughness=st.floats(0.03, 1), weight=st.sampled_from([0.0, 1.0, 1e6]),
     log_sharpness=st.floats(math.log(1e-4), math.log(1e6)), cosine=st.sampled_from([None, 1e-4, 1.0]),
 )  # fmt: skip
-def test_radiance_and_every_gradient_are_finite(name, normal, view, axis, place, roughness, weight, log_sharpness, cosine):
+def test_radiance_and_every_gradient_are_finite(
+    name, normal, view, axis, place, roughness, weight, log_sharpness, cosine
+):
     operator = FAST[name]
     n, o, z = (torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in (normal, view, axis))
     if cosine is not None:
         across = torch.nn.functional.normalize(torch.linalg.cross(n, o) + 1e-12, dim=0)
         o = cosine * n + math.sqrt(1 - cosine**2) * across
     z = {"n": n, "−n": -n, "mirror": 2 * (n @ o) * n - o, "o": o, "−o": -o, "anywhere": z}[place]
-    light = SimpleNamespace(axis=z[None], sharpness=torch.tensor([math.exp(log_sharpness)]), weight=torch.full((1, 3), weight))
-    material = SimpleNamespace(diffuse=torch.full((3,), 0.5), specular=torch.full((3,), 0.5), roughness=torch.tensor(roughness))
+    light = SimpleNamespace(
+        axis=z[None], sharpness=torch.tensor([math.exp(log_sharpness)]), weight=torch.full((1, 3), weight)
+    )
+    material = SimpleNamespace(
+        diffuse=torch.full((3,), 0.5), specular=torch.full((3,), 0.5), roughness=torch.tensor(roughness)
+    )
     slopes = gradients(operator, leaves_of(light, material, n[None], o[None], operator.dtype))
     assert all(t.isfinite().all() for t in slopes.values()), {k: t for k, t in slopes.items() if not t.isfinite().all()}
     assert (slopes["radiance"] >= 0).all()
@@ -154,12 +169,20 @@ TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no
 def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
     operator = FAST[name]
     point = dict(
-        zip(INPUTS, (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2), strict=True)
+        zip(
+            INPUTS,
+            (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2),
+            strict=True,
+        )
     )
     point = {key: t.to(operator.dtype).clone() for key, t in point.items()}
     point[bad].view(-1)[0] = math.nan
     expected = torch.zeros(2, 2, dtype=torch.bool)
-    expected[{"roughness": (slice(None), slice(None)), "sharpness": (slice(None), 0), "no": (0, slice(None))}.get(bad, (0, 0))] = True
+    expected[
+        {"roughness": (slice(None), slice(None)), "sharpness": (slice(None), 0), "no": (0, slice(None))}.get(
+            bad, (0, 0)
+        )
+    ] = True
     response = operator.response(**point)
     with torch.no_grad():
         values = {"diffuse": operator.diffuse(point["sharpness"], point["nz"]), "specular": operator.specular(**point)}

@@ -23,7 +23,11 @@ STRIPES = (0.2, 0.5)
 
 def light() -> Lobes:
     axis = np.array([[0.2, -0.95, 0.1], [0.75, -0.6, 0.2]])
-    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]]))
+    return Lobes(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        np.array([1.0, 80.0]),
+        np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]]),
+    )
 
 
 def there() -> Placed:
@@ -40,7 +44,11 @@ def true_photo(objects, samples=1024):
         frame[:3, :3] = np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1)
         frame[:3, 3] = (k + 0.5, -1.0, -6)
         grey = STRIPES[k % 2]
-        entries[f"stripe{k + 8}"] = {"type": "rectangle", "to_world": transform(frame), "bsdf": bsdf(Reflectance((grey,) * 3, (0.0,) * 3, 1.0))}
+        entries[f"stripe{k + 8}"] = {
+            "type": "rectangle",
+            "to_world": transform(frame),
+            "bsdf": bsdf(Reflectance((grey,) * 3, (0.0,) * 3, 1.0)),
+        }
     return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
 
 
@@ -102,7 +110,13 @@ def test_a_polished_ground_shows_the_object_and_only_there(made):
 def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_it(turn):
     """Whatever the objects of the photo are called."""
     corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
-    quad = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0, 0, 1.0], (4, 1)), np.ones(2, np.int16), open=True)
+    quad = Mesh(
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.tile([0, 0, 1.0], (4, 1)),
+        np.ones(2, np.int16),
+        open=True,
+    )
     seen = []
     for where in (-8.0, -4.0):
         matrix = 0.3 * np.eye(4)

@@ -16,12 +16,19 @@ from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, re
 from factorlib.results.materials import Reflectance
 
 CAMERA = Camera(48, 40, 60.0, (26.0, 18.0))
-MATERIALS = {"red": Reflectance((0.6, 0.2, 0.1), (0.1, 0.1, 0.1), 0.4), "grey": Reflectance((0.4,) * 3, (0.0,) * 3, 1.0)}
+MATERIALS = {
+    "red": Reflectance((0.6, 0.2, 0.1), (0.1, 0.1, 0.1), 0.4),
+    "grey": Reflectance((0.4,) * 3, (0.0,) * 3, 1.0),
+}
 
 
 def lobes() -> Lobes:
     axis = np.array([[0.3, -0.9, -0.2], [-0.7, -0.2, -0.6]])
-    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([2.0, 20.0]), np.array([[0.5, 0.6, 0.9], [4.0, 3.0, 2.0]]))
+    return Lobes(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        np.array([2.0, 20.0]),
+        np.array([[0.5, 0.6, 0.9], [4.0, 3.0, 2.0]]),
+    )
 
 
 def placed(name, mesh, where, material="red", rotation=np.eye(3)) -> Placed:
@@ -59,7 +66,9 @@ def test_the_camera_goes_right_and_up_and_keeps_its_distance(scene):
     moved = orbit(scene, 30, 20)[:3, 3]
     assert moved[0] > 0 and moved[1] > 0
     assert np.linalg.norm(moved - scene.middle) == pytest.approx(np.linalg.norm(scene.middle))
-    assert np.linalg.norm(orbit(scene, 0, zoom=2)[:3, 3] - scene.middle) == pytest.approx(np.linalg.norm(scene.middle) / 2)
+    assert np.linalg.norm(orbit(scene, 0, zoom=2)[:3, 3] - scene.middle) == pytest.approx(
+        np.linalg.norm(scene.middle) / 2
+    )
 
 
 def test_turning_camera_objects_and_light_together_changes_nothing(scene):
@@ -67,7 +76,9 @@ def test_turning_camera_objects_and_light_together_changes_nothing(scene):
     turn = rotation_of_vector(np.radians(50) * np.array([0, 1.0, 0]))
     whole = np.eye(4)
     whole[:3, :3] = turn
-    objects = tuple(msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects)
+    objects = tuple(
+        msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects
+    )
     other = msgspec.structs.replace(scene, objects=objects, light=turned_light(scene.light, 50))
     assert differ(traced_photo(scene, 256), traced_photo(other, 256, world_from_camera=whole @ orbit(scene, 0))) < 0.02
 

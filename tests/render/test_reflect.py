@@ -52,13 +52,17 @@ def by_quadrature(lat_long: np.ndarray, material: Reflectance, normals: np.ndarr
     d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
     specular = np.where(n @ i.T > 0, d * g1(ni) * g1(no) / (4 * no), 0)
     incoming = lat_long.reshape(-1, 3) * np.repeat(lat_long_solid_angles(height, width), width)[:, None]
-    return np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming) + np.array(material.specular) * (specular @ incoming)
+    return np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming) + np.array(material.specular) * (
+        specular @ incoming
+    )
 
 
 def test_radiance_is_the_integral_over_the_exported_map():
     normals, views = points(12)
     found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
-    np.testing.assert_allclose(found, by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, normals, views), rtol=2e-3)
+    np.testing.assert_allclose(
+        found, by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, normals, views), rtol=2e-3
+    )
 
 
 def test_short_cuts_keep_to_the_operator():

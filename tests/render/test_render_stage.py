@@ -36,9 +36,12 @@ def run(made, photo, out):
 
 def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
     first, second = (
-        {str(p.relative_to(o)): p.read_bytes() for p in o.rglob("*.*")} for o in (run(made, "side", tmp_path / n) for n in "ab")
+        {str(p.relative_to(o)): p.read_bytes() for p in o.rglob("*.*")}
+        for o in (run(made, "side", tmp_path / n) for n in "ab")
     )
-    stems = ["resynthesis/side"] + [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
+    stems = ["resynthesis/side"] + [
+        f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES
+    ]
     assert set(first) == {f"{stem}.{suffix}" for stem in stems for suffix in ("exr", "png")}
     assert first == second
 
@@ -46,11 +49,15 @@ def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
 @pytest.mark.parametrize("photo", ["front", "side"])
 def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(made, tmp_path, photo):
     world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()["front" if photo == "front" else "room"]
-    normal = torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])  # in the light's own frame
+    normal = (
+        torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])
+    )  # in the light's own frame
     solved = read_materials(made["solve"] / "materials.json").materials
     out = run(made, photo, tmp_path / "out")
     for name in made_export.NAMES:
-        expected = reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
+        expected = (
+            reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
+        )
         np.testing.assert_allclose(read_rgb_exr(out / "materials" / photo / f"{name}.exr")[16, 16], expected, rtol=2e-3)
 
 
@@ -86,7 +93,11 @@ def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(ma
     file = made["solve"] / "materials.json"
     before, solved = file.read_bytes(), read_json(file)
     try:
-        write_json(file, solved | {"model": {"tone": {"front": {"exponent": 1.5, "pivot": 0.3}, "side": {"exponent": 2.0, "pivot": 1.0}}}})
+        write_json(
+            file,
+            solved
+            | {"model": {"tone": {"front": {"exponent": 1.5, "pivot": 0.3}, "side": {"exponent": 2.0, "pivot": 1.0}}}},
+        )
         curved = run(made, "front", tmp_path / "curved")
     finally:
         file.write_bytes(before)
@@ -101,7 +112,9 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     label = read_exr(made["masks"] / "front.exr")["label"]
     y, x = np.nonzero(label > 0)
     n = len(x)
-    visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(np.uint8)  # the lower half is hidden, by nothing known
+    visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(
+        np.uint8
+    )  # the lower half is hidden, by nothing known
     geometry = read_exr(made["align"] / "front.exr")
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     seen = Observations(
@@ -118,7 +131,12 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
             write_json(file, solved | {"model": {"self_shadowing": True, "interreflection": bounces}})
             of = made_export.of_photo(made, "front")
             (tmp_path / str(bounces)).mkdir()
-            render.main(FAST, Inputs({**of.folders, "urm": tmp_path / "urm"}, of.facts, of.files, "front"), tmp_path / str(bounces), silent)
+            render.main(
+                FAST,
+                Inputs({**of.folders, "urm": tmp_path / "urm"}, of.facts, of.files, "front"),
+                tmp_path / str(bounces),
+                silent,
+            )
             pictures[bounces] = read_rgb_exr(tmp_path / str(bounces) / "resynthesis" / "front.exr")[y, x]
     finally:
         file.write_bytes(before)

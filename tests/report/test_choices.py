@@ -26,7 +26,10 @@ def test_every_choice_has_a_sentence_with_its_losses():
 
 
 def test_nothing_is_said_of_what_was_not_asked():
-    assert choices(Model(solver="paper", lobes={"hall": 32}))[0] == "Each light is 32 lobes, a number that was given, as in the paper's solver."
+    assert (
+        choices(Model(solver="paper", lobes={"hall": 32}))[0]
+        == "Each light is 32 lobes, a number that was given, as in the paper's solver."
+    )
     assert choices(Model())[0] == "Shadow of surfaces on one another is not in the model."
     assert not any("split" in said for said in choices(Model(lobes={"hall": 400}, light_prior=True)))
     assert choices(Model(specular={"red": True}, tone_chosen_by={"hall": Decision(False)}))[-2:] == [

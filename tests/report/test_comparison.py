@@ -56,7 +56,9 @@ def test_equal_results_are_nowhere_apart(folders):
 
 
 def test_differences_are_in_standard_errors_after_the_free_factor(folders):
-    page = comparison(result(folders[0]), result(folders[1], roughness=0.4, factor=0.5), ["solve: parameter lobes: 32 -> 64"])
+    page = comparison(
+        result(folders[0]), result(folders[1], roughness=0.4, factor=0.5), ["solve: parameter lobes: 32 -> 64"]
+    )
     off = apart(page)
     assert off[0] == off[1] == [0, 0, 0]
     assert off[2] == [pytest.approx(0.1 / np.hypot(0.02, 0.02), abs=0.05)] and 'class="bad"' in page
@@ -74,13 +76,19 @@ def with_components(folder, factors, component):
     "first, second, equal",
     [
         ({"red": 0, "blue": 1}, {"red": 1, "blue": 0}, True),  # two components in both, whatever their numbers
-        ({"red": 0, "blue": 0}, {"red": 0, "blue": 1}, True),  # linked in the first alone: the second's factors are free
+        (
+            {"red": 0, "blue": 0},
+            {"red": 0, "blue": 1},
+            True,
+        ),  # linked in the first alone: the second's factors are free
         ({"red": 0, "blue": 0}, {"red": 0, "blue": 0}, False),  # linked in both: their ratio is observed
     ],
 )
 def test_every_component_has_a_factor_of_its_own(folders, first, second, equal):
     page = comparison(
-        with_components(folders[0], {"red": 1.0, "blue": 1.0}, first), with_components(folders[1], {"red": 0.5, "blue": 2.0}, second), []
+        with_components(folders[0], {"red": 1.0, "blue": 1.0}, first),
+        with_components(folders[1], {"red": 0.5, "blue": 2.0}, second),
+        [],
     )
     assert all(v == 0 for row in apart(page) for v in row) == equal
 
@@ -110,7 +118,11 @@ def test_a_result_that_is_not_whole_is_refused_with_the_stage_and_the_cure(folde
     (folders[1] / "dataset.txt").write_text("data/chairs\n")  # b is a copy
     with pytest.raises(InputError, match="no whole result") as error:
         comparison(*folders, [])
-    assert f"the stage {missing!r}" in str(error.value) and "make all DATASET=chairs" in str(error.value) and str(folders[1]) in str(error.value)
+    assert (
+        f"the stage {missing!r}" in str(error.value)
+        and "make all DATASET=chairs" in str(error.value)
+        and str(folders[1]) in str(error.value)
+    )
 
 
 def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):

@@ -27,7 +27,11 @@ def metrics_of(error: float) -> Metrics:
     """Everything wrong by `error`, beside nulls that are wrong by 1 (and 10°, 20 dB)."""
     light = {view: ScoredLight(LightError(error, error, 10 * error), LightError(1.0, 1.0, 10.0)) for view in VIEWS}
     part = ComparedMaterial(0, GREY, GREY, *(MaterialError(e, (e, -e, e), (-e, e, e)) for e in (error, 1.0)))
-    kinds = {"in_estimated_light": PictureError(0, 20 / error, 0), "in_true_light": PictureError(0, 30, 0), "null_grey": PictureError(0, 20, 0)}
+    kinds = {
+        "in_estimated_light": PictureError(0, 20 / error, 0),
+        "in_true_light": PictureError(0, 30, 0),
+        "null_grey": PictureError(0, 20, 0),
+    }
     return Metrics(
         Counts(1, 1, 1, 1),
         Resynthesis({}, None, None, None),
@@ -46,7 +50,12 @@ def test_what_beats_its_null_needs_no_sentence():
 
 def test_what_its_null_beats_is_named_with_both_numbers_and_a_reason():
     light, ball, material, normals = no_better_than_a_guess(metrics_of(1.1))
-    assert "'hall'" in light and all(f"a {sphere} sphere" in light for sphere in ("mirror", "glossy", "Lambertian")) and "11.0°" in light and "mirror 50" in light
+    assert (
+        "'hall'" in light
+        and all(f"a {sphere} sphere" in light for sphere in ("mirror", "glossy", "Lambertian"))
+        and "11.0°" in light
+        and "mirror 50" in light
+    )
     assert "'hall'" in ball and "oak" in ball
     assert "'oak'" in material and "roughness" in material and "diffuse" in material and "specular" in material
     assert normals.startswith("a: ") and "11.0°" in normals
@@ -61,4 +70,7 @@ def test_one_number_is_enough():
 
 def test_without_a_truth_nothing_is_said():
     nothing = dict.fromkeys(("materials", "relighting", "light", "normals", "poses"))
-    assert no_better_than_a_guess(Metrics(Counts(1, 1, 1, 1), Resynthesis({}, None, None, None), **nothing, reasons={})) == []
+    assert (
+        no_better_than_a_guess(Metrics(Counts(1, 1, 1, 1), Resynthesis({}, None, None, None), **nothing, reasons={}))
+        == []
+    )

@@ -24,7 +24,15 @@ VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
 OURS = re.compile(r"<script( type=\"application/json\" id=\"viewer-data\")?>.*?</script>", re.DOTALL)
 SVG_LEAVES = {"line", "polyline", "circle", "path", "rect"}
 LOG = [
-    {"event": "done", "stage": "solve", "photo": None, "seconds": 83.4, "cpu_seconds": 81.0, "memory_mb": 512.0, "machine": {"cores": 2}},
+    {
+        "event": "done",
+        "stage": "solve",
+        "photo": None,
+        "seconds": 83.4,
+        "cpu_seconds": 81.0,
+        "memory_mb": 512.0,
+        "machine": {"cores": 2},
+    },
     {"event": "done", "stage": "masks", "photo": "day", "seconds": 1.25},
     {"event": "warning", "stage": "masks", "photo": "day", "text": "photo 'day' <is> dark"},
 ]
@@ -93,7 +101,9 @@ def test_nothing_outside_the_file_is_asked_for(made):
     found = parsed(made[2])
     assert all(link.startswith(("data:image/png;base64,", "#")) for link in found.links)
     assert not re.search(r"url\(|@import|<script|<link|https?://", OURS.sub("", made[2]))
-    assert not re.search(r"fetch\(|import\(|XMLHttpRequest|https?://|//cdn", "".join(m.group() for m in OURS.finditer(made[2])))
+    assert not re.search(
+        r"fetch\(|import\(|XMLHttpRequest|https?://|//cdn", "".join(m.group() for m in OURS.finditer(made[2]))
+    )
     assert all(link[1:] in found.ids for link in found.links if link.startswith("#"))
 
 
@@ -125,7 +135,10 @@ def test_the_numbers_are_those_of_the_metrics(made):
 
 def test_bins_of_the_networks_error_stand_in_order(made):
     section = made[2].split('id="training"')[1]
-    order = [section.index(f">{name}</th>") for name in ("specular", "sharpness", "0.3 to 3", "3 to 30", "30 to 300", "diffuse")]
+    order = [
+        section.index(f">{name}</th>")
+        for name in ("specular", "sharpness", "0.3 to 3", "3 to 30", "30 to 300", "diffuse")
+    ]
     assert order == sorted(order) and "0.20 %" in section
 
 
@@ -149,7 +162,9 @@ def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
     assert without_cost(again) == without_cost(html) and again != html
     assert "1 min 23 s" in html and "photo &#39;day&#39; &lt;is&gt; dark" in html
     figures = [inputs.folders["evaluate"].parent / "report" / "figures", tmp_path / "again" / "figures"]
-    assert [p.read_bytes() for p in sorted(figures[0].rglob("*.png"))] == [p.read_bytes() for p in sorted(figures[1].rglob("*.png"))]
+    assert [p.read_bytes() for p in sorted(figures[0].rglob("*.png"))] == [
+        p.read_bytes() for p in sorted(figures[1].rglob("*.png"))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -202,7 +217,9 @@ def test_a_doubtful_pose_says_why_and_what_to_do(made, tmp_path):
         "doubts": ["mesh <and> mask differ"], "left_out": True, "source": "refined", "scale": [1.0, 1.05, 0.952],
     }  # fmt: skip
     (tmp_path / "align" / "poses.json").write_text(json.dumps(poses))
-    doubtful = page_of(msgspec.structs.replace(inputs, folders=inputs.folders | {"align": tmp_path / "align"}), tmp_path / "report")
+    doubtful = page_of(
+        msgspec.structs.replace(inputs, folders=inputs.folders | {"align": tmp_path / "align"}), tmp_path / "report"
+    )
     parsed(doubtful)
     for words in ("mesh &lt;and&gt; mask differ", "left out of the solve", "0.905", "41° away", "noon: &#39;balls&#39; is left out",
                   "pose of an earlier result, the mesh's axes times 1.000, 1.050, 0.952"):  # fmt: skip

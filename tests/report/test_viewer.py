@@ -43,7 +43,10 @@ def made(tmp_path_factory):
 
 def artifacts(inputs) -> tuple[Artifacts, dict, dict]:
     facts = inputs.facts
-    lights, objects = (msgspec.convert(facts[f"dataset.{n}"], dict[str, k]) for n, k in {"light": LightSlice, "objects": ObjectsSlice}.items())
+    lights, objects = (
+        msgspec.convert(facts[f"dataset.{n}"], dict[str, k])
+        for n, k in {"light": LightSlice, "objects": ObjectsSlice}.items()
+    )
     return Artifacts(inputs.folders, msgspec.convert(facts["dataset.set"], Set), None), lights, objects
 
 
@@ -103,7 +106,9 @@ def test_a_name_cannot_end_the_script(made, tmp_path):
     facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "materials": ["brass", evil, "white"]}}
     names = ["brass", evil, "white"]
     write_glb(tmp_path / "export" / "ball.glb", sphere(0.5), names, dict.fromkeys(names, TRUE["red"]))
-    renamed = msgspec.structs.replace(inputs, folders=inputs.folders | {"export": tmp_path / "export", "solve": solved}, facts=facts)
+    renamed = msgspec.structs.replace(
+        inputs, folders=inputs.folders | {"export": tmp_path / "export", "solve": solved}, facts=facts
+    )
     html = page_of(renamed, tmp_path / "report")
     assert html.count("<script") == 2 and "alert(1)</" not in html
     data = re.search(r'id="viewer-data">(.*?)</script>', html, re.DOTALL).group(1)
@@ -115,7 +120,10 @@ def test_forms_hold_the_numbers():
     found = forms("brass", material)
     assert json.loads(found["numbers"])["brass"]["roughness"] == 0.25
     assert json.loads(found["glTF"])["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
-    assert found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">') and "MeshPhysicalMaterial" in found["three.js"]
+    assert (
+        found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">')
+        and "MeshPhysicalMaterial" in found["three.js"]
+    )
     compile(found["Blender"], "console", "exec")
     assert "0.05, 0.04, 0.02, 1" in found["Blender"] and 'name="m_brass"' in found["MaterialX"]
 
@@ -126,13 +134,18 @@ def test_forms_hold_the_numbers():
 @pytest.fixture(scope="module")
 def browser(made):
     """Not across processes: Playwright's loop lives in this one."""
-    with opened(made[2], viewport={"width": 1440, "height": 900}, permissions=["clipboard-read", "clipboard-write"]) as (page, complaints):
+    with opened(
+        made[2], viewport={"width": 1440, "height": 900}, permissions=["clipboard-read", "clipboard-write"]
+    ) as (page, complaints):
         page.evaluate(f"viewer.canvas.style.width = '{SIZE}px'")  # software draws slowly
         yield page, complaints
 
 
 @needs_chromium
-@pytest.mark.parametrize("material, view", [("brass", {}), ("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})])
+@pytest.mark.parametrize(
+    "material, view",
+    [("brass", {}), ("brass", {"azimuth": 0.7, "elevation": -0.4, "turn": 1.1}), ("white", {"turn": -2.0})],
+)
 def test_it_shows_what_the_pipeline_renders(browser, material, view):
     """The glossiest material and the roughest; 2 % at the 95th percentile of pixels."""
     normals, views, inside = ball_seen(view.get("azimuth", 0.0), view.get("elevation", 0.0), SIZE)
@@ -159,11 +172,15 @@ def test_controls_work_by_mouse_and_keys(browser):
     page.select_option("[data-control=object]", label="a ball")
     page.select_option("[data-control=material]", label="brass")
     page.select_option("[data-control=light]", label="noon")
-    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.startsWith('ball of brass in the light of noon')")
+    page.wait_for_function(
+        "document.querySelector('#viewer canvas').ariaLabel.startsWith('ball of brass in the light of noon')"
+    )
     page.focus("#viewer canvas")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowUp")
-    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.includes('from 5° to the right and 5° above')")
+    page.wait_for_function(
+        "document.querySelector('#viewer canvas').ariaLabel.includes('from 5° to the right and 5° above')"
+    )
     box = page.locator("#viewer canvas").bounding_box()
     page.mouse.move(box["x"] + 20, box["y"] + 20)
     page.mouse.down()
@@ -233,7 +250,9 @@ def test_the_browser_has_nothing_to_complain_of(browser):
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_needs_no_scrolling_sideways(made, scheme):
-    with opened(made[2], viewport={"width": 390, "height": 844}, color_scheme=scheme, has_touch=True, is_mobile=True) as (page, complaints):
+    with opened(
+        made[2], viewport={"width": 390, "height": 844}, color_scheme=scheme, has_touch=True, is_mobile=True
+    ) as (page, complaints):
         page.evaluate("viewer.canvas.scrollIntoView()")
         page.wait_for_function("viewer.pass > 0", timeout=120000)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
@@ -260,4 +279,7 @@ def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
     area = lat_long_solid_angles(*light.shape[:2])[:, None] * np.ones(light.shape[1])
     grey = light.mean(axis=-1)
     bright = grey > 2 * (grey * area).sum() / (4 * np.pi)
-    assert light_row(run_, "day", ["day"], None).known == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3) and bright.any()
+    assert (
+        light_row(run_, "day", ["day"], None).known == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3)
+        and bright.any()
+    )

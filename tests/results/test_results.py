@@ -20,7 +20,15 @@ from factorlib.results.materials import (
 )
 from factorlib.results.metrics import Counts, Metrics, Resynthesis, read_metrics, write_metrics
 from factorlib.results.photos import PhotoFacts, read_photo_facts, write_photo_facts
-from factorlib.results.poses import CameraEntry, ObjectEntry, PhotoPoses, read_photo_poses, read_poses, write_photo_poses, write_poses
+from factorlib.results.poses import (
+    CameraEntry,
+    ObjectEntry,
+    PhotoPoses,
+    read_photo_poses,
+    read_poses,
+    write_photo_poses,
+    write_poses,
+)
 from factorlib.results.uncertainty import Uncertainty, read_uncertainty, write_uncertainty
 
 ERRORS = StandardErrors((0.01, 0.02, 0.03), (0.1, 0.1, 0.1), 0.05)
@@ -71,7 +79,9 @@ def test_a_photo_may_be_called_version(tmp_path):
 
 
 @pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("content", ["", "[]", "{", '{"a": NaN}', '{"a": 1e999}', '"text"', "null", '{"version": {}}', "[" * 3000])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{", '{"a": NaN}', '{"a": 1e999}', '"text"', "null", '{"version": {}}', "[" * 3000]
+)
 def test_what_is_none_is_refused(tmp_path, name, content):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError) as caught:

@@ -29,7 +29,17 @@ class LiveCluster:
     def add_worker(self, *options: str) -> subprocess.Popen:
         """One more, of one core; returns when the scheduler knows it."""
         name = f"worker{len(self.processes)}"
-        command = ("factorlib", "worker", self.address, "--cores", "1", "--host", "127.0.0.1", "--local-directory", tempfile.gettempdir())
+        command = (
+            "factorlib",
+            "worker",
+            self.address,
+            "--cores",
+            "1",
+            "--host",
+            "127.0.0.1",
+            "--local-directory",
+            tempfile.gettempdir(),
+        )
         process = self._start(name, *command, *options)
         self._said(name, r"(Registered to):\s")
         return process
@@ -37,7 +47,14 @@ class LiveCluster:
     def _start(self, name: str, *words: str) -> str | subprocess.Popen:
         environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "60s"}
         with open(self.folder / f"{name}.log", "wb") as log:
-            process = subprocess.Popen([sys.executable, "-m", *words], env=environment, stdout=log, stderr=log, cwd=self.folder, start_new_session=True)
+            process = subprocess.Popen(
+                [sys.executable, "-m", *words],
+                env=environment,
+                stdout=log,
+                stderr=log,
+                cwd=self.folder,
+                start_new_session=True,
+            )
         self.processes.append(process)
         return name if name == "scheduler" else process
 

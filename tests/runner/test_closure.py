@@ -14,13 +14,16 @@ def digest(text):
     return source_of(text, "m", False).digest
 
 
-@pytest.mark.parametrize("other", ['def f(x):\n    "What it does."\n    return x + 1\n', "# why\ndef f(x):  # here\n\n    return (x+1)\n"])
+@pytest.mark.parametrize(
+    "other", ['def f(x):\n    "What it does."\n    return x + 1\n', "# why\ndef f(x):  # here\n\n    return (x+1)\n"]
+)
 def test_comments_docstrings_and_layout_do_not_count(other):
     assert digest("def f(x):\n    return x + 1\n") == digest(other)
 
 
 @pytest.mark.parametrize(
-    "other", ["def f(x):\n    return x + 2\n", "def f(y):\n    return y + 1\n", 'def f(x):\n    return x + 1\nY = "a string"\n']
+    "other",
+    ["def f(x):\n    return x + 2\n", "def f(y):\n    return y + 1\n", 'def f(x):\n    return x + 1\nY = "a string"\n'],
 )
 def test_anything_else_counts(other):
     assert digest("def f(x):\n    return x + 1\n") != digest(other)

@@ -119,7 +119,9 @@ def kept(project):
 def start(project, *settings):
     command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
 
 
 def wait_until(true, seconds=120):
@@ -135,7 +137,9 @@ def events_of(project):
 
 
 def steps_done(project):
-    return sorted(f"{e['stage']}/{e['photo']}" if e["photo"] else e["stage"] for e in events_of(project) if e["event"] == "done")
+    return sorted(
+        f"{e['stage']}/{e['photo']}" if e["photo"] else e["stage"] for e in events_of(project) if e["event"] == "done"
+    )
 
 
 # ── the same bytes ───────────────────────────────────────────────────────────────────────────────────────────────────
@@ -145,8 +149,12 @@ def test_a_cluster_of_two_gives_the_bytes_and_keys_of_one_process(project, besid
     assert verbs.make(project, verbs.Wish("set", settings=live.settings)) == 0
     assert kept(project) == kept(beside)
     said = capsys.readouterr()
-    assert said.err.count("d is odd") == 1 and said.err.count("number 3 is odd") == 1, "what steps and blocks warn of is not lost"
-    assert verbs.make(project, verbs.Wish("set")) == 0 and "nothing to do" in capsys.readouterr().out, "where it ran is in no key"
+    assert said.err.count("d is odd") == 1 and said.err.count("number 3 is odd") == 1, (
+        "what steps and blocks warn of is not lost"
+    )
+    assert verbs.make(project, verbs.Wish("set")) == 0 and "nothing to do" in capsys.readouterr().out, (
+        "where it ran is in no key"
+    )
     cost = next(event for event in events_of(project) if event["event"] == "done" and event["stage"] == "sums")
     assert cost["spread"]["maps"] == 5 and cost["spread"]["tasks"] == 5 * 8 and cost["cores"] == 2
     assert not list((project.build / "store" / "tmp").iterdir()), "something is left behind"
@@ -169,7 +177,9 @@ def test_a_cluster_of_this_machine_gives_the_same_bytes(project, beside):
 
 
 def test_steps_have_the_environment_that_their_bits_ask_for_whatever_the_workers_were_started_in(project, live):
-    text = PROOF.replace('json.loads(os.environ["PROOF"])', repr([*arithmetic.VARIABLES, TRIM])).replace('if "PROOF" in os.environ else []', "")
+    text = PROOF.replace('json.loads(os.environ["PROOF"])', repr([*arithmetic.VARIABLES, TRIM])).replace(
+        'if "PROOF" in os.environ else []', ""
+    )
     write(project.root / "stages" / "proof.py", text)
     assert verbs.make(project, verbs.Wish("set", ["proof"], settings=live.settings)) == 0
     found = json.loads((project.build / "set" / "proof" / "environment.json").read_text())
@@ -211,7 +221,9 @@ def of_live(live, word):
 
 
 @pytest.mark.parametrize("victim", ["worker", pytest.param("child", marks=pytest.mark.long)])
-def test_what_is_killed_in_mid_step_costs_that_step_alone_and_the_run_ends_with_the_same_bytes(project, live, tmp_path, victim):
+def test_what_is_killed_in_mid_step_costs_that_step_alone_and_the_run_ends_with_the_same_bytes(
+    project, live, tmp_path, victim
+):
     go, tries = waiting_for_a_file(project, tmp_path)
     other = toy.copy(project, tmp_path / "beside")
     process = start(project, *live.settings)
@@ -232,7 +244,9 @@ def test_what_is_killed_in_mid_step_costs_that_step_alone_and_the_run_ends_with_
 
 def test_a_worker_that_is_killed_over_the_blocks_of_a_step_costs_neither_the_step_nor_a_bit(project, live, tmp_path):
     go = tmp_path / "go"
-    kept_lines = [line for line in (toy.PIPELINE + MORE).splitlines() if not re.match("  (count|table|total|proof):", line)]
+    kept_lines = [
+        line for line in (toy.PIPELINE + MORE).splitlines() if not re.match("  (count|table|total|proof):", line)
+    ]
     write(project.root / "pipeline.yaml", "\n".join(kept_lines))
     other = toy.copy(project, tmp_path / "beside")
     process = start(project, *live.settings, f"sums.wait={go}")
@@ -255,14 +269,19 @@ def test_a_worker_that_is_killed_over_the_blocks_of_a_step_costs_neither_the_ste
 
 
 def test_a_step_whose_process_dies_each_time_fails_as_one_and_says_so(project, live, capsys):
-    write(project.root / "stages" / "count.py", toy.COUNT.replace("    (out", "    __import__('os').kill(__import__('os').getpid(), 9)\n    (out", 1))
+    write(
+        project.root / "stages" / "count.py",
+        toy.COUNT.replace("    (out", "    __import__('os').kill(__import__('os').getpid(), 9)\n    (out", 1),
+    )
     assert verbs.make(project, verbs.Wish("set", ["count", "table"], settings=live.settings)) == 1
     said = capsys.readouterr().err
     assert said.count("its process died") == len(TEXTS) and "defect" not in said
     assert state(project)["table"] == "current"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGKILL))])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.long) for n in (signal.SIGTERM, signal.SIGKILL))]
+)
 def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(project, live, tmp_path, number):
     go, _ = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
@@ -292,7 +311,11 @@ def test_the_first_block_that_fails_is_the_steps_error(project, live, capsys):
 def test_pieces_have_all_items_once_in_their_order():
     for count in range(12):
         pieces = blocks._pieces(list(range(count)), 4)
-        assert [k for piece in pieces for k in piece] == list(range(count)) and all(pieces) and len(pieces) == min(count, 4)
+        assert (
+            [k for piece in pieces for k in piece] == list(range(count))
+            and all(pieces)
+            and len(pieces) == min(count, 4)
+        )
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -307,7 +330,9 @@ def test_a_worker_that_does_not_say_how_many_cores_it_has_is_refused_with_the_co
     finally:
         os.killpg(started.pid, signal.SIGTERM)
         started.wait(60)
-    assert "does not say how many cores" in str(refused.value) and f"-m factorlib worker {live.address}" in str(refused.value)
+    assert "does not say how many cores" in str(refused.value) and f"-m factorlib worker {live.address}" in str(
+        refused.value
+    )
     assert not list((project.build / "store" / "tmp").iterdir())
 
 
@@ -315,7 +340,11 @@ def test_a_worker_that_does_not_say_how_many_cores_it_has_is_refused_with_the_co
     "change, found, cure",
     [
         ({"mark": Path("/nowhere/mark")}, "does not see the run's folder", "mount at the same path"),
-        ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/python -m factorlib worker"),
+        (
+            {"library": Path("/other")},
+            f"runs the code in {LIBRARY}",
+            "cd /other && .venv/bin/python -m factorlib worker",
+        ),
         ({"python": "3.99"}, "the run has 3.99", "-m factorlib worker"),
     ],
 )
@@ -378,7 +407,10 @@ def test_what_listens_and_is_no_scheduler_is_named_and_not_waited_for(project, m
         threading.Thread(target=answer, daemon=True).start()
         began = time.monotonic()
         with pytest.raises(InputError, match="no Dask scheduler answers at"):
-            verbs.make(project, verbs.Wish("set", settings=["executor=dask", f"scheduler=tcp://127.0.0.1:{server.getsockname()[1]}"]))
+            verbs.make(
+                project,
+                verbs.Wish("set", settings=["executor=dask", f"scheduler=tcp://127.0.0.1:{server.getsockname()[1]}"]),
+            )
         assert time.monotonic() - began < 10
         for one in held:
             one.close()
@@ -432,8 +464,16 @@ def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_p
         (PLAIN, ["exectuor=dask"], "'exectuor=dask' is no setting\n  did you mean 'executor'?"),
         (PLAIN, ["scheduler=tcp://a:1"], 'only Dask has a scheduler\n  write SET="executor=dask scheduler=…"'),
         (PLAIN, ["executor=dask scheduler=a:1"], "'a:1' is no address\n  write tcp://<host>:<port>"),
-        (PLAIN.replace("stages", "executor: dusk\nstages"), [], "executor: there is no executor 'dusk'\n  did you mean 'dask'?"),
-        (PLAIN.replace("stages", "scheduler: tcp://a:1\nstages"), [], "scheduler: only Dask has a scheduler\n  add executor: dask"),
+        (
+            PLAIN.replace("stages", "executor: dusk\nstages"),
+            [],
+            "executor: there is no executor 'dusk'\n  did you mean 'dask'?",
+        ),
+        (
+            PLAIN.replace("stages", "scheduler: tcp://a:1\nstages"),
+            [],
+            "scheduler: only Dask has a scheduler\n  add executor: dask",
+        ),
         (PLAIN.replace("stages", "executer: dask\nstages"), [], "did you mean 'executor'?"),
     ],
 )
@@ -442,4 +482,3 @@ def test_what_is_no_executor_is_refused_with_what_was_meant(tmp_path, text, sett
     with pytest.raises(InputError) as refused:
         with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), settings)
     assert said in str(refused.value)
-

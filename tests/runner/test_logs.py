@@ -30,14 +30,22 @@ COST = r" +\d+\.\d s +\d+\.\d s processor +\d+ MB peak   {} on 1 core   \d{{4}}-
 
 def test_each_step_has_its_time_its_memory_and_what_it_was_made_with(project, capsys):
     said = logs(project, capsys)
-    for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("table", "1 thread"), ("total", "2 threads")):
+    for step, threads in (
+        ("upper/a", "1 thread"),
+        ("count/b", "1 thread"),
+        ("table", "1 thread"),
+        ("total", "2 threads"),
+    ):
         assert re.search("^" + step + COST.format(threads), said, re.M), said
     assert re.search(r"Python 3\.\d+\.\d+, \w+ \w+, msgspec \d", said) and re.search(r"filelock \d", said)
     assert "warning: a is odd" in said
 
 
 def test_one_stage_and_one_photo(project, capsys):
-    assert [line.split()[0] for line in logs(project, capsys, "upper").splitlines() if not line.startswith(" ")] == ["upper/a", "upper/b"]
+    assert [line.split()[0] for line in logs(project, capsys, "upper").splitlines() if not line.startswith(" ")] == [
+        "upper/a",
+        "upper/b",
+    ]
     said = logs(project, capsys, photo="b")
     assert "upper/b" in said and "count/b" in said and "upper/a" not in said and "total" not in said
     with pytest.raises(InputError, match="no step is of 'aa'") as caught:
@@ -46,7 +54,11 @@ def test_one_stage_and_one_photo(project, capsys):
 
 
 def test_what_is_not_made_says_why_and_what_failed_where(project, capsys, tmp_path):
-    assert re.search(r"^table +to run: parameter scale: 2 \(the default\) -> 3$", logs(project, capsys, "table", settings=["table.scale=3"]), re.M)
+    assert re.search(
+        r"^table +to run: parameter scale: 2 \(the default\) -> 3$",
+        logs(project, capsys, "table", settings=["table.scale=3"]),
+        re.M,
+    )
     broken = toy.copy(project, tmp_path / "broken")
     write(broken.root / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", "json.dumps(1 / 0)"))
     assert verbs.make(broken, verbs.Wish("set")) == 1

@@ -34,7 +34,11 @@ class Outer(Base):
 
 def test_fields_of_bases_and_of_fields_are_there():
     found = [(p.name, p.allowed, p.default, p.text) for p in parameters(Outer)]
-    expected = [("share", "number > 0 and < 1", "0.5", "A share."), ("inner.size", "1 … 9", "3", "Of what is inside."), ("mute", "true, false", "false", "")]
+    expected = [
+        ("share", "number > 0 and < 1", "0.5", "A share."),
+        ("inner.size", "1 … 9", "3", "Of what is inside."),
+        ("mute", "true, false", "false", ""),
+    ]
     assert found == expected
 
 

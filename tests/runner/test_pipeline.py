@@ -19,7 +19,11 @@ def read(tmp_path, text):
 
 def test_a_good_one(tmp_path):
     pipeline = read(tmp_path, GOOD)
-    assert pipeline.stages["two"].params == {"a": 0.001} and pipeline.needed(["one"]) == ["one"] and pipeline.order() == ["one", "two"]
+    assert (
+        pipeline.stages["two"].params == {"a": 0.001}
+        and pipeline.needed(["one"]) == ["one"]
+        and pipeline.order() == ["one", "two"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,7 +46,9 @@ def test_what_is_refused(tmp_path, old, new, words):
 
 
 def test_settings_reach_into_nested_parameters_and_leave_the_rest():
-    pipeline = with_settings(Pipeline(1, {"s": Stage(params={"a": 1, "search": {"x": 1, "y": 2}})}), ["s.search.x=3", "s.b=no s.c=1e2"])
+    pipeline = with_settings(
+        Pipeline(1, {"s": Stage(params={"a": 1, "search": {"x": 1, "y": 2}})}), ["s.search.x=3", "s.b=no s.c=1e2"]
+    )
     assert pipeline.stages["s"].params == {"a": 1, "search": {"x": 3, "y": 2}, "b": "no", "c": 100.0}
 
 

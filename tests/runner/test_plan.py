@@ -20,7 +20,11 @@ PIPELINE = Pipeline(
 def hashes(spec, **changed):
     """Each step's own record; `changed` is {stage or stage_photo: new value of its source}."""
     return {
-        s: {"stage": s.stage, "photo": s.photo, "source:m": changed.get(str(s).replace("/", "_"), changed.get(s.stage, 1))}
+        s: {
+            "stage": s.stage,
+            "photo": s.photo,
+            "source:m": changed.get(str(s).replace("/", "_"), changed.get(s.stage, 1)),
+        }
         for s in spec.steps()
     }
 
@@ -33,7 +37,8 @@ def run(spec, own, listing, same=()):
         todo = [p for p in plan(now, own, Listing(outputs, previous)) if p.status == "to run" and p.key]
         if not todo:
             return ran, Listing(
-                outputs, {**previous, **{str(p.step): p.record for p in plan(now, own, Listing(outputs, previous)) if p.record}}
+                outputs,
+                {**previous, **{str(p.step): p.record for p in plan(now, own, Listing(outputs, previous)) if p.record}},
             )
         for p in todo:
             old = outputs.get(key_of(previous[str(p.step)])) if str(p.step) in previous else None
@@ -116,7 +121,9 @@ def test_a_result_that_was_deleted_is_made_again():
     spec, listing = done()
     key = key_of(listing.previous["train"])
     found = plan(spec, hashes(spec), Listing({k: v for k, v in listing.outputs.items() if k != key}, listing.previous))
-    assert [(str(p.step), p.status, p.reasons) for p in found if p.status == "to run"] == [("train", "to run", ["its result is gone"])]
+    assert [(str(p.step), p.status, p.reasons) for p in found if p.status == "to run"] == [
+        ("train", "to run", ["its result is gone"])
+    ]
 
 
 records = st.dictionaries(st.sampled_from(["param:a", "param:b", "source:m", "file:f", "threads"]), st.integers(0, 2))

@@ -99,7 +99,10 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     write(project.root / "recipes" / "set" / "more.txt", "and more")
     assert to_run(project, "all") == ["shout/hello", "shout/bye"]
     seen = survey(project, "set", ["shout"], [], recipes=["all"])
-    assert [p.reasons for p in seen.planned()[-2:]] == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
+    assert [p.reasons for p in seen.planned()[-2:]] == [
+        ['recipe: word: "hello" -> "hi"'],
+        ["file more.txt of the recipe: changed"],
+    ]
 
 
 def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_they_are_new(project, capsys):
@@ -122,7 +125,10 @@ def test_a_path_is_a_recipe_as_well(project, monkeypatch):
     assert make(project, "mine/own.yaml") == 0 and said(project, "own") == "own!ab"
 
 
-@pytest.mark.parametrize("word, wrong", [("helo", "did you mean 'hello'"), ("recipes/helo.yaml", "did you mean 'hello'"), ("not", "known are")])
+@pytest.mark.parametrize(
+    "word, wrong",
+    [("helo", "did you mean 'hello'"), ("recipes/helo.yaml", "did you mean 'hello'"), ("not", "known are")],
+)
 def test_a_recipe_that_is_not_there_names_those_that_are(project, word, wrong):
     data = project.provider.read(project.root / "data" / "set")
     with pytest.raises(InputError) as error:
@@ -172,4 +178,6 @@ def test_the_whole_pipeline_and_recipes_where_both_are_asked_for(project, capsys
     assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
     assert not (project.build / "set" / "shout" / "bye").exists()
     named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has none of the results that are named otherwise
+    assert named == [
+        f"shout: {project.build / 'set' / 'shout' / 'hello'}"
+    ]  # the toy has none of the results that are named otherwise

@@ -31,7 +31,11 @@ def make(project, dataset="set", settings=(), targets=None, force=False):
 def ran(project, dataset="set"):
     """The steps of the run log, in order."""
     lines = (project.build / dataset / "log.jsonl").read_text().splitlines()
-    return [f"{e['stage']}/{e['photo']}" if e["photo"] else e["stage"] for e in map(json.loads, lines) if e["event"] == "done"]
+    return [
+        f"{e['stage']}/{e['photo']}" if e["photo"] else e["stage"]
+        for e in map(json.loads, lines)
+        if e["event"] == "done"
+    ]
 
 
 def new_runs(project, **options):
@@ -69,7 +73,9 @@ def test_store_files_are_read_only(project):
 
 def test_the_log_has_what_a_step_cost_and_artifacts_have_not(project):
     event = json.loads((project.build / "set" / "log.jsonl").read_text().splitlines()[0])
-    assert event["seconds"] > 0 and event["memory_mb"] > 1 and event["threads"] == 1 and event["key"] and event["started"]
+    assert (
+        event["seconds"] > 0 and event["memory_mb"] > 1 and event["threads"] == 1 and event["key"] and event["started"]
+    )
 
 
 def test_a_second_run_does_nothing(project, capsys):
@@ -108,7 +114,10 @@ def test_a_new_photo_costs_one_photo_and_one_taken_away_vanishes(project):
     assert new_runs(project) == ["count/c", "total", "upper/c"]
     (project.root / "data" / "set" / "a.txt").unlink()
     assert new_runs(project) == ["total"]
-    assert not (project.build / "set" / "upper" / "a.txt").exists() and (project.build / "set" / "upper" / "c.txt").exists()
+    assert (
+        not (project.build / "set" / "upper" / "a.txt").exists()
+        and (project.build / "set" / "upper" / "c.txt").exists()
+    )
 
 
 def test_a_parameter_reruns_its_stage_and_the_old_one_is_still_there(project):
@@ -181,7 +190,11 @@ def test_a_name_as_long_as_the_file_system_allows_is_as_good_as_a_short_one(tmp_
     assert len(list((project.build / "set" / "errors").iterdir())) == 1
     write(project.root / "stages" / "count.py", toy.COUNT)
     assert make(project) == 0 and not (project.build / "set" / "errors").exists()
-    places = [path for path in (project.build / "store").rglob("*") if "kkk" in str(path) and path.name.startswith("k") is False]
+    places = [
+        path
+        for path in (project.build / "store").rglob("*")
+        if "kkk" in str(path) and path.name.startswith("k") is False
+    ]
     assert places == []
 
 
@@ -190,7 +203,11 @@ def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
     write(project.root / "data" / "set" / "c.txt", "Gamma")
     assert make(project) == 1
     said = capsys.readouterr()
-    assert "upper/a: a.txt: line 1: a bad word" in said.err and "use a better one" in said.err and "Traceback" not in said.err
+    assert (
+        "upper/a: a.txt: line 1: a bad word" in said.err
+        and "use a better one" in said.err
+        and "Traceback" not in said.err
+    )
     assert ran(project)[-2:] == ["upper/c", "count/c"] and state(project)["count/c"] == "current"
     assert not (project.build / "set" / "upper" / "a.txt").exists(), "a result that is not current is shown"
     write(project.root / "data" / "set" / "a.txt", "good")
@@ -237,7 +254,9 @@ def test_another_directory_gives_the_same_bytes(project, tmp_path):
     assert make(other) == 0
     for stage in ("upper", "count", "table"):
         assert files_of(other.build / "set" / stage) == files_of(project.build / "set" / stage)
-    assert {p.name for p in (other.build / "store" / "trees").iterdir()} == {p.name for p in (project.build / "store" / "trees").iterdir()}
+    assert {p.name for p in (other.build / "store" / "trees").iterdir()} == {
+        p.name for p in (project.build / "store" / "trees").iterdir()
+    }
 
 
 def test_datasets_share_what_is_the_same(project):
@@ -274,22 +293,35 @@ def test_gc_keeps_what_is_current_and_only_that(project):
     before = {stage: files_of(project.build / "set" / stage) for stage in ("upper", "count", "table", "total")}
     assert collect(project).results == 2  # table and total of the other scale
     assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
-    assert set(state(project).values()) == {"current"} and state(project, settings=("table.scale=3",))["table"] == "to run"
+    assert (
+        set(state(project).values()) == {"current"} and state(project, settings=("table.scale=3",))["table"] == "to run"
+    )
     assert collect(project).results == 0
 
 
 def test_gc_shows_what_it_would_free_by_stage_and_age_and_asks(project, capsys):
     make(project, settings=["table.scale=3"])
     make(project)
-    table = project.build / "store" / "trees" / next(e for e in entries(project) if e.record["stage"] == "table" and "3" in str(e.record)).output
+    table = (
+        project.build
+        / "store"
+        / "trees"
+        / next(e for e in entries(project) if e.record["stage"] == "table" and "3" in str(e.record)).output
+    )
     for key in (project.build / "store" / "keys").iterdir():
         os.utime(key, (time.time() - 3 * 86400 - 60,) * 2)
     capsys.readouterr()
     assert verbs.collect(project, lambda: False) == 0
     said = capsys.readouterr().out
-    assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search(r"^total +1 result ", said, re.M)
+    assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search(
+        r"^total +1 result ", said, re.M
+    )
     assert "nothing was deleted" in said and table.exists()
-    assert verbs.collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out and not table.exists()
+    assert (
+        verbs.collect(project, lambda: True) == 0
+        and "deleted 2 results" in capsys.readouterr().out
+        and not table.exists()
+    )
     assert verbs.collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
 
 
@@ -321,7 +353,14 @@ def heed_interrupts():
 def background(project, *settings):
     command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
     environment = {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=heed_interrupts)
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=heed_interrupts,
+    )
 
 
 def wait_until(true, seconds=20):
@@ -332,7 +371,9 @@ def wait_until(true, seconds=20):
 
 
 def children_of(parent):
-    return [int(stat.parent.name) for stat in Path("/proc").glob("[0-9]*/stat") if fields_of(stat)[1:2] == [str(parent)]]
+    return [
+        int(stat.parent.name) for stat in Path("/proc").glob("[0-9]*/stat") if fields_of(stat)[1:2] == [str(parent)]
+    ]
 
 
 def is_alive(pid):
@@ -439,7 +480,9 @@ def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machin
 
 
 @pytest.mark.parametrize("cores, expected", [("all", 2), ("1", 1), ("64", 2)])
-def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(tmp_path, monkeypatch, cores, expected):
+def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(
+    tmp_path, monkeypatch, cores, expected
+):
     monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 2)
     project = make_project(tmp_path)
     many = "len(set(inputs.map(lambda _: (__import__('time').sleep(0.1), __import__('threading').get_ident())[1], range(6))))"
@@ -491,7 +534,9 @@ def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_p
     write(tmp_path / "other" / "seed.txt", "6")
     assert reasons(giving, "table", settings=named("other")) == ["given file start/seed.txt: changed"]
     assert new_runs(giving, settings=named("other")) == ["table", "total"]
-    assert new_runs(giving) == [] and (giving.build / "set" / "total" / "total.txt").read_text() == "total: 18", "it is off unless named"
+    assert new_runs(giving) == [] and (giving.build / "set" / "total" / "total.txt").read_text() == "total: 18", (
+        "it is off unless named"
+    )
 
 
 def test_no_path_of_a_given_folder_is_in_the_key(giving, tmp_path):
@@ -504,7 +549,9 @@ def test_a_given_folder_that_is_not_there_is_refused_before_anything_runs(giving
     with pytest.raises(InputError) as caught:
         make(giving, settings=[f"table.start={tmp_path / folder}"])
     said = str(caught.value)
-    assert words in said and "table.start" in said and "name a folder with seed.txt" in said and str(tmp_path.name) in said
+    assert (
+        words in said and "table.start" in said and "name a folder with seed.txt" in said and str(tmp_path.name) in said
+    )
 
 
 def test_a_given_file_that_changes_while_it_is_read_is_no_result(giving, tmp_path):

@@ -32,7 +32,12 @@ def checkout(folder, **texts):
     """A toy that counts how often it computes, in a file that is no part of it."""
     project = make_project(folder, **texts)
     for name, text in {"upper": toy.UPPER, "count": toy.COUNT, "table": toy.TABLE, "total": toy.TOTAL}.items():
-        write(folder / "stages" / f"{name}.py", text.replace("import msgspec", "import msgspec\nfrom pathlib import Path", 1).replace("    (out", COUNTED, 1))
+        write(
+            folder / "stages" / f"{name}.py",
+            text.replace("import msgspec", "import msgspec\nfrom pathlib import Path", 1).replace(
+                "    (out", COUNTED, 1
+            ),
+        )
     return project
 
 
@@ -106,7 +111,11 @@ def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, shared, capsys
     elif damage == "no tree":
         file.parent.rmdir()
     capsys.readouterr()
-    assert make(other) == 0 and computed(other) == 1 and "the shared store's result is not as it was kept" in capsys.readouterr().err
+    assert (
+        make(other) == 0
+        and computed(other) == 1
+        and "the shared store's result is not as it was kept" in capsys.readouterr().err
+    )
     assert files_of(other.build / "set") == files_of(other.build / "set") and trees(other.build / "store") == sound
     assert trees(shared) == sound
 
@@ -135,7 +144,11 @@ def test_a_record_of_another_key_is_not_taken(tmp_path, shared):
     one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
     assert make(one, "table.scale=3") == 0
     of_stage = {json.loads(path.read_text())["record"]["stage"]: path for path in (shared / "keys").iterdir()}
-    forged = next(p.key for p in __import__("factorlib.runner.survey", fromlist=["survey"]).survey(other, "set", None, []).planned() if p.step.stage == "table")
+    forged = next(
+        p.key
+        for p in __import__("factorlib.runner.survey", fromlist=["survey"]).survey(other, "set", None, []).planned()
+        if p.step.stage == "table"
+    )
     shutil.copyfile(of_stage["table"], shared / "keys" / f"{forged}.json")
     assert make(other) == 0 and (other.build / "set" / "table" / "table.json").read_text() == "2"
 
@@ -143,7 +156,10 @@ def test_a_record_of_another_key_is_not_taken(tmp_path, shared):
 def test_one_that_vanishes_costs_nothing(tmp_path, shared, capsys):
     project = checkout(tmp_path / "one")
     text = (project.root / "stages" / "table.py").read_text()
-    write(project.root / "stages" / "table.py", text.replace("    (out", "    import shutil, os; shutil.rmtree(os.environ['FACTORLIB_STORE'])\n    (out", 1))
+    write(
+        project.root / "stages" / "table.py",
+        text.replace("    (out", "    import shutil, os; shutil.rmtree(os.environ['FACTORLIB_STORE'])\n    (out", 1),
+    )
     assert make(project, "upper.sleep=0.5") == 0
     assert not shared.exists() and "the shared store took nothing (it is gone)" in capsys.readouterr().err
     assert (project.build / "set" / "total" / "total.txt").read_text() == "total: 18"
@@ -171,7 +187,9 @@ def test_one_that_may_only_be_read_is_read(tmp_path, shared):
     before = files_of(shared)
     drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
     command = [*drop, sys.executable, toy.__file__, str(other.root), "set"]
-    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(LIBRARY)}, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(LIBRARY)}, capture_output=True, text=True, timeout=120
+    )
     for folder in [shared, *(path for path in shared.rglob("*") if path.is_dir())]:
         folder.chmod(0o755)
     assert done.returncode == 0 and "warning" not in done.stderr, done.stderr

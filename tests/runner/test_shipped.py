@@ -16,7 +16,12 @@ from tests.runner.toy import make_project, write
 def project(tmp_path):
     """The toy, whose stage `table` has shipped a result that no stage would make: 2 by itself, 7 as shipped."""
     project = make_project(tmp_path / "root")
-    write(project.pipeline_file, project.pipeline_file.read_text().replace("  table: {}", "  table: {shipped: {folder: stages/tables, made_by: [stages.table]}}"))
+    write(
+        project.pipeline_file,
+        project.pipeline_file.read_text().replace(
+            "  table: {}", "  table: {shipped: {folder: stages/tables, made_by: [stages.table]}}"
+        ),
+    )
     assert make(project, targets=["table"]) == 0
     assert verbs.ship(project, "table", "set") == 0
     shipped = project.root / "stages" / "tables"

@@ -45,7 +45,14 @@ def light_of(axes, sharpness, weights) -> Light:
     return Light(axes / np.linalg.norm(axes, axis=1, keepdims=True), np.log(sharpness), weight, np.zeros(1))
 
 
-def spheres(lights: list[Light], materials: Materials = MATERIALS, shown=(0, 1, 2), size: int = 14, noise: float = 0.3, seed: int = 0):
+def spheres(
+    lights: list[Light],
+    materials: Materials = MATERIALS,
+    shown=(0, 1, 2),
+    size: int = 14,
+    noise: float = 0.3,
+    seed: int = 0,
+):
     """Noisy spheres of `shown` materials in each of the lights, named room0 and so on."""
     blocks, rng = [], np.random.default_rng(seed)
     for k, light in enumerate(lights):
@@ -60,7 +67,9 @@ def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[Joint
     true = [on_even_cells(drawn(100 * seed + k, cells)) for k in range(lights)]
     problem = spheres(true, seed=seed, **{"size": 16} | how)
     units = [one.unit for one in problem.blocks]
-    return problem, [light.with_log_radiance(light.log_radiance - np.log(unit)) for light, unit in zip(true, units, strict=True)]
+    return problem, [
+        light.with_log_radiance(light.log_radiance - np.log(unit)) for light, unit in zip(true, units, strict=True)
+    ]
 
 
 def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START) -> Fit:
@@ -68,7 +77,9 @@ def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START)
     return start_of(Point(materials, [constant_light(one, materials, cells) for one in problem.blocks]))
 
 
-def field(problem: JointProblem, light: Light, materials: Materials = MATERIALS, temperature: float = 2.0, prior=PRIOR) -> Field:
+def field(
+    problem: JointProblem, light: Light, materials: Materials = MATERIALS, temperature: float = 2.0, prior=PRIOR
+) -> Field:
     """Of the first illumination, without outliers."""
     one = Illumination(problem.blocks[0], light, materials, OPERATOR)
     return msgspec.structs.replace(field_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))

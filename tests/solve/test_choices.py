@@ -24,7 +24,9 @@ from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
-MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all photos share is known less than those between photos
+MORE = msgspec.structs.replace(
+    QUICK, observations=1000
+)  # an exponent that all photos share is known less than those between photos
 
 
 def solved(blocks, choices=QUICK, **others):
@@ -50,7 +52,11 @@ def lit_bowls(name, seed) -> Observations:
     shown = seen.radiance
     for _ in range(8):
         sent = bounced_light(seen, shown)
-        shown = seen.radiance + MATERIALS.diffuse[seen.material] * sent[:, :3] + MATERIALS.specular[seen.material] * sent[:, 3:]
+        shown = (
+            seen.radiance
+            + MATERIALS.diffuse[seen.material] * sent[:, :3]
+            + MATERIALS.specular[seen.material] * sent[:, 3:]
+        )
     return msgspec.structs.replace(seen, radiance=shown)
 
 
@@ -65,7 +71,10 @@ def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_t
         solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
         found = solution.point.materials
         factor = factor_between(found, MATERIALS)
-        error[choice] = np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(), np.abs(found.roughness - MATERIALS.roughness).mean()
+        error[choice] = (
+            np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(),
+            np.abs(found.roughness - MATERIALS.roughness).mean(),
+        )
     assert solution.shadows.kept and solution.shadows.margin > FOR
     assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
     assert error["auto"][0] < 0.5 * error["off"][0], error
@@ -76,7 +85,9 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
     error = {}
     for choice in ("off", "auto"):
         solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
-        error[choice] = np.abs(solution.point.materials.diffuse / MATERIALS.diffuse - 1).mean()  # absolute: no factor is taken out
+        error[choice] = np.abs(
+            solution.point.materials.diffuse / MATERIALS.diffuse - 1
+        ).mean()  # absolute: no factor is taken out
     assert solution.interreflection.kept and solution.interreflection.margin > FOR
     assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
     assert error["auto"] < 0.5 * error["off"], error
@@ -87,7 +98,9 @@ def tilted(seen, seed, degrees):
     rng = np.random.default_rng(seed)
     waves = np.sin(seen.normal @ (2 * rng.normal(size=(3, 3))).T + rng.uniform(0, 6, 3))
     normal = seen.normal + np.radians(degrees) * waves
-    return msgspec.structs.replace(seen, normal=(normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(seen.normal.dtype))
+    return msgspec.structs.replace(
+        seen, normal=(normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(seen.normal.dtype)
+    )
 
 
 @pytest.mark.parametrize("bounced", [False, True])
@@ -96,7 +109,10 @@ def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
     when they are weak, so a solve that kept them would make all reflectances ten times too small."""
     lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
     direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
-    shown = [one if bounced else msgspec.structs.replace(one, radiance=other.radiance) for one, other in zip(lit, direct, strict=True)]
+    shown = [
+        one if bounced else msgspec.structs.replace(one, radiance=other.radiance)
+        for one, other in zip(lit, direct, strict=True)
+    ]
     blocks = [blocks_of_observations(tilted(one, 10 + i, 12.0), Noise(0.02, 0.02))[0] for i, one in enumerate(shown)]
     solution = solved(blocks, OF_SHAPES, self_shadowing="on")
     assert solution.interreflection.kept == bounced, solution.interreflection
@@ -158,14 +174,19 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
     open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
     directions = np.stack([fibonacci_sphere(96)])
     wrong = [
-        msgspec.structs.replace(b, visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8), directions=directions)
+        msgspec.structs.replace(
+            b, visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8), directions=directions
+        )
         for b in open_
     ]
     few = msgspec.structs.replace(QUICK, cells=24, observations=150, tone="off")
     found = solved(wrong, few)
     assert not found.shadows.kept and found.shadows.margin < AGAINST
     assert solved(wrong, few, self_shadowing="on").shadows.kept
-    nothing = [msgspec.structs.replace(b, visibility=np.full((len(b), 96), 255, np.uint8), directions=directions) for b in open_]
+    nothing = [
+        msgspec.structs.replace(b, visibility=np.full((len(b), 96), 255, np.uint8), directions=directions)
+        for b in open_
+    ]
     assert solved(nothing, few).shadows.kept
 
 
@@ -205,7 +226,9 @@ def found(curved):
 
 def test_curves_are_found_and_spare_the_materials(curved, found):
     without = solved(curved, MORE, tone="off")
-    np.testing.assert_allclose([float(e[0]) if len(e) else 1.0 for e in exponents_of(found)], (1.3, 0.8, 1.0), rtol=0.05)
+    np.testing.assert_allclose(
+        [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)], (1.3, 0.8, 1.0), rtol=0.05
+    )
     assert all(len(e) == 0 for e in exponents_of(without))
     assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
 
@@ -232,7 +255,9 @@ def test_a_curve_that_no_camera_has_is_not_believed():
     blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
     solution = solved(blocks, cells=40, observations=200)
     assert len(exponents_of(solution)[0]) == 0
-    assert solution.tone[0].held_out_loss_with < 0.8 * solution.tone[0].held_out_loss_without and not solution.tone[0].kept
+    assert (
+        solution.tone[0].held_out_loss_with < 0.8 * solution.tone[0].held_out_loss_without and not solution.tone[0].kept
+    )
 
 
 def test_an_exponent_near_its_bounds_is_named():
@@ -260,7 +285,11 @@ def test_without_held_out_observations_shadows_stay_and_bounces_are_left_out(lit
 def test_models_are_compared_on_few_observations_of_each_material(curved):
     sample = sample_of(JointProblem(curved, OPERATOR), Choices(observations=50))
     for block, whole in zip(sample.blocks, curved, strict=True):
-        assert 0 < len(block) <= 50 + 50 // 3 and set(np.unique(block.material)) == set(np.unique(whole.material)) and block.held_out.any()
+        assert (
+            0 < len(block) <= 50 + 50 // 3
+            and set(np.unique(block.material)) == set(np.unique(whole.material))
+            and block.held_out.any()
+        )
 
 
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
@@ -268,4 +297,6 @@ def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     assert [len(from_nothing(n).points(problem, 30)) for n in (3, 40)] == [1, 1]
     only = JointProblem([block.take(block.material < 2) for block in problem.blocks], OPERATOR)
     points = from_nothing(2).points(only, 30)
-    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and all(len(p.lights[0]) == len(even_cells(30)) for p in points)
+    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and all(
+        len(p.lights[0]) == len(even_cells(30)) for p in points
+    )

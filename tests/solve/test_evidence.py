@@ -35,7 +35,10 @@ def test_the_margin_changes_its_sign_with_the_models(**how):
     without, richer = made(**how)
     one, other = compare(without, richer, FOR), compare(richer, without, FOR)
     assert one.margin == pytest.approx(-other.margin, rel=1e-9, abs=1e-9)
-    assert (one.held_out_loss_with, one.held_out_loss_without) == (other.held_out_loss_without, other.held_out_loss_with)
+    assert (one.held_out_loss_with, one.held_out_loss_without) == (
+        other.held_out_loss_without,
+        other.held_out_loss_with,
+    )
 
 
 @FEW_EXAMPLES
@@ -52,7 +55,9 @@ def test_the_order_of_lights_and_the_scale_of_a_light_change_nothing(factor, **h
 
     assert compare(turned(without), turned(richer), FOR).margin == pytest.approx(margin, rel=1e-9)
     for which in ({0}, set(range(5))):
-        assert compare(scaled(without, which), scaled(richer, which), FOR).margin == pytest.approx(margin, rel=0.01, abs=1e-3)
+        assert compare(scaled(without, which), scaled(richer, which), FOR).margin == pytest.approx(
+            margin, rel=0.01, abs=1e-3
+        )
 
 
 @pytest.mark.parametrize("lights", [1, 3])
@@ -77,8 +82,13 @@ def test_chance_is_rarely_evidence_though_residuals_are_alike():
     kept, singly = [], []
     for seed in range(400):
         rng, (same, _) = np.random.default_rng(seed), made(seed, 3, rows=240)
-        err = [np.exp(0.3 * rng.normal(size=(2, 12))) for _ in same.values]  # alike within a cluster, not between models
-        both = [Losses([v * e[k][c] for v, e, c in zip(same.values, err, same.clusters, strict=True)], same.clusters) for k in (0, 1)]
+        err = [
+            np.exp(0.3 * rng.normal(size=(2, 12))) for _ in same.values
+        ]  # alike within a cluster, not between models
+        both = [
+            Losses([v * e[k][c] for v, e, c in zip(same.values, err, same.clusters, strict=True)], same.clusters)
+            for k in (0, 1)
+        ]
         kept.append(compare(*both, FOR).kept)
         alone = [Losses(of.values, [np.arange(len(v)) for v in of.values]) for of in both]
         singly.append(compare(*alone, FOR).kept)

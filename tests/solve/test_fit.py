@@ -50,7 +50,10 @@ def test_a_fit_lowers_its_value(solved):
     """Of materials and lights together, and of lights alone.  The prior on k_d is about the start, so the value of a fit that goes on is
     another, by little."""
     problem, _, found = solved
-    again, given = (fitted(problem, found, PRIOR, step, FREE).value for step in (Schedule(together=(0,), estimate=False), Schedule()))
+    again, given = (
+        fitted(problem, found, PRIOR, step, FREE).value
+        for step in (Schedule(together=(0,), estimate=False), Schedule())
+    )
     assert again == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
     for step, before in ((Schedule(together=(3,), estimate=False), again), (Schedule(lights=3), given)):
         assert fitted(problem, found, PRIOR, step, FREE).value <= before + 1e-9 * abs(before)
@@ -82,7 +85,11 @@ def test_order_of_lights_changes_nothing():
 
 def test_gold_among_paints_is_not_taken_for_a_paint():
     """Up to the factor per channel that is free."""
-    gold = Materials(np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]), np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]), MATERIALS.roughness)
+    gold = Materials(
+        np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]),
+        np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]),
+        MATERIALS.roughness,
+    )
     problem, _ = photographed(10, 2, materials=gold)
     found = materials_in(problem).point.materials
     assert found.specular[2] * factor_between(found, gold) == pytest.approx(gold.specular[2], rel=0.15)
@@ -92,7 +99,9 @@ def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
     problem, _, found = solved
     again = fitted(problem, found, PRIOR, LIGHTS, ~FREE)
     assert np.array_equal(again.point.materials.vector(), found.point.materials.vector())
-    for one, how, light, after in zip(problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True):
+    for one, how, light, after in zip(
+        problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True
+    ):
         alone = field(JointProblem([one], OPERATOR), light, found.point.materials, how.temperature)
         deviation = np.sqrt(np.diag(np.linalg.inv(marginal(alone, materials_given=True).light_hessian))).reshape(3, -1)
         assert np.mean(np.abs(after.log_radiance - light.log_radiance) < deviation) > 0.95
@@ -102,15 +111,21 @@ def test_lights_from_all_show_what_the_others_alone_see(solved):
     """Found from a half of the observations, given the true materials, lights explain the other half better afterwards."""
     problem, _, found = solved
     half = [msgspec.structs.replace(b, confidence=np.where(b.normal[:, 0] > 0, 0.9, 0.1)) for b in problem.blocks]
-    of_half = fitted(sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE, FREE)
-    others = msgspec.structs.replace(problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks])
+    of_half = fitted(
+        sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE, FREE
+    )
+    others = msgspec.structs.replace(
+        problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks]
+    )
     after = fitted(problem, of_half, PRIOR, LIGHTS, ~FREE)
     assert others.held_out_loss(after.point) < 0.5 * others.held_out_loss(of_half.point)
 
 
 def test_the_gauge_of_an_answer_shows_the_same(solved):
     problem, _, found = solved
-    for one, other in zip(problem.radiance(in_gauge(found.point, problem.blocks)), problem.radiance(found.point), strict=True):
+    for one, other in zip(
+        problem.radiance(in_gauge(found.point, problem.blocks)), problem.radiance(found.point), strict=True
+    ):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
@@ -123,7 +138,9 @@ def test_correlated_residuals_count_less():
     assert temperature(one, independent) == pytest.approx(1.0, abs=0.35)
     assert temperature(one, np.ones_like(independent)) > 5
     assert temperature(one, 0.1 * independent) == Schedule().least
-    assert temperature(one, 1e9 * np.ones_like(independent)) == temperature(one, 3 * np.ones_like(independent))  # outliers
+    assert temperature(one, 1e9 * np.ones_like(independent)) == temperature(
+        one, 3 * np.ones_like(independent)
+    )  # outliers
     assert 2 < temperature(one, 2 * independent) < 4
 
 
@@ -144,7 +161,12 @@ def test_a_start_has_hyperparameters_for_each_light():
     kept = [Hyperparameters(3.0), Hyperparameters(7.0)]
     assert start_of(start.point, kept).hyperparameters == kept
     assert fitted(problem, start_of(start.point, kept), PRIOR, Schedule(lights=1), FREE).hyperparameters == kept
-    assert fitted(problem, start_of(start.point, kept), PRIOR, Schedule(together=(1,), estimate=False), FREE).hyperparameters == kept
+    assert (
+        fitted(
+            problem, start_of(start.point, kept), PRIOR, Schedule(together=(1,), estimate=False), FREE
+        ).hyperparameters
+        == kept
+    )
 
 
 # ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────

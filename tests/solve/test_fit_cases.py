@@ -41,7 +41,9 @@ def test_a_light_of_one_colour():
 
 def test_lamps_at_night_are_found_where_they_are():
     axes = np.array([[0.6, -0.5, -0.6], [-0.7, -0.3, -0.6], [0.1, 0.6, -0.8]])
-    lamps = light_of(np.vstack([axes, [0, 0, 1.0]]), [60, 60, 60, 1e-4], np.array([8.0, 6.0, 7.0, 0.02])[:, None] * np.ones(3))
+    lamps = light_of(
+        np.vstack([axes, [0, 0, 1.0]]), [60, 60, 60, 1e-4], np.array([8.0, 6.0, 7.0, 0.02])[:, None] * np.ones(3)
+    )
     light = found_in([lamps]).point.lights[0]
     radiance = np.exp(light.log_radiance).mean(0)
     near = np.degrees(np.arccos(np.clip(light.axis @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T, -1, 1)))
@@ -58,11 +60,17 @@ def test_all_surfaces_lambertian():
     free = FREE & (np.arange(7) < 3)
     start = Materials(START.diffuse, np.zeros((3, 3)), START.roughness)
     found = found_in(lights, materials=lambertian, free=free, start=start).point.materials
-    assert np.abs(found.diffuse * factor_between(found, lambertian) / lambertian.diffuse - 1).max() < 0.05 and not found.specular.any()
+    assert (
+        np.abs(found.diffuse * factor_between(found, lambertian) / lambertian.diffuse - 1).max() < 0.05
+        and not found.specular.any()
+    )
 
 
 @pytest.mark.parametrize("shown", [(0,), (2,)])
 def test_one_photo_of_one_material(shown):
     light = on_even_cells(np.tile(1.5 * np.sin(3 * even_cells(FEW).axis[:, 0] + 1), (3, 1)))
     found = found_in([light], shown).point
-    assert all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight)) and contrast(found.lights[0]) < 3
+    assert (
+        all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
+        and contrast(found.lights[0]) < 3
+    )

@@ -18,13 +18,17 @@ THETA = unknowns_of(MATERIALS)
 def prior_of(light, precision) -> float:
     """uᵀQu and the Gaussians of exposures and tone exponents."""
     u = light.log_radiance.reshape(-1)
-    return float(u @ precision @ u + np.sum((light.log_exposure / EXPOSURE) ** 2) + np.sum((light.log_tone / TONE) ** 2))
+    return float(
+        u @ precision @ u + np.sum((light.log_exposure / EXPOSURE) ** 2) + np.sum((light.log_tone / TONE) ** 2)
+    )
 
 
 def log_det(one) -> float:
     """log det H, of the value."""
     part = marginal(one)
-    return part.value - part.loss / one.temperature - prior_of(one.illumination.light, one.precision) + one.log_determinant
+    return (
+        part.value - part.loss / one.temperature - prior_of(one.illumination.light, one.precision) + one.log_determinant
+    )
 
 
 def posterior(one) -> float:
@@ -55,7 +59,9 @@ def test_the_gradient_by_materials_is_the_finite_difference_of_the_value(here):
     for place in range(THETA.size):
         change = 2e-3 * np.eye(THETA.size)[place].reshape(THETA.shape)
         high, low = (marginal(at(here, materials=materials_of(THETA + sign * change))).value for sign in (1, -1))
-        assert gradient[place] == pytest.approx((high - low) / 4e-3 / 2, rel=0.02, abs=0.02 * np.abs(gradient).max()), place
+        assert gradient[place] == pytest.approx((high - low) / 4e-3 / 2, rel=0.02, abs=0.02 * np.abs(gradient).max()), (
+            place
+        )
 
 
 @pytest.mark.parametrize("toned", [False, True])
@@ -86,13 +92,19 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
     direction[:, [channel, 3 + channel]], cells[channel] = 1.0, -1.0
     light, values = one.illumination.light, []
     for step in (0.0, np.log(3)):
-        there = at(one, light.with_log_radiance(light.log_radiance + step * cells), materials_of(THETA + step * direction))
+        there = at(
+            one, light.with_log_radiance(light.log_radiance + step * cells), materials_of(THETA + step * direction)
+        )
         values.append(marginal(there).value - prior_of(there.illumination.light, one.precision))
     assert values[0] == pytest.approx(values[1], abs=1e-3 * abs(values[0]))
     part = marginal(one)
     by_light = part.light_gradient, part.light_gradient + part.determinant_by_light
     alone, whole = (
-        abs(direction.reshape(-1) @ (part.material_gradient - part.cross_hessian @ np.linalg.solve(part.light_hessian, g))) for g in by_light
+        abs(
+            direction.reshape(-1)
+            @ (part.material_gradient - part.cross_hessian @ np.linalg.solve(part.light_hessian, g))
+        )
+        for g in by_light
     )
     assert alone > 10 and whole < 0.02 * alone, (alone, whole)
 
@@ -112,7 +124,9 @@ def test_given_materials_the_system_of_the_light_is_the_same(here, clustered):
 def test_scores_of_clusters_add_up_to_the_gradient_of_the_loss(here):
     part = marginal(here, clusters_of(here.illumination.block), materials_given=True)
     k = len(part.places)
-    np.testing.assert_allclose(part.scores[:, :k].sum(0), part.material_gradient, rtol=1e-3, atol=1e-3 * np.abs(part.material_gradient).max())
+    np.testing.assert_allclose(
+        part.scores[:, :k].sum(0), part.material_gradient, rtol=1e-3, atol=1e-3 * np.abs(part.material_gradient).max()
+    )
     light = here.illumination.light
     prior = np.concatenate([here.precision @ light.log_radiance.reshape(-1), light.log_exposure[1:] / EXPOSURE**2])
     expected = part.light_gradient - prior

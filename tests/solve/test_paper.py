@@ -15,7 +15,10 @@ QUICK = Paper(lobes=8, samplings=200, subset=512)
 
 def rooms(photos=1, size=16):
     rng = np.random.default_rng(3)
-    return [block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=i) for i in range(2)]
+    return [
+        block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=i)
+        for i in range(2)
+    ]
 
 
 def run(blocks, paper=QUICK, operator=OPERATOR):
@@ -31,8 +34,12 @@ def solved():
 def test_roughly_recovers_the_materials_it_was_rendered_with(solved):
     found = solved[1].point.materials
     factor = factor_between(found, MATERIALS)
-    np.testing.assert_allclose(found.roughness[1:], MATERIALS.roughness[1:], atol=0.15)  # the first is all but Lambertian
-    np.testing.assert_allclose(found.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05)  # the glossy one is split badly
+    np.testing.assert_allclose(
+        found.roughness[1:], MATERIALS.roughness[1:], atol=0.15
+    )  # the first is all but Lambertian
+    np.testing.assert_allclose(
+        found.diffuse * factor, MATERIALS.diffuse, rtol=0.3, atol=0.05
+    )  # the glossy one is split badly
 
 
 def test_resynthesises_what_it_was_shown(solved):
@@ -61,7 +68,10 @@ def test_the_same_seed_gives_the_same_answer():
 def test_scaling_a_photo_scales_its_light_alone():
     short = msgspec.structs.replace(QUICK, samplings=3)
     blocks = rooms()
-    one, other = run(blocks, short), run([msgspec.structs.replace(blocks[0], unit=7 * blocks[0].unit), blocks[1]], short)
+    one, other = (
+        run(blocks, short),
+        run([msgspec.structs.replace(blocks[0], unit=7 * blocks[0].unit), blocks[1]], short),
+    )
     np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
     np.testing.assert_array_equal(one.point.lights[0].weight, other.point.lights[0].weight)  # in units of the block
 
@@ -70,7 +80,9 @@ def test_gradient_is_the_finite_difference():
     blocks = rooms(photos=2, size=8)
     objective = PaperObjective(JointProblem(blocks, EXACT), 3, Paper(lobes=3))
     subset = drawn([np.arange(len(b)) for b in blocks], 60, np.random.default_rng(0))
-    x = objective.start() + 0.3 * torch.randn(sum(objective.sizes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = objective.start() + 0.3 * torch.randn(
+        sum(objective.sizes), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     _, gradient = objective.at(x, subset)
     moves = torch.eye(len(x), dtype=torch.float64) * 1e-6
     expected = [(objective.at(x + d, subset)[0] - objective.at(x - d, subset)[0]) / 2e-6 for d in moves]

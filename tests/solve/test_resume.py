@@ -19,7 +19,15 @@ from tests.solve.made import OPERATOR, PRIOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "materials", "splitting", "lights")
-PHASES = ("no shadows", "shadows", "shadows and bounces", "tone curves", "materials and lights", "splitting 1", "lights")
+PHASES = (
+    "no shadows",
+    "shadows",
+    "shadows and bounces",
+    "tone curves",
+    "materials and lights",
+    "splitting 1",
+    "lights",
+)
 
 
 class Killed(Exception):
@@ -32,7 +40,11 @@ def short():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(choices, "TRIAL", Schedule(2, (3,)))
         patch.setattr(choices, "CURVED", Schedule(together=(2,), estimate=False))
-        for name, schedule in (("MATERIALS", Schedule(2, (2,))), ("AFTER_SPLITTING", Schedule(1, (2,))), ("LIGHTS", Schedule(together=(0, 2)))):
+        for name, schedule in (
+            ("MATERIALS", Schedule(2, (2,))),
+            ("AFTER_SPLITTING", Schedule(1, (2,))),
+            ("LIGHTS", Schedule(together=(0, 2))),
+        ):
             patch.setattr(solving, name, schedule)
         yield
 
@@ -41,11 +53,17 @@ def short():
 def blocks():
     """Two lights with two photos each, some of which is hidden, and some sent by other surfaces, as is made up."""
     rng = np.random.default_rng(4)
-    made = [block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=6, seed=i) for i in range(2)]
+    made = [
+        block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=6, seed=i)
+        for i in range(2)
+    ]
     further = {"directions": np.stack([fibonacci_sphere(96)] * 2)}
     return [
         msgspec.structs.replace(
-            b, visibility=(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8), bounced=0.01 * rng.random((len(b), 6)), **further
+            b,
+            visibility=(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8),
+            bounced=0.01 * rng.random((len(b), 6)),
+            **further,
         )
         for b in made
     ]
@@ -60,7 +78,11 @@ def answer(blocks, journal=None, stop=lambda event: False, spread=serial_map):
         if stop(event):
             raise Killed
 
-    found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), Run(CHOICES, report, journal or Journal(), PRIOR))
+    found = solve(
+        JointProblem(blocks, OPERATOR, spread=spread),
+        from_nothing(3),
+        Run(CHOICES, report, journal or Journal(), PRIOR),
+    )
     p = found.point
     parts = [p.materials.vector(), *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
     decided = [found.history, found.shadows, found.interreflection, found.tone, found.splitting, found.loss]
@@ -93,13 +115,22 @@ def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp
         answer(blocks, Journal(Fragile(path, part)))
     again, events = answer(blocks, Journal(Checkpoint(path)))
     assert again == whole[0]
-    assert msgspec.json.encode(events) == msgspec.json.encode(whole[1])  # of parts that were done, too, for who shows progress
+    assert msgspec.json.encode(events) == msgspec.json.encode(
+        whole[1]
+    )  # of parts that were done, too, for who shows progress
 
 
 def test_every_part_reports_what_it_does(whole):
     _, events = whole
     seen = [event.phase for event in events]
-    assert set(seen) <= set(PHASES) and {"no shadows", "shadows", "tone curves", "materials and lights", "splitting 1", "lights"} <= set(seen)
+    assert set(seen) <= set(PHASES) and {
+        "no shadows",
+        "shadows",
+        "tone curves",
+        "materials and lights",
+        "splitting 1",
+        "lights",
+    } <= set(seen)
     assert sorted(seen, key=PHASES.index) == seen and all(np.isfinite(event.loss) for event in events)
     assert [event.round for event in events] == sorted(event.round for event in events)
 
@@ -108,7 +139,11 @@ def test_every_part_reports_what_it_does(whole):
 def test_a_solve_killed_in_the_midst_of_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, phase):
     path, seen = tmp_path / "solve.pt", []
     with pytest.raises(Killed):
-        answer(blocks, Journal(Checkpoint(path)), lambda event: event.phase == phase and (seen.append(event) or len(seen) == 2))
+        answer(
+            blocks,
+            Journal(Checkpoint(path)),
+            lambda event: event.phase == phase and (seen.append(event) or len(seen) == 2),
+        )
     assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
 
 

@@ -43,13 +43,19 @@ def first(materials: Materials, count: int) -> Materials:
 
 def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> Earlier:
     """As the stage writes it and `read_earlier` reads it."""
-    rows = zip(names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True)
+    rows = zip(
+        names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True
+    )
     table = MaterialTable(
-        {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows}, Gauge(component=dict(zip(names, component, strict=True))), Model()
+        {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
+        Gauge(component=dict(zip(names, component, strict=True))),
+        Model(),
     )
     lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in zip(blocks, lights, strict=True)}
     exposures = {
-        p: (float(np.exp(e)),) * 3 for b, li in zip(blocks, lights, strict=True) for p, e in zip(b.photos, li.log_exposure, strict=True)
+        p: (float(np.exp(e)),) * 3
+        for b, li in zip(blocks, lights, strict=True)
+        for p, e in zip(b.photos, li.log_exposure, strict=True)
     }
     return Earlier(table, lobes, exposures)
 
@@ -63,7 +69,9 @@ def start_from(earlier, blocks, names=NAMES):
 
 def explained(blocks, materials, lights, atol=1e-3):
     for b, light in zip(blocks, lights, strict=True):
-        np.testing.assert_allclose(Illumination(b, light, materials, OPERATOR).radiance(), b.radiance, atol=atol, rtol=atol)
+        np.testing.assert_allclose(
+            Illumination(b, light, materials, OPERATOR).radiance(), b.radiance, atol=atol, rtol=atol
+        )
 
 
 def check_same_but_for_the_gauge(found: Materials, true=MATERIALS):
@@ -75,7 +83,9 @@ def check_same_but_for_the_gauge(found: Materials, true=MATERIALS):
 
 def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
     blocks, lights = truth(0, 1)
-    turned = [msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)]  # same scene, other unit
+    turned = [
+        msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)
+    ]  # same scene, other unit
     materials, found = start_from(written(blocks, MATERIALS, lights), turned)
     check_same_but_for_the_gauge(materials)
     explained(turned, materials, found)
@@ -107,7 +117,9 @@ def test_a_light_nobody_knows_is_constant_and_the_known_ones_stay():
     check_same_but_for_the_gauge(materials)
     explained(blocks[:1], materials, found[:1])
     assert np.ptp(found[1].log_radiance, axis=1).max() < 1e-9 and len(found[1]) == CELLS
-    assert abs(np.log(Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean())) < 0.5  # a block's mean is 1
+    assert (
+        abs(np.log(Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean())) < 0.5
+    )  # a block's mean is 1
 
 
 def test_a_material_nobody_knows_stands_beside_the_known_ones():
@@ -128,7 +140,9 @@ def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
     new, *others = blocks[0].photos
     factor = earlier.exposures[others[0]][0]
     relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
-    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was while `new` was not there
+    lobes = {
+        name: light.scaled(factor) for name, light in earlier.lights.items()
+    }  # as it was while `new` was not there
     earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
     materials, (light,) = start_from(earlier, blocks)
     np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
@@ -153,7 +167,7 @@ def test_groups_that_a_new_photo_links_come_into_one_gauge():
 
 def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     blocks, lights = truth(0, 1)
-    turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight**2), lights[1]]
+    turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight ** 2), lights[1]]
     with caplog.at_level(logging.WARNING):
         materials, found = start_from(written(blocks, MATERIALS, turned), blocks)
     assert "'room0' starts anew" in caplog.text and "room1" not in caplog.text
@@ -190,12 +204,20 @@ def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
 
 @pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])
 def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kept, tried):
-    losses = {"held_out_loss_with": 1.0, "held_out_loss_without": 2.0, "margin": 3.0} if tried else {"held_out_loss_with": 1.0}
-    model = Model(self_shadowing=kept, self_shadowing_chosen_by=losses, interreflection=not kept, interreflection_chosen_by=losses)
+    losses = (
+        {"held_out_loss_with": 1.0, "held_out_loss_without": 2.0, "margin": 3.0}
+        if tried
+        else {"held_out_loss_with": 1.0}
+    )
+    model = Model(
+        self_shadowing=kept, self_shadowing_chosen_by=losses, interreflection=not kept, interreflection_chosen_by=losses
+    )
     earlier = Earlier(MaterialTable({}, Gauge(), model), {}, {})
     found = with_decided(Choices(), earlier)
     names = ["off", "on"]
-    assert [found.self_shadowing, found.interreflection] == ([names[kept], names[not kept]] if tried else ["auto", "auto"])
+    assert [found.self_shadowing, found.interreflection] == (
+        [names[kept], names[not kept]] if tried else ["auto", "auto"]
+    )
     asked = Choices(self_shadowing="off", interreflection="on")
     assert with_decided(asked, earlier) == asked
 
@@ -205,7 +227,9 @@ def test_decided_shadows_are_kept_though_nothing_speaks_for_them():
     rng = np.random.default_rng(0)
     hidden = [
         msgspec.structs.replace(
-            b, visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8), directions=np.stack([fibonacci_sphere(96)])
+            b,
+            visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8),
+            directions=np.stack([fibonacci_sphere(96)]),
         )
         for b in blocks
     ]

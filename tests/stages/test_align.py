@@ -24,7 +24,9 @@ FACTS = {"width": 200, "height": 150, "factor": 1, "original_size": [200, 150]}
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
 
 
-def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, source=None, seed=8, edit=lambda label: label):
+def step(
+    tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, source=None, seed=8, edit=lambda label: label
+):
     """Inputs of one photo of `mesh_in_photo` that is said to show `mesh_given`; and the truth."""
     caster, camera, pose = photo_of(mesh_in_photo, seed, width=200, height=150)
     label = edit(rasterise(caster, camera, pose).label.astype(float))
@@ -39,7 +41,11 @@ def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, s
         obj["pose"] = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
     facts = {
         "dataset.materials": ["white"],
-        "dataset.objects": {"camera": {}, "objects": [obj], "meshes": {"chair": {"file": "chair.ply", "material": "white"}}},
+        "dataset.objects": {
+            "camera": {},
+            "objects": [obj],
+            "meshes": {"chair": {"file": "chair.ply", "material": "white"}},
+        },
     }
     return Inputs({"masks": masks}, facts, {"chair.ply": tmp_path / "chair.ply"}, "a"), caster, camera, pose
 
@@ -69,7 +75,10 @@ def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
 def test_focal_length_of_a_given_pose_is_found(tmp_path):
     inputs, _, camera, _ = step(tmp_path, chair(), chair(), pose_given=True)
     entry = run(tmp_path, inputs)[1]
-    assert entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.01) and entry["camera"]["focal_source"] == "estimated"
+    assert (
+        entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.01)
+        and entry["camera"]["focal_source"] == "estimated"
+    )
 
 
 def test_found_from_nothing_and_the_same_bytes_twice(tmp_path):
@@ -88,7 +97,9 @@ def test_exif_of_a_crop_is_found_out(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         entry = run(tmp_path, inputs)[1]
     assert "EXIF" in caplog.text and "camera.focal_px" in caplog.text
-    assert entry["camera"]["focal_source"] == "estimated" and entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.2)
+    assert entry["camera"]["focal_source"] == "estimated" and entry["camera"]["focal_px"] == pytest.approx(
+        camera.focal, rel=0.2
+    )
 
 
 def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, caplog):
@@ -96,7 +107,12 @@ def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, c
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         out, entry = run(tmp_path, inputs)
     obj = entry["objects"]["chair"]
-    assert obj["doubts"] and obj["left_out"] and "keypoints or pose" in caplog.text and "left out of the solve" in caplog.text
+    assert (
+        obj["doubts"]
+        and obj["left_out"]
+        and "keypoints or pose" in caplog.text
+        and "left out of the solve" in caplog.text
+    )
     maps = read_exr(out / "a.exr")
     assert (maps["label"] > 0).any() and not maps["confidence"].any()
     kept, entry = run(tmp_path, inputs, "kept", keep_doubtful=True)
@@ -123,7 +139,15 @@ def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
     folder = tmp_path / "earlier"
     folder.mkdir()
     obj = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "runner_up": runner_up}
-    write_json(folder / "poses.json", {"a": {"camera": {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}, "objects": {"chair": obj}}})
+    write_json(
+        folder / "poses.json",
+        {
+            "a": {
+                "camera": {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)},
+                "objects": {"chair": obj},
+            }
+        },
+    )
     return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
 
 
@@ -140,9 +164,18 @@ def test_an_earlier_pose_is_judged_like_any_other(tmp_path):
     """A rival that nobody ruled out is still a doubt, and so is a pose that misses the mask."""
     inputs, _, camera, pose = step(tmp_path, chair(), chair())
     turned = rotation_of_vector(np.array([0.0, 2.0, 0.0])) @ pose.rotation
-    rival = {"rotation": turned.tolist(), "translation": pose.translation.tolist(), "score": 1.0, "normal_difference_deg": 60.0}
+    rival = {
+        "rotation": turned.tolist(),
+        "translation": pose.translation.tolist(),
+        "score": 1.0,
+        "normal_difference_deg": 60.0,
+    }
     obj = run(tmp_path, earlier(tmp_path, inputs, pose, camera, rival), "rival")[1]["objects"]["chair"]
-    assert obj["left_out"] and "another pose" in obj["doubts"][0] and np.allclose(obj["runner_up"]["rotation"], turned, atol=1e-9)
+    assert (
+        obj["left_out"]
+        and "another pose" in obj["doubts"][0]
+        and np.allclose(obj["runner_up"]["rotation"], turned, atol=1e-9)
+    )
     wrong = tmp_path / "wrong"
     wrong.mkdir()
     obj = run(wrong, earlier(wrong, inputs, Pose(turned, pose.translation), camera))[1]["objects"]["chair"]
@@ -152,7 +185,9 @@ def test_an_earlier_pose_is_judged_like_any_other(tmp_path):
 def test_a_pose_that_the_dataset_gives_goes_before_an_earlier_one(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
     entry = run(tmp_path, earlier(tmp_path, inputs, Pose(np.eye(3), pose.translation), camera))[1]
-    assert entry["objects"]["chair"]["source"] == "given" and np.allclose(entry["objects"]["chair"]["rotation"], pose.rotation)
+    assert entry["objects"]["chair"]["source"] == "given" and np.allclose(
+        entry["objects"]["chair"]["rotation"], pose.rotation
+    )
 
 
 def in_a_file_twice_as_large(inputs, **camera):
@@ -177,12 +212,16 @@ def test_keypoints_and_principal_point_are_pixels_of_the_file(tmp_path):
     inputs.facts["dataset.objects"]["objects"][0]["keypoints"] = keypoints
     entry = run(tmp_path, in_a_file_twice_as_large(inputs, principal_point=[200.0, 150.0]))[1]
     obj = entry["objects"]["chair"]
-    assert obj["source"] == "keypoints" and obj["doubts"] == [] and np.allclose(obj["rotation"], pose.rotation, atol=0.02)
+    assert (
+        obj["source"] == "keypoints" and obj["doubts"] == [] and np.allclose(obj["rotation"], pose.rotation, atol=0.02)
+    )
     assert entry["camera"]["principal_point"] == [100.0, 75.0]
 
 
 def test_an_earlier_focal_length_of_another_factor_is_scaled(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    with_poses = in_a_file_twice_as_large(earlier(tmp_path, inputs, pose, camera, focal=600.0))  # of the file, before it was averaged
+    with_poses = in_a_file_twice_as_large(
+        earlier(tmp_path, inputs, pose, camera, focal=600.0)
+    )  # of the file, before it was averaged
     entry = run(tmp_path, with_poses)[1]
     assert entry["camera"]["focal_px"] == 300.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.97

@@ -34,8 +34,21 @@ def made(tmp_path, given, source="found"):
         caster, camera, pose = photo_of(chair(), 30 + k)
         label = rasterise(caster, camera, pose).label.astype(float)
         zero = np.zeros(label.shape)
-        write_exr(masks / f"{photo}.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
-        write_json(masks / f"{photo}.json", {"width": camera.width, "height": camera.height, "focal_px": camera.focal, "focal_source": "dataset", "factor": 1, "original_size": [camera.width, camera.height]})
+        write_exr(
+            masks / f"{photo}.exr",
+            {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero},
+        )
+        write_json(
+            masks / f"{photo}.json",
+            {
+                "width": camera.width,
+                "height": camera.height,
+                "focal_px": camera.focal,
+                "focal_source": "dataset",
+                "factor": 1,
+                "original_size": [camera.width, camera.height],
+            },
+        )
         obj = {
             "rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "source": source, "silhouette_iou": 0.9,
             "runner_up": None, "left_out": False,
@@ -44,7 +57,11 @@ def made(tmp_path, given, source="found"):
         poses[photo] = {"camera": facts, "objects": {"chair": obj}}
         truth[photo] = caster, camera, pose
     write_poses(aligned / "poses.json", msgspec.convert(poses, dict[str, PhotoPoses]))
-    slice_ = {"camera": {}, "objects": [{"name": "chair", "mesh": "chair"}], "meshes": {"chair": {"file": "chair.ply", "material": "white"}}}
+    slice_ = {
+        "camera": {},
+        "objects": [{"name": "chair", "mesh": "chair"}],
+        "meshes": {"chair": {"file": "chair.ply", "material": "white"}},
+    }
     facts = {"dataset.materials": ["white"], "dataset.objects": {photo: slice_ for photo in PHOTOS}}
     return Inputs({"masks": masks, "align": aligned}, facts, {"chair.ply": tmp_path / "chair.ply"}), truth
 
@@ -66,7 +83,11 @@ def fitted(tmp_path_factory):
 def test_the_factors_undo_what_the_mesh_has_wrong(fitted):
     _, _, _, mesh, poses = fitted
     wanted = 1 / np.array(OFF)
-    assert mesh["used"] and np.allclose(mesh["factors"], wanted / wanted.prod() ** (1 / 3), rtol=0.03) and len(mesh["sightings"]) == 3
+    assert (
+        mesh["used"]
+        and np.allclose(mesh["factors"], wanted / wanted.prod() ** (1 / 3), rtol=0.03)
+        and len(mesh["sightings"]) == 3
+    )
     assert mesh["held_out_unexplained"]["fitted"] < 0.5 * mesh["held_out_unexplained"]["as_it_is"]
     assert all(poses[photo]["objects"]["chair"]["scale"] == mesh["factors"] for photo in PHOTOS)
     assert all(poses[photo]["objects"]["chair"]["silhouette_iou"] > 0.97 for photo in PHOTOS)
@@ -98,7 +119,9 @@ def test_urm_and_export_place_the_fitted_mesh_alike(fitted, tmp_path):
     pose = poses["a"]["objects"]["chair"]
     given = scaled(chair(), OFF)
     there = (given.vertices * mesh["factors"]) @ np.array(pose["rotation"]).T + pose["translation"]
-    one = Inputs(inputs.folders, {**inputs.facts, "dataset.objects": inputs.facts["dataset.objects"]["a"]}, inputs.files, "a")
+    one = Inputs(
+        inputs.folders, {**inputs.facts, "dataset.objects": inputs.facts["dataset.objects"]["a"]}, inputs.files, "a"
+    )
     objects = msgspec.convert(poses["a"], PhotoPoses).objects
     occluders = urm.occluders_of(one, objects)
     assert np.allclose(occluders.centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)

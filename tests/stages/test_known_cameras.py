@@ -23,7 +23,11 @@ from tests.align.scenes import blob, chair, normal_error_deg
 
 CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))
 POSE = Pose(rotation_of_vector(np.array([0.7, -1.1, 0.4])), np.array([0.1, 0.2, 5.0]))
-WORLD = {"scale": 2.0, "rotation": rotation_of_vector(np.array([-0.3, 0.2, 1.5])).tolist(), "translation": [1.0, -2.0, 0.5]}
+WORLD = {
+    "scale": 2.0,
+    "rotation": rotation_of_vector(np.array([-0.3, 0.2, 1.5])).tolist(),
+    "translation": [1.0, -2.0, 0.5],
+}
 CASTER = Caster(chair())
 
 
@@ -37,7 +41,9 @@ def scene(folder, source, *, pose=POSE, scale=1, photo=None, mesh=None, posed=Tr
     write_labels(folder / "masks/000003.png", label)
     write_ply(folder / "chair.ply", mesh or chair())
     obj = {"name": "chair", "mesh": "chair"}
-    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [obj]} | (photo or {})
+    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png", "objects": [obj]} | (
+        photo or {}
+    )
     meshes = {"chair": {"file": "chair.ply", "material": "white"}}
     cameras = SOURCES[source](folder, pose) if posed else {source: SOURCES[source](folder, pose)[source]}
     spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
@@ -56,7 +62,9 @@ def colmap(folder, pose):
     rotation, translation = cam_from_world(pose)
     model = pycolmap.Reconstruction()
     parameters = [CAMERA.focal, *CAMERA.centre]
-    model.add_camera_with_trivial_rig(pycolmap.Camera(model="SIMPLE_PINHOLE", width=200, height=150, params=parameters, camera_id=1))
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="SIMPLE_PINHOLE", width=200, height=150, params=parameters, camera_id=1)
+    )
     image = pycolmap.Image(name="000003.png", camera_id=1, image_id=1)
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
     (folder / "sparse").mkdir()
@@ -69,7 +77,14 @@ def transforms(folder, pose):
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3], world_from_camera[:3, 3] = rotation.T @ np.diag([1, -1, -1]), -rotation.T @ translation
     frame = {"file_path": "./images/000003.png", "transform_matrix": world_from_camera.tolist()}
-    lens = {"fl_x": CAMERA.focal, "fl_y": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
+    lens = {
+        "fl_x": CAMERA.focal,
+        "fl_y": CAMERA.focal,
+        "cx": CAMERA.centre[0],
+        "cy": CAMERA.centre[1],
+        "w": 200,
+        "h": 150,
+    }
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
     return {"transforms": "transforms.json", "world_from_object": {"chair": WORLD}}
 
@@ -105,7 +120,9 @@ def test_the_poses_of_the_scene_come_out(tmp_path, source):
     camera, obj = entry["camera"], entry["objects"]["chair"]
     assert (camera["focal_source"], obj["source"]) == (source, source) and obj["doubts"] == []
     assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
-    assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and np.allclose(obj["translation"], POSE.translation, atol=1e-12)
+    assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and np.allclose(
+        obj["translation"], POSE.translation, atol=1e-12
+    )
     assert obj["silhouette_iou"] > 0.995
 
 
@@ -119,7 +136,9 @@ def test_a_photo_of_twice_the_size_is_the_same_scene(tmp_path, source):
 @pytest.mark.parametrize("source", SOURCES)
 def test_a_known_camera_follows_a_photo_that_is_averaged_down(tmp_path, source):
     entry = aligned(scene(tmp_path / "set", source), averaged=masks.Params(frame=200 * 150 // 4))
-    assert entry["camera"]["focal_px"] == 150.0 and np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
+    assert entry["camera"]["focal_px"] == 150.0 and np.allclose(
+        entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12
+    )
     assert entry["objects"]["chair"]["silhouette_iou"] > 0.98
 
 
@@ -134,7 +153,11 @@ def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
 
 def test_what_dataset_yaml_says_of_the_camera_wins(tmp_path):
     camera = aligned(scene(tmp_path / "set", "colmap", photo={"camera": {"focal_px": 310.0}}))["camera"]
-    assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (310.0, "dataset", list(CAMERA.centre))
+    assert (camera["focal_px"], camera["focal_source"], camera["principal_point"]) == (
+        310.0,
+        "dataset",
+        list(CAMERA.centre),
+    )
 
 
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):

@@ -37,7 +37,14 @@ def folder(tmp_path):
 
 def run(folder, progress=lambda *_: None, params=masks.Params(), **facts):
     """The channels and the summary the stage writes for a photo `kitchen` with the given facts."""
-    given = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen", "objects": []}
+    given = {
+        "image": "photo.exr",
+        "encoding": None,
+        "masks": "mask.png",
+        "focal_px": None,
+        "illumination": "kitchen",
+        "objects": [],
+    }
     photo = PhotoSlice(**given | facts)
     inputs = Inputs(
         folders={},
@@ -118,12 +125,16 @@ def test_own_masks_number_the_objects(folder):
     np.testing.assert_array_equal(channels["object"], 2 * (LABEL == 2))
 
 
-@pytest.mark.parametrize("given, source, expected", [(812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))])
+@pytest.mark.parametrize(
+    "given, source, expected", [(812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))]
+)
 def test_focal_of_the_dataset_goes_before_exif(folder, given, source, expected):
     spec = oiio.ImageSpec(W, H, 3, oiio.UINT8)
     spec.attribute("Exif:FocalLengthIn35mmFilm", 50)
     output = oiio.ImageOutput.create("photo.jpg")
-    assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(np.full((H, W, 3), 90, dtype=np.uint8))
+    assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(
+        np.full((H, W, 3), 90, dtype=np.uint8)
+    )
     output.close()
     _, summary = run(folder, image="photo.jpg", focal_px=given)
     assert summary["focal_source"] == source and summary["focal_px"] == pytest.approx(expected)
@@ -171,12 +182,22 @@ def test_a_photo_of_many_pixels_is_averaged_down_and_says_so(folder):
     np.testing.assert_array_equal(channels["left_out"], label == 255)
     np.testing.assert_array_equal(channels["object"], 2 * box_majority((LABEL == 2).astype("u1"), 2))
     np.testing.assert_array_equal(channels["valid"], channels["label"] > 0)
-    assert (summary["factor"], summary["original_size"]) == (2, [W, H]) and (summary["width"], summary["height"]) == (W // 2, H // 2)
+    assert (summary["factor"], summary["original_size"]) == (2, [W, H]) and (summary["width"], summary["height"]) == (
+        W // 2,
+        H // 2,
+    )
     assert summary["pixels"] == {"red": int((label == 1).sum()), "wood": int((label == 2).sum())}
 
 
 @pytest.mark.parametrize(
-    "params, factor", [({"pixels": 152}, 1), ({"pixels": 151}, 2), ({"frame": H * W}, 1), ({"frame": 100}, 2), ({"frame": 100, "pixels": 100}, 2)]
+    "params, factor",
+    [
+        ({"pixels": 152}, 1),
+        ({"pixels": 151}, 2),
+        ({"frame": H * W}, 1),
+        ({"frame": 100}, 2),
+        ({"frame": 100, "pixels": 100}, 2),
+    ],
 )
 def test_the_factor_is_the_least_that_fits_both_bounds(folder, params, factor):
     assert run(folder, params=masks.Params(**params))[1]["factor"] == factor
@@ -197,7 +218,9 @@ def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
     codes[3, 3, 1] = 255
     Image.fromarray(codes).save(folder / "in" / "photo.png")
     channels, summary = run(folder, image="photo.png", params=SMALLER)
-    assert np.argwhere(channels["clipped.G"]).tolist() == [[1, 1]] and summary["clipped_fraction"] == pytest.approx(1 / sum(summary["pixels"].values()))
+    assert np.argwhere(channels["clipped.G"]).tolist() == [[1, 1]] and summary["clipped_fraction"] == pytest.approx(
+        1 / sum(summary["pixels"].values())
+    )
 
 
 def test_a_mask_of_specks_that_averaging_loses_is_refused(folder):

@@ -25,7 +25,9 @@ def made(tmp_path_factory):
 
 def drawn(made, out, recipe, **files):
     facts = {**made.facts, "recipe": msgspec.to_builtins(recipe)}
-    inputs = Inputs(made.folders, facts, {**made.files, **{f"recipe file:{name}": path for name, path in files.items()}})
+    inputs = Inputs(
+        made.folders, facts, {**made.files, **{f"recipe file:{name}": path for name, path in files.items()}}
+    )
     out.mkdir()
     recipes.main(recipes.Params(), inputs, out, silent)
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
@@ -34,12 +36,21 @@ def drawn(made, out, recipe, **files):
 KINDS = [
     (schema.Resynthesis(samples=2), ["front.exr", "front.png", "side.exr", "side.png"]),
     (schema.View(photos=["side"], samples=2, width=32, background="light"), ["side.exr", "side.png"]),
-    (schema.Turntable(photos=["front"], samples=1, frames=3), ["front.gif", "front/000.png", "front/001.png", "front/002.png"]),
-    (schema.MovingLight(photos=["front"], samples=1, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
+    (
+        schema.Turntable(photos=["front"], samples=1, frames=3),
+        ["front.gif", "front/000.png", "front/001.png", "front/002.png"],
+    ),
+    (
+        schema.MovingLight(photos=["front"], samples=1, frames=2, width=16),
+        ["front.gif", "front/000.png", "front/001.png"],
+    ),
     (schema.Relight(samples=1, rotate=30.0), ["front/side.exr", "front/side.png", "side/front.exr", "side/front.png"]),
     (schema.Transfer(materials={"red": "unseen"}, photos=["front"], samples=2), ["front.exr", "front.png"]),
     (schema.Insert(photos=["front"], samples=2), ["front.exr", "front.png"]),
-    (schema.Insert(photos=["front"], samples=2, mesh="egg", material="brass", at=(40.0, 50.0)), ["front.exr", "front.png"]),
+    (
+        schema.Insert(photos=["front"], samples=2, mesh="egg", material="brass", at=(40.0, 50.0)),
+        ["front.exr", "front.png"],
+    ),
     (schema.Grid(samples=2, size=16), ["grid.exr", "grid.png", "grid.txt"]),
 ]
 
@@ -62,7 +73,9 @@ def test_the_photo_stays_where_no_object_is(made, tmp_path):
 
 
 def test_a_material_of_ones_own_is_what_is_seen(made, tmp_path):
-    write_materials(tmp_path / "own.json", MaterialTable({"black": solved(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0), ERROR)}))
+    write_materials(
+        tmp_path / "own.json", MaterialTable({"black": solved(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0), ERROR)})
+    )
     recipe = schema.Transfer(photos=["front"], materials={"red": "black"}, table="own.json", samples=4)
     drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
     inside = read_exr(made["align"] / "front.exr")["confidence"] > 0
@@ -71,7 +84,9 @@ def test_a_material_of_ones_own_is_what_is_seen(made, tmp_path):
 
 
 def test_a_material_that_reflects_more_than_arrives_is_refused(made, tmp_path):
-    write_json(tmp_path / "own.json", MaterialTable({"too much": solved(Reflectance((0.9,) * 3, (0.3,) * 3, 0.5), ERROR)}))
+    write_json(
+        tmp_path / "own.json", MaterialTable({"too much": solved(Reflectance((0.9,) * 3, (0.3,) * 3, 0.5), ERROR)})
+    )
     recipe = schema.Transfer(photos=["front"], materials={"red": "too much"}, table="own.json")
     with pytest.raises(InputError, match="more light is reflected than arrives"):
         drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
@@ -116,7 +131,10 @@ def test_a_photo_that_cannot_be_drawn_is_left_out_with_a_warning_where_nobody_na
 
 
 def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
-    grounds = {**made.facts["dataset.ground"], "front": {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}}  # y is down
+    grounds = {
+        **made.facts["dataset.ground"],
+        "front": {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}},
+    }  # y is down
     below = Inputs(made.folders, {**made.facts, "dataset.ground": grounds}, made.files)
     with pytest.raises(InputError, match="'front' was taken from below"):
         drawn(below, tmp_path / "out", schema.Insert(photos=["front"], samples=1))

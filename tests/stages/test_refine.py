@@ -40,10 +40,28 @@ def inputs_of(tmp_path, photo, **entry):
         folder.mkdir()
     zero = np.zeros(photo.channels["label"].shape)
     write_exr(masks / "a.exr", {**photo.channels, "left_out": zero, "object": zero})
-    facts = {"width": zero.shape[1], "height": zero.shape[0], "factor": 1, "original_size": list(zero.shape[::-1]), "focal_px": photo.camera.focal, "focal_source": "dataset"}
+    facts = {
+        "width": zero.shape[1],
+        "height": zero.shape[0],
+        "factor": 1,
+        "original_size": list(zero.shape[::-1]),
+        "focal_px": photo.camera.focal,
+        "focal_source": "dataset",
+    }
     write_json(masks / "a.json", facts)
-    camera = {"focal_px": photo.camera.focal, "focal_source": "dataset", "focal_relative_stderr": 0.0, "principal_point": list(photo.camera.centre)}
-    obj = {**pose_entry(photo.pose), "source": "found", "runner_up": None, "left_out": False, "silhouette_iou": 0.0} | entry
+    camera = {
+        "focal_px": photo.camera.focal,
+        "focal_source": "dataset",
+        "focal_relative_stderr": 0.0,
+        "principal_point": list(photo.camera.centre),
+    }
+    obj = {
+        **pose_entry(photo.pose),
+        "source": "found",
+        "runner_up": None,
+        "left_out": False,
+        "silhouette_iou": 0.0,
+    } | entry
     write_json(aligned / "a.json", {"camera": camera, "objects": {"chair": obj}})
     write_materials(solved, [0.1] * 3)
     write_ply(tmp_path / "chair.ply", photo.given.mesh)
@@ -76,7 +94,9 @@ def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
     inputs = inputs_of(tmp_path, turned)
     entry = run(refine, inputs, tmp_path / "refined")
     obj = entry["objects"]["chair"]
-    assert np.allclose(obj["rotation"], turned.truth.rotation, atol=0.02) and not np.allclose(turned.pose.rotation, turned.truth.rotation, atol=0.02)
+    assert np.allclose(obj["rotation"], turned.truth.rotation, atol=0.02) and not np.allclose(
+        turned.pose.rotation, turned.truth.rotation, atol=0.02
+    )
     choice = obj["refined"]
     assert choice["chosen"] == "moved" and choice["moved"]["rotation_deg"] > 2 and obj["silhouette_iou"] > 0.98
     assert choice["candidates"]["moved"]["held_out_loss"] < choice["candidates"]["found"]["held_out_loss"]
@@ -84,7 +104,9 @@ def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned):
     write_json(tmp_path / "refined" / "poses.json", {"a": entry})
     again = msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": tmp_path / "refined"})
     obj_again = run(align, again, tmp_path / "aligned")["objects"]["chair"]
-    assert all(obj_again[name] == obj[name] for name in ("rotation", "translation")) and obj_again["source"] == "refined"
+    assert (
+        all(obj_again[name] == obj[name] for name in ("rotation", "translation")) and obj_again["source"] == "refined"
+    )
     assert not obj_again["left_out"]
 
 
@@ -97,7 +119,9 @@ def test_a_photo_with_a_tone_curve_is_straightened_first(tmp_path, turned):
     table = inputs["solve"] / "materials.json"
     write_json(table, read_json(table) | {"model": {"tone": {"a": tone}}})
     again = run(refine, inputs, tmp_path / "again")
-    found, expected = (entry["objects"]["chair"]["refined"]["candidates"]["found"]["held_out_loss"] for entry in (again, straight))
+    found, expected = (
+        entry["objects"]["chair"]["refined"]["candidates"]["found"]["held_out_loss"] for entry in (again, straight)
+    )
     assert found == pytest.approx(expected, rel=1e-2)
 
 
@@ -120,12 +144,22 @@ def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, capl
     [
         ("[]", "Expected `object`"),
         ('{"a": {"camera": {"focal_px": -1, "principal_point": [0, 0]}, "objects": {}}}', "focal_px"),
-        ('{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}}}}', "a.objects.t"),
-        ('{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"translation": [0,0,1]}}}}', "rotation"),
+        (
+            '{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}}}}',
+            "a.objects.t",
+        ),
+        (
+            '{"a": {"camera": {"focal_px": 1, "principal_point": [0, 0]}, "objects": {"t": {"translation": [0,0,1]}}}}',
+            "rotation",
+        ),
     ],
 )
 def test_a_folder_without_poses_is_refused(tmp_path, text, words):
     (tmp_path / "poses.json").write_text(text)
     with pytest.raises(InputError) as caught:
         read_poses(tmp_path / "poses.json")
-    assert words in str(caught.value) and "poses.json" in str(caught.value) and "result of `align`, `fit_mesh` or `refine`" in str(caught.value)
+    assert (
+        words in str(caught.value)
+        and "poses.json" in str(caught.value)
+        and "result of `align`, `fit_mesh` or `refine`" in str(caught.value)
+    )

@@ -36,7 +36,9 @@ def observations(photo: str, shown, seed: int, size: int = 20, unit: float = 1.0
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
     radiance = Illumination(block, light, MATERIALS, reflection_operator("network")).radiance()
-    return Observations(**{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance)
+    return Observations(
+        **{f: getattr(empty, f) for f in empty.__struct_fields__ if f != "radiance"}, radiance=unit * radiance
+    )
 
 
 def run(folder, seen: dict[str, Observations], progress=silent, unfinished=None, start=None, light=None, **params):
@@ -86,14 +88,22 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
 def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, linked):
     def hidden(part, kind):
         random = np.random.default_rng(0).integers(0, 2, (len(part), 128))
-        return msgspec.structs.replace(part, visibility=np.full_like(random, 255) if kind == "nothing" else 255 * random)
+        return msgspec.structs.replace(
+            part, visibility=np.full_like(random, 255) if kind == "nothing" else 255 * random
+        )
 
     few = {"cells": 24, "observations": 150, "tone": "off"}
-    same = [run(tmp_path / "plain", linked, **few), run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()}, **few)]
+    same = [
+        run(tmp_path / "plain", linked, **few),
+        run(tmp_path / "open", {k: hidden(v, "nothing") for k, v in linked.items()}, **few),
+    ]
     for file in sorted(p.relative_to(same[0]) for p in same[0].rglob("*") if p.is_file()):
         assert (same[0] / file).read_bytes() == (same[1] / file).read_bytes(), file
     wrong = {k: hidden(v, "random") for k, v in linked.items()}  # radiance was made without
-    models = {c: read_json(run(tmp_path / c, wrong, self_shadowing=c, **few) / "materials.json")["model"] for c in ("auto", "on", "off")}
+    models = {
+        c: read_json(run(tmp_path / c, wrong, self_shadowing=c, **few) / "materials.json")["model"]
+        for c in ("auto", "on", "off")
+    }
     assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
     evidence = models["auto"]["self_shadowing_chosen_by"]
     assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"] and evidence["margin"] < -2
@@ -110,7 +120,10 @@ def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_s
 
     seen = {k: lit(v) for k, v in linked.items()}
     few = {"cells": 24, "observations": 150, "tone": "off", "self_shadowing": "on"}
-    tables = {c: read_json(run(tmp_path / c, seen, interreflection=c, **few) / "materials.json") for c in ("auto", "on", "off")}
+    tables = {
+        c: read_json(run(tmp_path / c, seen, interreflection=c, **few) / "materials.json")
+        for c in ("auto", "on", "off")
+    }
     models = {c: table["model"] for c, table in tables.items()}
     assert models["on"]["interreflection"] and not models["off"]["interreflection"]
     evidence = models["auto"]["interreflection_chosen_by"]
@@ -165,7 +178,9 @@ def test_the_papers_solver_writes_the_same_artifacts(tmp_path, linked):
     assert found["model"]["solver"] == "paper"
     assert found["model"]["lobes"] == {"a": 3, "b": 3}
     assert set(found["materials"]) == set(NAMES)
-    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
+    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {
+        p.name for p in out.iterdir()
+    }
 
 
 def test_the_solver_of_few_lobes_writes_the_same_artifacts(tmp_path, linked):
@@ -174,7 +189,9 @@ def test_the_solver_of_few_lobes_writes_the_same_artifacts(tmp_path, linked):
     found = read_json(out / "materials.json")
     assert found["model"]["solver"] == "few_lobes" and not found["model"]["light_prior"]
     assert max(found["model"]["lobes"].values()) <= 6 and set(found["materials"]) == set(NAMES)
-    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {p.name for p in out.iterdir()}
+    assert {"lobes.parquet", "exposures.json", "convergence.parquet", "uncertainty.json"} <= {
+        p.name for p in out.iterdir()
+    }
 
 
 class Killed(Exception):
@@ -246,7 +263,9 @@ def a_result(tmp_path_factory, linked):
 def of_one_room(exposures: dict[str, float], said: dict[str, float | None]) -> dict[str, Observations]:
     """Photos of three spheres in one light, `exposures` times as bright, whose EXIF says `said`."""
     return {
-        name: msgspec.structs.replace(observations(name, [0, 1, 2], 1, 8, unit), illuminations=("room",), exposures=(said[name],))
+        name: msgspec.structs.replace(
+            observations(name, [0, 1, 2], 1, 8, unit), illuminations=("room",), exposures=(said[name],)
+        )
         for name, unit in exposures.items()
     }
 

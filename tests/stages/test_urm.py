@@ -30,9 +30,17 @@ def step(folder, poses: dict[str, Pose]):
     }
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
     clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
-    write_exr(folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside})
-    write_json(folder / "masks" / "a.json", {"width": CAMERA.width, "height": CAMERA.height, "factor": 1, "original_size": [CAMERA.width, CAMERA.height]})
-    placed = {name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()} for name, pose in poses.items()}
+    write_exr(
+        folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside}
+    )
+    write_json(
+        folder / "masks" / "a.json",
+        {"width": CAMERA.width, "height": CAMERA.height, "factor": 1, "original_size": [CAMERA.width, CAMERA.height]},
+    )
+    placed = {
+        name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+        for name, pose in poses.items()
+    }
     camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
     write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})
     write_ply(folder / "ball.ply", mesh)
@@ -45,7 +53,9 @@ def step(folder, poses: dict[str, Pose]):
             "meshes": {"ball": {"file": "ball.ply", "material": "white"}},
         },
     }
-    return Inputs({stage: folder / stage for stage in ("masks", "align")}, facts, {"ball.ply": folder / "ball.ply"}, "a")
+    return Inputs(
+        {stage: folder / stage for stage in ("masks", "align")}, facts, {"ball.ply": folder / "ball.ply"}, "a"
+    )
 
 
 def run(folder, inputs, **params):
@@ -76,7 +86,10 @@ def test_two_balls_hide_each_other_where_they_face(tmp_path, two):
 
 
 def test_the_same_bytes_again(tmp_path, two):
-    assert run(tmp_path / "1", two, merge_degrees=3.0).read_bytes() == run(tmp_path / "2", two, merge_degrees=3.0).read_bytes()
+    assert (
+        run(tmp_path / "1", two, merge_degrees=3.0).read_bytes()
+        == run(tmp_path / "2", two, merge_degrees=3.0).read_bytes()
+    )
 
 
 def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_path, two, monkeypatch):

@@ -14,7 +14,10 @@ def light(seed: int, rows: int = 32) -> np.ndarray:
     rng = np.random.default_rng(seed)
     directions, found = lat_long_directions(rows, 2 * rows), np.full((rows, 2 * rows, 3), 0.4)
     for axis in rng.normal(size=(4, 3)):
-        found += rng.uniform(0.5, 4, 3) * np.exp(rng.uniform(5, 60) * (directions @ (axis / np.linalg.norm(axis)) - 1))[..., None]
+        found += (
+            rng.uniform(0.5, 4, 3)
+            * np.exp(rng.uniform(5, 60) * (directions @ (axis / np.linalg.norm(axis)) - 1))[..., None]
+        )
     return found
 
 

@@ -10,7 +10,15 @@ from factorlib.results.materials import Reflectance
 from studies.core.baselines.body import level, mesh, pose, seen, turn
 from studies.core.baselines.gauge import in_gauge, lambertian_part
 from studies.core.baselines.grey import grey
-from studies.core.baselines.intrinsic import LAMBERT, averaged, decomposed, harmonics, intrinsic, light_coefficients, light_map
+from studies.core.baselines.intrinsic import (
+    LAMBERT,
+    averaged,
+    decomposed,
+    harmonics,
+    intrinsic,
+    light_coefficients,
+    light_map,
+)
 from studies.core.baselines.photos import Photos, observations_of, read_photos
 from studies.core.baselines.prediction import Rendered
 from studies.core.baselines.projective import Texture, projective
@@ -39,7 +47,10 @@ def test_a_camera_sees_the_front_of_the_body(view):
 
 def test_normals_are_those_of_the_surface():
     found, step = seen(1, 16), 1e-6
-    slope = np.stack([(level((found.points + step * e) @ pose(1)) - level((found.points - step * e) @ pose(1))) for e in np.eye(3)], axis=-1)
+    slope = np.stack(
+        [(level((found.points + step * e) @ pose(1)) - level((found.points - step * e) @ pose(1))) for e in np.eye(3)],
+        axis=-1,
+    )
     assert found.normals == pytest.approx(slope / np.linalg.norm(slope, axis=1, keepdims=True), abs=1e-4)
 
 
@@ -53,7 +64,12 @@ def test_the_mesh_is_the_body():
 
 def test_the_body_and_its_light_stay_where_they_are_when_the_camera_moves():
     """Lambert looks alike from everywhere: a point has one radiance in all views that see it."""
-    here, there, material, of = seen(0, 48), seen(0, 48, VIEW), Reflectance((0.5, 0.4, 0.3), (0.0, 0.0, 0.0), 1.0), light(1, 64)
+    here, there, material, of = (
+        seen(0, 48),
+        seen(0, 48, VIEW),
+        Reflectance((0.5, 0.4, 0.3), (0.0, 0.0, 0.0), 1.0),
+        light(1, 64),
+    )
     texture = Texture(here)
     both = texture.seen(there)
     carried, exact = texture.at(there, Scene(of, here).of(material))[both], Scene(of, there).of(material)[both]
@@ -136,7 +152,10 @@ def test_albedos_are_averaged_over_photos_that_each_know_them_but_for_a_factor()
     shows = {0: ("a", "b"), 1: ("b", "c"), 2: ("a", "b", "c")}
     scale = {li: RNG.uniform(0.5, 2, 3) for li in shows}
     normals = seen(0, 12).normals
-    parts = {li: decomposed(normals, {n: scale[li] * albedo[n] * np.ones((len(normals), 3)) for n in names}) for li, names in shows.items()}
+    parts = {
+        li: decomposed(normals, {n: scale[li] * albedo[n] * np.ones((len(normals), 3)) for n in names})
+        for li, names in shows.items()
+    }
     found, _ = averaged(parts)
     factor = albedo["a"] / found["a"]
     assert all(found[n] * factor == pytest.approx(albedo[n], rel=1e-6) for n in albedo)
@@ -175,7 +194,9 @@ def test_a_grey_ball_shows_a_photos_mean_colour_from_everywhere():
 def test_the_gauge_is_taken_out_and_nothing_else():
     truths, of = materials_of(0), lights(0)
     factor = np.array([0.5, 2.0, 1.5])
-    materials, found = in_gauge({n: times(m, factor) for n, m in truths.items()}, {li: v / factor for li, v in of.items()}, truths)
+    materials, found = in_gauge(
+        {n: times(m, factor) for n, m in truths.items()}, {li: v / factor for li, v in of.items()}, truths
+    )
     assert factor_of(materials, truths) == pytest.approx(np.ones(3)) and np.allclose(found[0], of[0])
 
 
@@ -194,16 +215,25 @@ def test_the_truth_in_any_gauge_scores_nothing_and_a_grey_ball_does():
         return Rendered(*in_gauge(materials, {li: world.lights[li] / factor for li in (0, 1)}, world.materials))
 
     score, found = scores(true)
-    assert {shot.asked.kind for shot in found} == set(KINDS) and len({shot.asked.name for shot in found}) == len(found) == 8 + 2 + 6
+    assert {shot.asked.kind for shot in found} == set(KINDS) and len({shot.asked.name for shot in found}) == len(
+        found
+    ) == 8 + 2 + 6
     measures = [kind + suffix for kind in KINDS for suffix in SUFFIXES.values()]
-    assert max(score.values[m] for m in measures) < 1e-6 and score.values["mirror"] < 1e-6 and score.values["roughness"] == 0
+    assert (
+        max(score.values[m] for m in measures) < 1e-6
+        and score.values["mirror"] < 1e-6
+        and score.values["roughness"] == 0
+    )
     worse, _ = scores(lambda world: grey(photos(case("grey", side=2, size=12)), world.materials))
     assert min(worse.values[m] for m in measures) > 0.02 and "roughness" not in worse.values
 
 
 def test_what_a_method_does_not_state_has_no_score():
     score, found = scores(lambda world: projective(photos(case("projective", side=2, size=12))))
-    assert not {"diffuse", "mirror", "novel_material"} & score.values.keys() and {"novel_view", "novel_light"} <= score.values.keys()
+    assert (
+        not {"diffuse", "mirror", "novel_material"} & score.values.keys()
+        and {"novel_view", "novel_light"} <= score.values.keys()
+    )
     assert all(shot.asked.kind != "novel_material" for shot in found)
 
 

@@ -61,32 +61,53 @@ def test_from_worlds_to_pictures(tmp_path, monkeypatch):
     monkeypatch.setitem(comparison.SIZES, "quick", 12)
     data = data_of(tmp_path / NAME, msgspec.structs.replace(TINY, largest=2, side=1))
     (tmp_path / "worlds").mkdir()
-    worlds.main(worlds.Params(), Inputs({}, {"dataset.worlds": data.slice("worlds", None).facts}), tmp_path / "worlds", silent)
+    worlds.main(
+        worlds.Params(), Inputs({}, {"dataset.worlds": data.slice("worlds", None).facts}), tmp_path / "worlds", silent
+    )
     for name in data.photos:
         stepped(tmp_path, name, data)
     gathered = {name: json.loads((tmp_path / "score" / f"{name}.json").read_text()) for name in data.photos}
     (tmp_path / "score/scores.json").write_text(json.dumps(gathered))
     (out := tmp_path / "conclude").mkdir()
-    conclude.main(conclude.Params(), Inputs({"score": tmp_path / "score"}, {"dataset.study": data.slice("study", None).facts}), out, silent)
+    conclude.main(
+        conclude.Params(),
+        Inputs({"score": tmp_path / "score"}, {"dataset.study": data.slice("study", None).facts}),
+        out,
+        silent,
+    )
     found = json.loads((out / "table.json").read_text())
     cells = {row["name"]: {m: c["spread"]["mean"] for m, c in row["cells"].items()} for row in found["rows"]}
     assert list(cells) == ["ours", "mitsuba", "intrinsic", "projective", "grey"] and found["label"]
     assert all({"novel_view", "novel_light", "processor"} <= of.keys() for of in cells.values())
     assert cells["ours"]["novel_view"] < cells["grey"]["novel_view"] and "novel_material" not in cells["projective"]
-    assert {p.name for p in (out / "pictures").iterdir()} == {f"{kind}.png" for kind in ("novel_view", "novel_light", "novel_material")}
+    assert {p.name for p in (out / "pictures").iterdir()} == {
+        f"{kind}.png" for kind in ("novel_view", "novel_light", "novel_material")
+    }
 
 
 def test_a_change_of_a_baseline_or_of_the_scores_solves_nothing_again(tmp_path):
     records = survey(studies(TINY, tmp_path, "baselines"), NAME, None, []).records
-    keys = {stage: next(record for step, record in records.items() if step.stage == stage) for stage in ("solve", "optimise")}
+    keys = {
+        stage: next(record for step, record in records.items() if step.stage == stage)
+        for stage in ("solve", "optimise")
+    }
     for name in ("score", "projective", "intrinsic", "grey", "show"):
         assert not any(f"source:studies.core.baselines.{name}" in record for record in keys.values())
-    assert "source:studies.core.baselines.joint" in keys["optimise"] and "source:studies.core.baselines.joint" not in keys["solve"]
+    assert (
+        "source:studies.core.baselines.joint" in keys["optimise"]
+        and "source:studies.core.baselines.joint" not in keys["solve"]
+    )
     assert "source:stages.solve" in keys["solve"] and "source:stages.solve" not in keys["optimise"]
 
 
 def test_the_rate_is_not_chosen_on_a_seed_that_is_reported():
-    done = subprocess.run([sys.executable, "-m", "studies.joint_rate", "--seed", "0"], cwd=LIBRARY, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "studies.joint_rate", "--seed", "0"],
+        cwd=LIBRARY,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 1 and "seed 0 is reported" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -124,7 +145,14 @@ def errors_of_renderings(folder):
 @pytest.mark.long
 def test_mitsubas_scene_is_the_one_that_was_photographed(llvm, tmp_path):
     """In a process of its own, for its variant is; coarse texels and samples leave a few per cent."""
-    done = subprocess.run([sys.executable, "-c", RENDERS, str(tmp_path)], cwd=LIBRARY, capture_output=True, text=True, check=False, env=environment())
+    done = subprocess.run(
+        [sys.executable, "-c", RENDERS, str(tmp_path)],
+        cwd=LIBRARY,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment(),
+    )
     assert done.returncode == 0, done.stderr
     right, map_, mirrored, map_too = map(float, done.stdout.split())
     assert right < 0.06 and map_ < 0.06 and map_too < 0.06 and mirrored > 2 * right
@@ -140,7 +168,9 @@ def environment():
 def test_the_optimisation_goes_down_the_same_way_in_every_run(llvm):
     of = case("mitsuba", side=1, size=24)
     first, again = (optimised(0, photos(of), Joint(12, 12)) for _ in range(2))
-    assert first.losses == again.losses and first.materials == again.materials and first.losses[-1] < 0.9 * first.losses[0]
+    assert (
+        first.losses == again.losses and first.materials == again.materials and first.losses[-1] < 0.9 * first.losses[0]
+    )
     assert not first.flat and len(first.losses) == 12 and first.processor > 0 and np.array(first.lights[0]).min() >= 0
 
 
@@ -149,4 +179,8 @@ def test_quick_and_full_ask_for_different_sizes():
     from studies.core.study import FULL
 
     quick, full = (next(iter(STUDY.cases(scale).values())) for scale in (QUICK, FULL))
-    assert quick.size < full.size and quick.joint.steps < full.joint.steps and full.size % full.joint.pixels == quick.size % quick.joint.pixels == 0
+    assert (
+        quick.size < full.size
+        and quick.joint.steps < full.joint.steps
+        and full.size % full.joint.pixels == quick.size % quick.joint.pixels == 0
+    )

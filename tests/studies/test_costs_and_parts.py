@@ -39,7 +39,9 @@ OWN = ("prior", "network-evaluation", "cost", "speed", "parts", "hard-cases")
 def test_settings_have_names_of_their_own_and_claims_compare_them(name, scale):
     study = STUDIES[name]
     names = [setting.name for setting in study.settings(scale)]
-    assert len(set(names)) == len(names) and not any(set(n) - set("abcdefghijklmnopqrstuvwxyz0123456789-") for n in names)
+    assert len(set(names)) == len(names) and not any(
+        set(n) - set("abcdefghijklmnopqrstuvwxyz0123456789-") for n in names
+    )
     assert {n for claim in study.claims(scale) for n in (claim.lower, claim.higher)} <= set(names)
     assert len({msgspec.json.encode(case) for case in study.cases(scale).values()}) == len(study.cases(scale))
 
@@ -135,7 +137,9 @@ def test_what_is_asked_for_is_the_same_whatever_a_solve_may_see(change):
     np.testing.assert_array_equal(found.asked.radiance, usual.asked.radiance)
     assert len(found.seen) and not {*map(tuple, found.seen.normal)} & {*map(tuple, found.asked.normal)}
     changed = {"sure": "precision", "unclipped": "clipped", "dropped": "clipped"}.get(change)
-    same = len(found.seen) == len(usual.seen) and all(np.array_equal(getattr(found.seen, k), getattr(usual.seen, k)) for k in ("precision", "clipped"))
+    same = len(found.seen) == len(usual.seen) and all(
+        np.array_equal(getattr(found.seen, k), getattr(usual.seen, k)) for k in ("precision", "clipped")
+    )
     assert same == (changed is None)
     assert change not in ("unclipped", "dropped") or not found.seen.clipped.any()
 
@@ -143,17 +147,26 @@ def test_what_is_asked_for_is_the_same_whatever_a_solve_may_see(change):
 # figures and sentences ------------------------------------------------------------------------------------------------
 
 
-def conclusion(names=("a, 1", "a, 2", "b, 1", "b, 2"), measures=("entries", "seconds"), seeds=(0, 1, 2, 3, 4), answer=""):
+def conclusion(
+    names=("a, 1", "a, 2", "b, 1", "b, 2"), measures=("entries", "seconds"), seeds=(0, 1, 2, 3, 4), answer=""
+):
     def cell(k, m):
         values = {seed: (k + 1.0) * (m + 1) * (1 + 0.01 * seed) for seed in seeds}
         mean = float(np.mean(list(values.values())))
         return Cell(Spread(mean, len(seeds), 0.01, mean - 0.02, mean + 0.02), values)
 
-    rows = [Row(f"s{k}", name, k, {measure: cell(k, m) for m, measure in enumerate(measures)}) for k, name in enumerate(names)]
-    return Conclusion("x", "Title <&>", "?", "p", "varied", "full", "", tuple(seeds), tuple(measures), rows, [], answer=answer)
+    rows = [
+        Row(f"s{k}", name, k, {measure: cell(k, m) for m, measure in enumerate(measures)})
+        for k, name in enumerate(names)
+    ]
+    return Conclusion(
+        "x", "Title <&>", "?", "p", "varied", "full", "", tuple(seeds), tuple(measures), rows, [], answer=answer
+    )
 
 
-@pytest.mark.parametrize("draw", [curves, bars, lambda found: against(found, "seconds", ("entries",))], ids=["curves", "bars", "against"])
+@pytest.mark.parametrize(
+    "draw", [curves, bars, lambda found: against(found, "seconds", ("entries",))], ids=["curves", "bars", "against"]
+)
 def test_figures_stand_alone_and_show_every_setting(draw):
     import xml.etree.ElementTree as tree
 
@@ -164,7 +177,9 @@ def test_figures_stand_alone_and_show_every_setting(draw):
     assert any("Title <&>" in (e.text or "") for e in root.iter())
 
 
-@pytest.mark.parametrize("names, axes", [(("few seeds", "more seeds"), 1), (("a: few", "a: more"), 1), (("a: few", "b: more"), 2)])
+@pytest.mark.parametrize(
+    "names, axes", [(("few seeds", "more seeds"), 1), (("a: few", "a: more"), 1), (("a: few", "b: more"), 2)]
+)
 def test_settings_share_an_axis_unless_they_are_of_several_kinds(names, axes):
     assert bars(conclusion(names=names, measures=("peak",))).count("largest memory of the process (GB)") == axes
 
@@ -173,7 +188,15 @@ def test_the_best_is_named_with_those_that_are_not_shown_to_be_worse():
     found = conclusion(names=("one", "two"))
     assert best(found, "entries") == "Least mean of DSSIM, all entries: “one”; all others are shown to be worse."
     rng = np.random.default_rng(0)
-    noisy = [msgspec.structs.replace(row, cells={"entries": msgspec.structs.replace(row.cells["entries"], values={s: rng.normal() for s in range(5)})}) for row in found.rows]
+    noisy = [
+        msgspec.structs.replace(
+            row,
+            cells={
+                "entries": msgspec.structs.replace(row.cells["entries"], values={s: rng.normal() for s in range(5)})
+            },
+        )
+        for row in found.rows
+    ]
     assert "not shown to be worse: “two”" in best(msgspec.structs.replace(found, rows=noisy), "entries")
     assert "too few seeds" in best(conclusion(names=("one", "two"), seeds=(0,)), "entries")
 

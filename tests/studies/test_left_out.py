@@ -24,7 +24,21 @@ def photo(shown, light):
     n, zero = len(material), np.zeros(len(material), int)
     radiance = np.array([ALBEDO[NAMES[m]] for m in material]) * np.array(light)
     normal = np.tile([0.0, 0.0, -1.0], (n, 1))
-    return Observations(normal, normal, radiance, np.zeros((n, 3), bool), material, zero, zero, zero, zero, np.ones(n), NAMES, ("p",), ("p",))
+    return Observations(
+        normal,
+        normal,
+        radiance,
+        np.zeros((n, 3), bool),
+        material,
+        zero,
+        zero,
+        zero,
+        zero,
+        np.ones(n),
+        NAMES,
+        ("p",),
+        ("p",),
+    )
 
 
 def test_what_is_left_is_everything_but_the_shell():
@@ -34,7 +48,11 @@ def test_what_is_left_is_everything_but_the_shell():
 
 def test_a_flat_colour_is_right_where_light_is_flat():
     """And needs nothing of the shell in the photo that is asked for."""
-    seen = {"a": photo(("red", "wood"), (1, 2, 3)), "b": photo(("red", "white", "wood"), (3, 1, 1)), "c": photo(("wood",), (0.5, 0.7, 2))}
+    seen = {
+        "a": photo(("red", "wood"), (1, 2, 3)),
+        "b": photo(("red", "white", "wood"), (3, 1, 1)),
+        "c": photo(("wood",), (0.5, 0.7, 2)),
+    }
     assert flat_colour(seen, "c", "red", "wood") == pytest.approx(np.array(ALBEDO["red"]) * (0.5, 0.7, 2))
 
 
@@ -75,7 +93,9 @@ def test_keys_have_what_the_photos_contain_and_neither_truth_nor_places():
     study = STUDIES["leave-one-out"]
     found = photos_of(next(iter(study.cases(QUICK).values())))
     assert found["photos"] == ["kitchen", "hall"] and found["folder"] == "data/eames"
-    assert "photos/hall.jpg" in found["content"] and not any(name.startswith(("truth", "/")) for name in found["content"])
+    assert "photos/hall.jpg" in found["content"] and not any(
+        name.startswith(("truth", "/")) for name in found["content"]
+    )
 
 
 def test_intervals_are_over_photos():
@@ -85,6 +105,12 @@ def test_intervals_are_over_photos():
 
 
 def test_a_note_gives_each_photos_values():
-    rows = [Row(name, name, 0, {"chair": Cell(Spread(0.0, 2), dict(enumerate(of)))}) for name, of in {"left out": (0.1, 0.2), "flat": (0.15, 0.123)}.items()]
+    rows = [
+        Row(name, name, 0, {"chair": Cell(Spread(0.0, 2), dict(enumerate(of)))})
+        for name, of in {"left out": (0.1, 0.2), "flat": (0.15, 0.123)}.items()
+    ]
     found = Conclusion("x", "x", "?", "p", "v", "full", "", (0, 1), ("chair",), rows, [])
-    assert by_photo(found, {0: "hall", 1: "patio"}) == "DSSIM of a chair, photo by photo (left out, flat): hall 0.1, 0.15; patio 0.2, 0.12."
+    assert (
+        by_photo(found, {0: "hall", 1: "patio"})
+        == "DSSIM of a chair, photo by photo (left out, flat): hall 0.1, 0.15; patio 0.2, 0.12."
+    )

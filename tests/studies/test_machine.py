@@ -18,7 +18,9 @@ def test_steps_are_those_of_the_pipeline():
     order = list(STEPS)
     for name, step in STEPS.items():
         said = stages[name]
-        assert step.slices == tuple(each.removeprefix("dataset.") for each in said["inputs"] if each.startswith("dataset."))
+        assert step.slices == tuple(
+            each.removeprefix("dataset.") for each in said["inputs"] if each.startswith("dataset.")
+        )
         assert step.over_photos == (said.get("over") == "photo") and step.gather == said.get("gather")
         before = {each for each in said["inputs"] if not each.startswith("dataset.")} - {"train"}
         assert before <= set(order[: order.index(name)])
@@ -38,7 +40,19 @@ def rows(**values):
 
 
 def test_notes_give_the_spread_over_all_seeds_and_what_instructions_change():
-    found = Conclusion("x", "x", "?", "p", "v", "full", "", (0, 1), (ROUGHNESS,), rows(**{"fixed-0": (0.01, 0.02), "fixed-5": (0.03, 0.04), "all-0": (0.01, 0.02), "least-0": (0.01, 0.025)}), [])
+    found = Conclusion(
+        "x",
+        "x",
+        "?",
+        "p",
+        "v",
+        "full",
+        "",
+        (0, 1),
+        (ROUGHNESS,),
+        rows(**{"fixed-0": (0.01, 0.02), "fixed-5": (0.03, 0.04), "all-0": (0.01, 0.02), "least-0": (0.01, 0.025)}),
+        [],
+    )
     spread, same, other = notes(found)
     assert "0.025 on average over 4 seeds" in spread and "0.01 to 0.04" in spread
     assert same == "all-0: every number is the same to the last digit."

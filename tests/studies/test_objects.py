@@ -34,7 +34,9 @@ def seen(perturbation=Perturbation(), entries=((0, 0),), pixels=ALL, **how):
 
 
 def errors(*of, **how):
-    return np.array([each.normal_error_deg for photo in seen(*of, entries=full_matrix(1, 3), **how).values() for each in photo])
+    return np.array(
+        [each.normal_error_deg for photo in seen(*of, entries=full_matrix(1, 3), **how).values() for each in photo]
+    )
 
 
 def test_objects_that_are_where_they_are_thought_to_be_have_true_normals():
@@ -42,7 +44,9 @@ def test_objects_that_are_where_they_are_thought_to_be_have_true_normals():
     found = together(seen(entries=[(0, 0), (2, 0)])["light0"])
     assert np.linalg.norm(found.normal, axis=1) == pytest.approx(1) and (found.normal @ FRONT > 0).all()
     assert set(found.material.tolist()) == {0, 1} and found.materials == ("brick", "lacquer")
-    assert len({*zip(found.x.tolist(), found.y.tolist(), strict=True)}) == len(found), "two entries have a pixel each of one number"
+    assert len({*zip(found.x.tolist(), found.y.tolist(), strict=True)}) == len(found), (
+        "two entries have a pixel each of one number"
+    )
 
 
 def test_the_further_an_object_is_turned_the_more_its_normals_are_off():
@@ -52,13 +56,17 @@ def test_the_further_an_object_is_turned_the_more_its_normals_are_off():
     assert (large > 3 * small).all() and (large < 40.0).all()
 
 
-@pytest.mark.parametrize("perturbation", [Perturbation(shifted=0.05), Perturbation(larger=0.1), Perturbation(triangles=100)])
+@pytest.mark.parametrize(
+    "perturbation", [Perturbation(shifted=0.05), Perturbation(larger=0.1), Perturbation(triangles=100)]
+)
 def test_other_perturbations_turn_normals_too(perturbation):
     assert (errors(perturbation) > 0.5).all()
 
 
 def test_harm_changes_the_normals_and_not_what_a_pixel_shows():
-    clean, perturbed = (together(seen(perturbation)["light0"]) for perturbation in (Perturbation(), Perturbation(turned_deg=5.0)))
+    clean, perturbed = (
+        together(seen(perturbation)["light0"]) for perturbation in (Perturbation(), Perturbation(turned_deg=5.0))
+    )
     radiance = dict(zip(clean.x.tolist(), clean.radiance.tolist(), strict=True))
     shared = [k for k, pixel in enumerate(perturbed.x.tolist()) if pixel in radiance]
     assert len(shared) > 1000
@@ -93,7 +101,11 @@ def test_the_robust_loss_is_off_inside_and_back_after_an_error():
 
 
 def test_docksta_is_linked_by_one_material():
-    assert len(docksta(6)) == 12 and {m for m, _ in docksta(6)} == set(range(7)) and {li for _, li in docksta(6)} == set(range(6))
+    assert (
+        len(docksta(6)) == 12
+        and {m for m, _ in docksta(6)} == set(range(7))
+        and {li for _, li in docksta(6)} == set(range(6))
+    )
     for entries, parts in ((docksta(6), 1), (unlinked(6), 6)):
         case = ObjectsCase(0, tuple(entries), 10)
         component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
@@ -110,13 +122,19 @@ def test_a_case_from_lights_to_scores_warm(tmp_path):
     for name in ("worlds", "observe", "solve", "score"):
         (tmp_path / name).mkdir()
     for li in range(with_one_light_more(world).lights):
-        write_rgb_exr(tmp_path / "worlds" / light_file(0, li), rng.uniform(0.5, 2, (8, 16, 3)).astype(np.float32), LAT_LONG)
+        write_rgb_exr(
+            tmp_path / "worlds" / light_file(0, li), rng.uniform(0.5, 2, (8, 16, 3)).astype(np.float32), LAT_LONG
+        )
     facts = {"dataset.case": msgspec.to_builtins(case), "dataset.worlds": msgspec.to_builtins(world)}
     folders = {name: tmp_path / name for name in ("worlds", "observe", "solve")}
     for stage in (observe, solve, score):
-        stage.main(stage.Params(), Inputs(folders, facts, photo="x"), tmp_path / stage.__name__.rpartition(".")[2], silent)
+        stage.main(
+            stage.Params(), Inputs(folders, facts, photo="x"), tmp_path / stage.__name__.rpartition(".")[2], silent
+        )
     assert [file.name for file in sorted((tmp_path / "observe/x/earlier").iterdir())] == ["light0.parquet"]
-    earlier, whole = (json.loads((tmp_path / "solve/x" / file).read_text()) for file in ("earlier/exposures.json", "exposures.json"))
+    earlier, whole = (
+        json.loads((tmp_path / "solve/x" / file).read_text()) for file in ("earlier/exposures.json", "exposures.json")
+    )
     assert earlier.keys() == {"light0"} and whole.keys() == {"light0", "light1"}
     found = json.loads((tmp_path / "score/x.json").read_text())["values"]
     assert found["seconds"] > 0 and found["normals"] == pytest.approx(0, abs=1e-3) and 0 <= found["new_light"] < 0.5

@@ -29,14 +29,22 @@ def test_the_entries_and_no_others_are_seen():
 def test_an_entry_is_the_same_whatever_else_a_case_shows():
     small, large = seen([(1, 0)])["light0"], seen(full_matrix(3, 3))["light0"]
     assert np.array_equal(small.radiance, large.radiance[large.material == 1])
-    other = observations_of(Case(1, ((1, 0),), 10), materials_of(0), LIGHTS)["light0"]  # the same material: its noise is of the seed
-    assert not np.array_equal(small.radiance, other.radiance) and small.radiance == pytest.approx(other.radiance, rel=0.1)
+    other = observations_of(Case(1, ((1, 0),), 10), materials_of(0), LIGHTS)[
+        "light0"
+    ]  # the same material: its noise is of the seed
+    assert not np.array_equal(small.radiance, other.radiance) and small.radiance == pytest.approx(
+        other.radiance, rel=0.1
+    )
 
 
 def test_harm_changes_what_is_told_and_not_what_is_seen():
-    clean, perturbed = (seen(full_matrix(2, 1), **how)["light0"] for how in ({}, {"normal_deg": 5.0, "wrong_labels": 0.2}))
+    clean, perturbed = (
+        seen(full_matrix(2, 1), **how)["light0"] for how in ({}, {"normal_deg": 5.0, "wrong_labels": 0.2})
+    )
     assert np.array_equal(clean.radiance, perturbed.radiance)
-    assert not np.array_equal(clean.normal, perturbed.normal) and 0 < np.mean(clean.material != perturbed.material) < 0.4
+    assert (
+        not np.array_equal(clean.normal, perturbed.normal) and 0 < np.mean(clean.material != perturbed.material) < 0.4
+    )
 
 
 def test_normals_turn_as_far_as_they_are_told():
@@ -50,7 +58,9 @@ def test_normals_turn_as_far_as_they_are_told():
 def test_labels_are_wrong_as_often_as_they_are_told_and_name_others():
     labels = mislabelled(10_000, 1, [0, 1, 2], 0.2, np.random.default_rng(0))
     assert np.mean(labels != 1) == pytest.approx(0.2, abs=0.02) and set(labels) == {0, 1, 2}
-    assert set(mislabelled(100, 0, [0], 0.2, np.random.default_rng(0))) == {0}, "alone in its photo it can be called nothing else"
+    assert set(mislabelled(100, 0, [0], 0.2, np.random.default_rng(0))) == {0}, (
+        "alone in its photo it can be called nothing else"
+    )
 
 
 @pytest.mark.parametrize("faces", [1, 2, 9])

@@ -28,7 +28,12 @@ NAME = "matrix-size"
 
 def cli(*words, **environment):
     return subprocess.run(
-        [sys.executable, "-m", "studies", *words], cwd=LIBRARY, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "studies", *words],
+        cwd=LIBRARY,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -57,9 +62,24 @@ def test_a_change_of_the_scores_solves_nothing_again(tmp_path):
     """Neither what a study says nor how it is scored is in the key of a solve."""
     records = survey(studies(TINY, tmp_path), NAME, None, []).records
     solve_ = next(record for step, record in records.items() if step.stage == "solve")
-    assert "source:studies.core.case" in solve_ and "source:stages.solve" in solve_ and "source:factorlib.solve.solve" in solve_
-    assert not {"source:studies.core.score", "source:studies.core.study", "source:studies.core.world", "source:studies.catalogue.matrix_size", "source:studies.report.figure"} & solve_.keys()
-    assert not any("templates" in name or name.endswith("pipeline.yaml") for name in solve_ if name.startswith("data:studies"))
+    assert (
+        "source:studies.core.case" in solve_
+        and "source:stages.solve" in solve_
+        and "source:factorlib.solve.solve" in solve_
+    )
+    assert (
+        not {
+            "source:studies.core.score",
+            "source:studies.core.study",
+            "source:studies.core.world",
+            "source:studies.catalogue.matrix_size",
+            "source:studies.report.figure",
+        }
+        & solve_.keys()
+    )
+    assert not any(
+        "templates" in name or name.endswith("pipeline.yaml") for name in solve_ if name.startswith("data:studies")
+    )
 
 
 def solved(folder, name, data):
@@ -68,26 +88,37 @@ def solved(folder, name, data):
     for stage, needs in ((observe, "worlds"), (solve, "observe"), (score, "solve")):
         out = folder / stage.__name__.rpartition(".")[2]
         out.mkdir(exist_ok=True)
-        stage.main(stage.Params(), Inputs({"worlds": folder / "worlds", needs: folder / needs}, facts, photo=name), out, silent)
+        stage.main(
+            stage.Params(), Inputs({"worlds": folder / "worlds", needs: folder / needs}, facts, photo=name), out, silent
+        )
 
 
 def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     data = data_of(tmp_path / NAME, msgspec.structs.replace(TINY, largest=1))
     (tmp_path / "worlds").mkdir()
-    worlds.main(worlds.Params(), Inputs({}, {"dataset.worlds": data.slice("worlds", None).facts}), tmp_path / "worlds", silent)
+    worlds.main(
+        worlds.Params(), Inputs({}, {"dataset.worlds": data.slice("worlds", None).facts}), tmp_path / "worlds", silent
+    )
     for name in data.photos:
         solved(tmp_path, name, data)
     gathered = {name: json.loads((tmp_path / "score" / f"{name}.json").read_text()) for name in data.photos}
     (tmp_path / "score/scores.json").write_text(json.dumps(gathered))
     (out := tmp_path / "conclude").mkdir()
-    conclude.main(conclude.Params(), Inputs({"score": tmp_path / "score"}, {"dataset.study": data.slice("study", None).facts}), out, silent)
+    conclude.main(
+        conclude.Params(),
+        Inputs({"score": tmp_path / "score"}, {"dataset.study": data.slice("study", None).facts}),
+        out,
+        silent,
+    )
     found = json.loads((out / "table.json").read_text())
     assert [row["label"] for row in found["rows"]] == ["1 × 1"] and found["label"] and not found["claims"]
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in found["rows"])
     figure = (out / "figure.svg").read_text()
     assert figure.startswith("<svg") and "no conclusion" in figure and "materials × lights" in figure
     text = page([(found, out)])
-    assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), "the page stands alone"
+    assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), (
+        "the page stands alone"
+    )
 
 
 def test_the_page_heads_a_column_with_its_unit(tmp_path):
@@ -105,7 +136,9 @@ def test_the_page_escapes_what_it_shows(tmp_path):
 
 @pytest.mark.parametrize("change", [{"measures": ["entries", "gone"]}, {"rows": 1}])
 def test_the_page_names_tables_of_another_version_and_shows_the_others(tmp_path, change):
-    found = json.loads(msgspec.json.encode(Conclusion("x", "title", "?", "&", "v", "full", "", (0,), ("entries",), [], [])))
+    found = json.loads(
+        msgspec.json.encode(Conclusion("x", "title", "?", "&", "v", "full", "", (0,), ("entries",), [], []))
+    )
     for name in ("new", "old"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "figure.svg").write_text("<svg></svg>")
@@ -137,7 +170,9 @@ def test_a_killed_study_goes_on_from_there_and_ends_with_the_page(tmp_path):
     project = studies(TINY, tmp_path)
     (tmp_path / "run_it.py").write_text(KILLED)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(LIBRARY), str(LIBRARY / "tests")])}
-    process = subprocess.Popen([sys.executable, str(tmp_path / "run_it.py"), str(tmp_path)], env=environment, start_new_session=True)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "run_it.py"), str(tmp_path)], env=environment, start_new_session=True
+    )
     deadline = time.monotonic() + 300
     while not any(step.startswith("solve/") for step in finished(project)):
         assert process.poll() is None and time.monotonic() < deadline
@@ -146,12 +181,16 @@ def test_a_killed_study_goes_on_from_there_and_ends_with_the_page(tmp_path):
     process.wait()
     before = finished(project)
     assert make(project, [NAME]) == 0
-    assert len(finished(project)) == len(set(finished(project))) and set(before) < set(finished(project)), "what was done is done again"
+    assert len(finished(project)) == len(set(finished(project))) and set(before) < set(finished(project)), (
+        "what was done is done again"
+    )
     for name in ("figure.svg", "table.csv", "table.json", "paragraph.md"):
         assert (project.build / NAME / name).read_bytes() == (project.build / NAME / "conclude" / name).read_bytes()
     text = (project.build / "index.html").read_text()
     assert "no conclusion" in text and STUDIES[NAME].title in text
-    assert make(project, [NAME]) == 0 and len(finished(project)) == len(set(finished(project))), "there was nothing to do"
+    assert make(project, [NAME]) == 0 and len(finished(project)) == len(set(finished(project))), (
+        "there was nothing to do"
+    )
     forget(project, [NAME])
     assert sorted(path.name for path in project.build.iterdir()) == ["index.html", "store"]
     assert STUDIES[NAME].title not in (project.build / "index.html").read_text()

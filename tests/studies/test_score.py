@@ -36,8 +36,12 @@ def pictures(case, truths, factors, roughness=0.0):
 def test_the_truth_in_any_gauge_scores_nothing(case, truths):
     score = pictures(case, truths, FACTORS).score()
     assert max(score.values.values()) < 1e-6
-    assert {"entries", "observed", "unobserved", "new_light", "new_material", "first_light"} == score.values.keys() - {"first_material"}
-    assert min(error for measure, error in score.nulls.items() if measure != "new_material") > 1e-3, "these lights are constant, as its null's"
+    assert {"entries", "observed", "unobserved", "new_light", "new_material", "first_light"} == score.values.keys() - {
+        "first_material"
+    }
+    assert min(error for measure, error in score.nulls.items() if measure != "new_material") > 1e-3, (
+        "these lights are constant, as its null's"
+    )
 
 
 @pytest.mark.parametrize("case, truths", CASES)

@@ -22,7 +22,9 @@ def written(tmp_path_factory):
     """Two materials in one light, one of them in a second."""
     folder = tmp_path_factory.mktemp("sets") / "pair"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sets, "light_map", lambda seed, number, rows, spp: np.ones((16, 32, 3), np.float32) * (1 + number))
+        patch.setattr(
+            sets, "light_map", lambda seed, number, rows, spp: np.ones((16, 32, 3), np.float32) * (1 + number)
+        )
         sets.write_set(folder, 0, [(0, 0), (5, 0), (5, 1)])
     return folder
 
@@ -30,7 +32,10 @@ def written(tmp_path_factory):
 def test_the_set_names_the_materials_of_its_entries(written):
     spec = read_dataset(written).spec
     assert spec.materials == ["brick", "tile"]
-    assert {photo.name: [obj.name for obj in photo.objects] for photo in spec.photos} == {"photo0": ["brick", "tile"], "photo1": ["tile"]}
+    assert {photo.name: [obj.name for obj in photo.objects] for photo in spec.photos} == {
+        "photo0": ["brick", "tile"],
+        "photo1": ["tile"],
+    }
 
 
 def test_meshes_at_the_given_poses_lie_under_the_masks(written):
@@ -41,7 +46,12 @@ def test_meshes_at_the_given_poses_lie_under_the_masks(written):
         height, width = label.shape
         camera = Camera(width, height, photo.camera.focal_px, tuple(photo.camera.principal_point))
         meshes = [
-            read_mesh(written / dataset.spec.meshes[obj.mesh].file, dataset.spec.materials, dataset.spec.meshes[obj.mesh].material, obj.materials)
+            read_mesh(
+                written / dataset.spec.meshes[obj.mesh].file,
+                dataset.spec.materials,
+                dataset.spec.meshes[obj.mesh].material,
+                obj.materials,
+            )
             for obj in photo.objects
         ]
         poses = [Pose(np.array(obj.pose.rotation), np.array(obj.pose.translation)) for obj in photo.objects]
@@ -73,4 +83,7 @@ def test_a_real_sets_rows_give_photos_and_the_mean_beside_flat_colours():
     seen = PhotoErrors(1.0, 4, 0, 0, 0, 0, None, {}, {"none": scored}, {})
     nothing_counts = msgspec.structs.replace(seen, gauges=None)
     found = SimpleNamespace(resynthesis=Resynthesis({"a": seen, "b": nothing_counts}, {"none": scored}, 1.0, 1.0))
-    assert real.rows_of("x", found) == [["x: a", ".344", ".348", "15.5", "13.4"], ["x: mean", ".344", ".348", "15.5", "13.4"]]
+    assert real.rows_of("x", found) == [
+        ["x: a", ".344", ".348", "15.5", "13.4"],
+        ["x: mean", ".344", ".348", "15.5", "13.4"],
+    ]

@@ -67,18 +67,36 @@ def test_only_seeds_that_both_have_are_compared():
 
 def study(*claims):
     made = [Setting(name, name, x, lambda seed: QUICK.case(seed, [(0, 0)])) for x, name in enumerate("ab")]
-    return Study("toy", "Toy <b>", "Which?", "a is better.", "letter", ("entries", "roughness"), lambda scale: made, lambda scale: list(claims))
+    return Study(
+        "toy",
+        "Toy <b>",
+        "Which?",
+        "a is better.",
+        "letter",
+        ("entries", "roughness"),
+        lambda scale: made,
+        lambda scale: list(claims),
+    )
 
 
 def scores(scale, **values):
-    return {case_name(name, seed): Score({"entries": v + 0.001 * seed}, {"entries": 0.5}) for name, v in values.items() for seed in scale.seeds}
+    return {
+        case_name(name, seed): Score({"entries": v + 0.001 * seed}, {"entries": 0.5})
+        for name, v in values.items()
+        for seed in scale.seeds
+    }
 
 
 CLAIM = Claim("entries", "a", "b", "a is better than b")
 
 
 @pytest.mark.parametrize(
-    "a, b, answer, words", [(0.1, 0.2, "agrees", ": shown ("), (0.2, 0.1, "disagrees", "the opposite is shown"), (0.1, 0.1, "no difference is shown", "no difference is shown")]
+    "a, b, answer, words",
+    [
+        (0.1, 0.2, "agrees", ": shown ("),
+        (0.2, 0.1, "disagrees", "the opposite is shown"),
+        (0.1, 0.1, "no difference is shown", "no difference is shown"),
+    ],
 )
 def test_the_sentence_says_what_was_found(a, b, answer, words):
     found = concluded(study(CLAIM), FULL, scores(FULL, a=a, b=b))
@@ -93,7 +111,11 @@ def test_rises_are_compared_per_unit(b, c, answer):
     claim = Claim("entries", Rise("b", "c", 2), Rise("a", "b", 1), "it saturates")
     of = msgspec.structs.replace(study(claim), settings=lambda scale: made)
     noise = {name: 1e-6 * k for name, k in zip("abc", (0, 1, 5), strict=True)}
-    given = {case_name(name, s): Score({"entries": v + s**2 * noise[name]}, {}) for name, v in zip("abc", (0.1, b, c), strict=True) for s in FULL.seeds}
+    given = {
+        case_name(name, s): Score({"entries": v + s**2 * noise[name]}, {})
+        for name, v in zip("abc", (0.1, b, c), strict=True)
+        for s in FULL.seeds
+    }
     found = concluded(of, FULL, given)
     assert found.claims[0].answer == answer and "the rise of DSSIM" in found.claims[0].sentence
     assert found.claims[0].difference.spread.mean == pytest.approx((c - b) / 2 - (b - 0.1), abs=1e-4)
@@ -102,12 +124,17 @@ def test_rises_are_compared_per_unit(b, c, answer):
 @pytest.mark.parametrize("a, answer", [(0.1, "agrees"), (0.9, "disagrees")])
 def test_a_guess_is_compared_seed_by_seed(a, answer):
     """The guess scores .5, and each seed's own difference counts."""
-    given = {name: Score(s.values, {"entries": 0.5 + 0.2 * s.values["entries"]}) for name, s in scores(FULL, a=a, b=0.3).items()}
+    given = {
+        name: Score(s.values, {"entries": 0.5 + 0.2 * s.values["entries"]})
+        for name, s in scores(FULL, a=a, b=0.3).items()
+    }
     found = concluded(study(Claim("entries", "a", Guess("a"), "a is predicted better than by a guess")), FULL, given)
     (tested,) = found.claims
     assert tested.answer == answer and "in “a” against a guess" in tested.sentence
     assert tested.difference.spread.mean == pytest.approx(0.8 * (a + 0.002) - 0.5)
-    assert msgspec.convert(msgspec.to_builtins(found, str_keys=True), type(found), str_keys=True) == found  # as table.json has it
+    assert (
+        msgspec.convert(msgspec.to_builtins(found, str_keys=True), type(found), str_keys=True) == found
+    )  # as table.json has it
 
 
 def test_a_claim_about_a_measure_without_a_null_is_left_out():
@@ -117,10 +144,16 @@ def test_a_claim_about_a_measure_without_a_null_is_left_out():
 
 def test_an_answer_in_part_says_of_how_many():
     """a < b is shown for the one measure; of the other there is nothing to see."""
-    given = {name: Score(s.values | {"roughness": 0.2 + 0.01 * (k % 2)}, s.nulls) for k, (name, s) in enumerate(scores(FULL, a=0.1, b=0.2).items())}
+    given = {
+        name: Score(s.values | {"roughness": 0.2 + 0.01 * (k % 2)}, s.nulls)
+        for k, (name, s) in enumerate(scores(FULL, a=0.1, b=0.2).items())
+    }
     found = concluded(study(CLAIM, Claim("roughness", "a", "b", "…")), FULL, given)
     assert answer_to_the_paper(found) == "agrees in part: 1 of 2 claims are shown"
-    assert answer_to_the_paper(concluded(study(Claim("roughness", "a", "b", "…")), FULL, given)) == "no difference is shown"
+    assert (
+        answer_to_the_paper(concluded(study(Claim("roughness", "a", "b", "…")), FULL, given))
+        == "no difference is shown"
+    )
 
 
 def test_a_quick_study_concludes_nothing_and_says_so():
@@ -135,4 +168,8 @@ def test_a_claim_whose_measure_a_setting_lacks_is_left_out():
 
 def test_the_table_has_a_line_for_each_setting_and_measure():
     lines = csv_text(concluded(study(CLAIM), FULL, scores(FULL, a=0.1, b=0.2))).splitlines()
-    assert len(lines) == 3 and lines[0].startswith("study,scale,setting") and lines[1].startswith("toy,full,a,a,entries,1,5,0.102,")
+    assert (
+        len(lines) == 3
+        and lines[0].startswith("study,scale,setting")
+        and lines[1].startswith("toy,full,a,a,entries,1,5,0.102,")
+    )

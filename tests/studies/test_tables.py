@@ -20,7 +20,9 @@ def found(label):
 
 @pytest.mark.parametrize("on_page, here, stays", [("", QUICK, True), ("", "", False), (QUICK, QUICK, False)])
 def test_a_row_stays_until_there_is_a_study_as_large(on_page, here, stays):
-    (row,) = [line for line in against_the_paper(found(here), page(on_page)).splitlines() if line.startswith("| [Prior on")]
+    (row,) = [
+        line for line in against_the_paper(found(here), page(on_page)).splitlines() if line.startswith("| [Prior on")
+    ]
     assert is_full(page(on_page), "prior") == (not on_page)
     assert (row.rpartition(" | ")[2].startswith("agrees")) == stays, row
 

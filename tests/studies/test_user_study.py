@@ -114,17 +114,25 @@ def save(browser, button, folder):
 def test_a_simulated_viewer_answers_and_is_marked_as_one(html, tmp_path):
     file, table = viewed(html, tmp_path, 1.0, 0)
     (answers,) = read_answers([file])
-    assert answers.simulated == "prefers the lower DSSIM with probability 1" and len(answers.answers) == answers.asked == 6
+    assert (
+        answers.simulated == "prefers the lower DSSIM with probability 1" and len(answers.answers) == answers.asked == 6
+    )
     assert all(a.for_ours == ("gold" not in a.picture) for a in answers.answers)
     rows = list(csv.DictReader(table.open()))
-    assert [(r["picture"], r["ours"], r["chosen"]) for r in rows] == [(a.picture, a.ours, a.chosen) for a in answers.answers]
-    assert {r["simulated"] for r in rows} == {answers.simulated} and {r["participant"] for r in rows} == {answers.participant}
+    assert [(r["picture"], r["ours"], r["chosen"]) for r in rows] == [
+        (a.picture, a.ours, a.chosen) for a in answers.answers
+    ]
+    assert {r["simulated"] for r in rows} == {answers.simulated} and {r["participant"] for r in rows} == {
+        answers.participant
+    }
 
 
 @needs_chromium
 def test_a_browser_that_a_program_drives_is_marked_even_where_it_says_nothing(html):
     with opened(html) as (browser, _):
-        assert browser.evaluate("results.simulated") == "a program drives the browser" and browser.is_visible("#simulated")
+        assert browser.evaluate("results.simulated") == "a program drives the browser" and browser.is_visible(
+            "#simulated"
+        )
 
 
 @needs_chromium
@@ -140,8 +148,14 @@ def test_a_phone_needs_no_scrolling_sideways(html):
 def test_order_and_sides_are_the_seeds_and_sides_are_fair(html):
     with opened(html) as (browser, _):
         script = "(seed) => drawn(data.pictures, seed).map((q) => [q.picture.name, q.ours])"
-        first, again, others = browser.evaluate(script, 7), browser.evaluate(script, 7), [browser.evaluate(script, s) for s in range(300)]
-        assert first == again and sorted(name for name, _ in first) == sorted(p["name"] for p in browser.evaluate("data.pictures"))
+        first, again, others = (
+            browser.evaluate(script, 7),
+            browser.evaluate(script, 7),
+            [browser.evaluate(script, s) for s in range(300)],
+        )
+        assert first == again and sorted(name for name, _ in first) == sorted(
+            p["name"] for p in browser.evaluate("data.pictures")
+        )
         left = np.mean([side == "left" for drawn in others for _, side in drawn])
         assert left == pytest.approx(0.5, abs=0.05) and len({name for drawn in others for name, _ in drawn[:1]}) == 6
 
@@ -165,7 +179,14 @@ def test_keys_before_the_first_question_and_their_repeats_answer_nothing(html):
 def participant(number, preferred, simulated="", **changes):
     """A person who chose ours in the pictures of `preferred`, of four."""
     given = [Answer(f"p{k}", "left", "left" if k in preferred else "right", 900.0) for k in range(4)]
-    fields = {"page": "0" * 16, "participant": f"{number:016x}", "seed": number, "simulated": simulated, "asked": 4, "answers": given}
+    fields = {
+        "page": "0" * 16,
+        "participant": f"{number:016x}",
+        "seed": number,
+        "simulated": simulated,
+        "asked": 4,
+        "answers": given,
+    }
     return Answers(format=1, **fields | changes)
 
 
@@ -186,7 +207,12 @@ def test_shares_and_standard_errors():
 
 def test_the_papers_own_numbers_come_out():
     """One answer each of 250 people, 86.5 % for ours: a standard error of 2.1 or 2.2 %."""
-    people = [participant(k, {0} if k < 216 else set(), answers=[Answer("p0", "left", "left" if k < 216 else "right", 1.0)], asked=1) for k in range(250)]
+    people = [
+        participant(
+            k, {0} if k < 216 else set(), answers=[Answer("p0", "left", "left" if k < 216 else "right", 1.0)], asked=1
+        )
+        for k in range(250)
+    ]
     found = analysed(people)
     assert 100 * found.overall.share == pytest.approx(86.4) and 2.1 < 100 * found.overall.error < 2.2
     assert "No difference is shown" in paragraph(found) and "250 participants" in paragraph(found)
@@ -200,7 +226,11 @@ def test_one_person_has_no_standard_error():
 def test_simulated_answers_stay_marked_in_all_that_is_made_of_them():
     found = analysed([participant(k, {0, 1}, simulated="a coin") for k in range(3)])
     assert all(row["simulated"] == "a coin" for row in csv.DictReader(io.StringIO(csv_text(found))))
-    assert "simulated: a coin" in figure(found) and paragraph(found).startswith("**simulated: a coin**") and "250" not in paragraph(found)
+    assert (
+        "simulated: a coin" in figure(found)
+        and paragraph(found).startswith("**simulated: a coin**")
+        and "250" not in paragraph(found)
+    )
 
 
 MALFORMED = {
@@ -250,13 +280,20 @@ def test_files_that_do_not_belong_together_are_said(tmp_path, second, said):
 
 
 def command(*words):
-    return subprocess.run([sys.executable, "-m", "studies.user_study", *words], cwd=LIBRARY, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "studies.user_study", *words], cwd=LIBRARY, capture_output=True, text=True, check=False
+    )
 
 
 def test_the_analysis_is_a_command(tmp_path):
     files = written(tmp_path, *(participant(k, {0, 1, 2}, simulated="a coin") for k in range(3)))
     done = command("analyse", *map(str, files), "--out", str(tmp_path / "out"))
     assert done.returncode == 0 and "75.0 %" in done.stdout and "simulated: a coin" in done.stdout, done.stderr
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"shares.csv", "analysis.json", "figure.svg", "paragraph.md"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "shares.csv",
+        "analysis.json",
+        "figure.svg",
+        "paragraph.md",
+    }
     wrong = command("analyse", str(tmp_path / "none.json"))
     assert wrong.returncode == 1 and "none.json" in wrong.stderr and "Traceback" not in wrong.stderr

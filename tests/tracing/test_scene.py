@@ -24,13 +24,17 @@ def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
     light[texel] = 100.0
     toward = lat_long_directions(16, 32)[texel] @ YUP_FROM_CAMERA  # camera frame
     ball = tracing.shape(
-        sphere(1.0), {"type": "diffuse", "reflectance": tracing.rgb(0.8)}, tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0])
+        sphere(1.0),
+        {"type": "diffuse", "reflectance": tracing.rgb(0.8)},
+        tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0]),
     )
     image = tracing.traced({"ball": ball, "light": tracing.envmap(light)}, CAMERA, AT_ORIGIN, 64, 1, 2)[..., 0]
     normal = ball_normal(CAMERA, 4.0)
     inside = np.nan_to_num(np.sum(normal * -CAMERA.rays(), axis=-1)) > 0.5
     cosine = np.nan_to_num(normal @ toward)
-    irradiance = np.sum(sampled(light, lat_long_directions(128, 256))[..., 0] * lat_long_solid_angles(128, 256)[:, None])
+    irradiance = np.sum(
+        sampled(light, lat_long_directions(128, 256))[..., 0] * lat_long_solid_angles(128, 256)[:, None]
+    )
     expected = 0.8 / np.pi * irradiance * cosine
     lit, unlit = inside & (cosine > 0.25), inside & (cosine < -0.2)
     assert lit.sum() > 8

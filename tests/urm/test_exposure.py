@@ -37,4 +37,6 @@ def test_exposures_pass_through_files_and_merging(tmp_path):
     unknown, silent = photo("a", "room", None), observations("a", "room")
     for name, part in (("b", unknown), ("c", msgspec.structs.replace(silent, exposures=()))):
         write_observations(tmp_path / f"{name}.parquet", part)
-    assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "c.parquet").read_bytes(), "what is unknown leaves no trace"
+    assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "c.parquet").read_bytes(), (
+        "what is unknown leaves no trace"
+    )

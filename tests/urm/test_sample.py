@@ -44,7 +44,9 @@ def test_weights_keep_their_sum_in_every_stratum_and_in_all():
     assert kept.weight.sum(dtype=float) == pytest.approx(seen.weight.sum(dtype=float), rel=1e-5)
     for material in (0, 1):
         for clipped in (False, True):
-            total = [s.weight[(s.material == material) & (s.clipped[:, 0] == clipped)].sum(dtype=float) for s in (seen, kept)]
+            total = [
+                s.weight[(s.material == material) & (s.clipped[:, 0] == clipped)].sum(dtype=float) for s in (seen, kept)
+            ]
             assert total[1] == pytest.approx(total[0], rel=1e-5)
 
 
@@ -71,12 +73,17 @@ def test_the_mean_of_a_stratum_is_kept_within_its_noise():
     kept = sample(seen, 3000)
     group, small = strata(seen, 3000), strata(kept, 3000)
     most = np.bincount(group).argmax()
-    means = [np.average(s.radiance[g == n], axis=0, weights=s.weight[g == n]) for s, g, n in ((seen, group, most), (kept, small, np.bincount(small).argmax()))]
+    means = [
+        np.average(s.radiance[g == n], axis=0, weights=s.weight[g == n])
+        for s, g, n in ((seen, group, most), (kept, small, np.bincount(small).argmax()))
+    ]
     np.testing.assert_allclose(*means, atol=0.04)
 
 
 def test_names_exposures_and_the_rest_stay():
-    seen = msgspec.structs.replace(many(), visibility=np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8))
+    seen = msgspec.structs.replace(
+        many(), visibility=np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8)
+    )
     kept = sample(seen, 3000)
     assert (kept.materials, kept.photos, kept.exposures) == (seen.materials, seen.photos, seen.exposures)
     row = kept.y * 200 + kept.x

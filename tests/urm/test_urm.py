@@ -15,7 +15,14 @@ def photo_and_geometry(size=64):
     inside = x**2 + y**2 < 0.98
     z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     one = inside.astype("f4")
-    geometry = {"normal.x": x * one, "normal.y": y * one, "normal.z": z * one, "view.x": 0 * one, "view.y": 0 * one, "view.z": -one}
+    geometry = {
+        "normal.x": x * one,
+        "normal.y": y * one,
+        "normal.z": z * one,
+        "view.x": 0 * one,
+        "view.y": 0 * one,
+        "view.z": -one,
+    }
     geometry |= {"label": np.where(x < 0, 1, 2) * one, "confidence": one}
     photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": np.where(x < 0, 1, 2) * one, "valid": one}
     photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}

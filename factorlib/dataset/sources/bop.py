@@ -50,7 +50,13 @@ def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
         if not ID.fullmatch(image):
             of_cameras(one_line(image), "is not the id of an image", "ids are whole numbers, of 18 digits at most")
     return [
-        Shot(int(image), _camera(image, camera, of_cameras), None, f"{CAMERAS}: {image}", poses=_poses(image, poses, of_poses))
+        Shot(
+            int(image),
+            _camera(image, camera, of_cameras),
+            None,
+            f"{CAMERAS}: {image}",
+            poses=_poses(image, poses, of_poses),
+        )
         for image, camera in sorted(cameras.items(), key=lambda item: int(item[0]))
     ]
 

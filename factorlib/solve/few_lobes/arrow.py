@@ -87,11 +87,17 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         ]
         return by_materials, by_lights
 
-    def predicted_decrease(self, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]) -> float:
+    def predicted_decrease(
+        self, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]
+    ) -> float:
         """By how much a step lowers the quadratic model of the loss."""
         decrease = -by_materials @ (2 * self.material_gradient + self.material_hessian @ by_materials)
         for part, step in zip(self.parts, by_lights, strict=True):
-            decrease -= step @ (2 * part.light_gradient + part.light_hessian @ step + 2 * part.cross_hessian.T @ by_materials[part.places])
+            decrease -= step @ (
+                2 * part.light_gradient
+                + part.light_hessian @ step
+                + 2 * part.cross_hessian.T @ by_materials[part.places]
+            )
         return float(decrease)
 
     def schur_complement(self, point: Point) -> Float[np.ndarray, "7m 7m"]:
@@ -99,7 +105,9 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         reduced = self.material_hessian
         for part, light in zip(self.parts, point.lights, strict=True):
             factor, cross = _eliminated(
-                damped(part.light_hessian, DEFINITE), part.cross_hessian, ~light_at_bound(light, point.materials, part.light_gradient)
+                damped(part.light_hessian, DEFINITE),
+                part.cross_hessian,
+                ~light_at_bound(light, point.materials, part.light_gradient),
             )
             reduced[np.ix_(part.places, part.places)] -= cross @ cho_solve(factor, cross.T, check_finite=False)
         return (reduced + reduced.T) / 2
@@ -110,9 +118,13 @@ class ArrowSystem(msgspec.Struct, frozen=True):
         for scores, part, light in zip(found, self.parts, point.lights, strict=True):
             k, free = len(part.places), ~light_at_bound(light, point.materials, part.light_gradient)
             factor, cross = _eliminated(damped(part.light_hessian, DEFINITE), part.cross_hessian, free)
-            scores[:, part.places] = part.scores[:, :k] - (part.scores[:, k:] * free) @ cho_solve(factor, cross.T, check_finite=False)
+            scores[:, part.places] = part.scores[:, :k] - (part.scores[:, k:] * free) @ cho_solve(
+                factor, cross.T, check_finite=False
+            )
         return found
 
 
-def _eliminated(light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "k l"], free: Bool[np.ndarray, " l"]) -> Eliminated:
+def _eliminated(
+    light: Float[np.ndarray, "l l"], cross: Float[np.ndarray, "k l"], free: Bool[np.ndarray, " l"]
+) -> Eliminated:
     return Eliminated(cho_factor(masked(light, free), check_finite=False), cross * free)

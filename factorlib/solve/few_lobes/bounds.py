@@ -29,7 +29,9 @@ class Bounds:
         self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
         p = len(light)
         self.low, self.high = np.full(len(self.free), -np.inf), np.full(len(self.free), np.inf)
-        s_now, s_low, s_high = (-np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest))
+        s_now, s_low, s_high = (
+            -np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest)
+        )
         self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
 
     def tighten(self, step: Float[np.ndarray, " l"]) -> bool:
@@ -64,7 +66,9 @@ def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarra
     at_bound = np.zeros(len(gradient), bool)
     low, high = np.log([SHARPNESS[0], materials.sharpest])
     by_sharpness = gradient[2 * p : 3 * p]
-    at_bound[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | ((light.log_sharpness >= high) & (by_sharpness < 0))
+    at_bound[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | (
+        (light.log_sharpness >= high) & (by_sharpness < 0)
+    )
     at_bound[3 * p : 6 * p] = (light.weight.T.reshape(-1) <= 0) & (gradient[3 * p : 6 * p] > 0)
     dark = light.weight.sum(1) <= 0
     at_bound[: 3 * p] |= np.tile(dark, 3)

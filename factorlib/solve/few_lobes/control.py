@@ -22,7 +22,9 @@ class Damping(msgspec.Struct, frozen=True):
         (Damping(value=0.4), Damping(value=3.0))
         """
         share = gained / max(predicted, 1e-300)
-        return Damping(max(self.value / LESS, LEAST_DAMPING) if share > GOOD else self.value if share > BAD else self.value * MORE)
+        return Damping(
+            max(self.value / LESS, LEAST_DAMPING) if share > GOOD else self.value if share > BAD else self.value * MORE
+        )
 
 
 class Termination(msgspec.Struct, frozen=True):

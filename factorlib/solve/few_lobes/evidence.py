@@ -26,7 +26,9 @@ class Candidates(NamedTuple):
     richer: Point
 
 
-def compare(problem: JointProblem, candidates: Candidates, threshold: Threshold, material: int | None = None) -> Evidence:
+def compare(
+    problem: JointProblem, candidates: Candidates, threshold: Threshold, material: int | None = None
+) -> Evidence:
     """Whether the richer model is kept, by the problem's loss of held-out observations.
 
     material: only observations of this material decide; None: all do.  Harm (`Threshold.harm`) counts over all observations

@@ -53,7 +53,9 @@ def lobes_inserted(illumination: Illumination, count: int, candidates: Candidate
     """The light with up to `count` further lobes that explain what it leaves unexplained."""
     residual, lobes = -illumination.residuals()[candidates.rows], candidates.lobes
     chosen, weights = _pursuit(candidates.atoms, residual, lobes, count)
-    return joined(illumination.light, UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3))
+    return joined(
+        illumination.light, UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3)
+    )
 
 
 def _sampled_rows(block: Block, seed: int, sample: int) -> Int[np.ndarray, " n"]:

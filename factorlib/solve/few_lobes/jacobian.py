@@ -58,7 +58,9 @@ class Whitened(msgspec.Struct, frozen=True):
 def places_of(illumination: Illumination) -> Int[np.ndarray, " k+l"]:
     """Numbers of the unknowns on which its radiance depends, ascending: 7 of each material that it shows, then the light's l."""
     shown = 7 * np.unique(illumination.block.material)[:, None] + np.arange(7)
-    return np.concatenate([shown.reshape(-1), 7 * len(illumination.materials) + np.arange(unknowns(illumination.light))])
+    return np.concatenate(
+        [shown.reshape(-1), 7 * len(illumination.materials) + np.arange(unknowns(illumination.light))]
+    )
 
 
 def fitted(illumination: Illumination) -> Illumination:
@@ -99,7 +101,10 @@ def linearised(block: Block, light: Light, materials: Materials, some: Responses
         by_oz = ks * r["specular_by_oz"] * weight[:, c]
         columns = [by_nz * n + by_oz * o for n, o in by_tangent]
         if some.turning is not None:
-            shading = [(kd * d + ks * s) * weight[:, c] for d, s in zip(some.turning.diffuse, some.turning.specular, strict=True)]
+            shading = [
+                (kd * d + ks * s) * weight[:, c]
+                for d, s in zip(some.turning.diffuse, some.turning.specular, strict=True)
+            ]
             columns = [column + also for column, also in zip(columns, shading, strict=True)]
         by_log_sharpness = kd * r["diffuse_by_log_sharpness"] + ks * r["specular_by_log_sharpness"]
         columns += [(by_log_sharpness * by_s + basis * weight_by_s) * weight[:, c], basis / per_energy]
@@ -120,7 +125,11 @@ def _places(light: Light, materials: int, m: int, c: int, p: int) -> Int[np.ndar
     """Numbers of the unknowns of channel c: geometry and weights of the lobes, exposures, those of material m, tones."""
     first = 7 * materials
     end = first + 6 * p + len(light.log_exposure) - 1
-    geometry, exposures, tones = np.arange(first, first + 3 * p), np.arange(first + 6 * p, end), np.arange(end, first + unknowns(light))
+    geometry, exposures, tones = (
+        np.arange(first, first + 3 * p),
+        np.arange(first + 6 * p, end),
+        np.arange(end, first + unknowns(light)),
+    )
     weights = np.arange(first + (3 + c) * p, first + (4 + c) * p)
     return np.concatenate([geometry, weights, exposures, [7 * m + c, 7 * m + 3 + c, 7 * m + 6], tones])
 

@@ -36,7 +36,10 @@ class NormalEquations(msgspec.Struct, frozen=True):
 
 
 def normal_equations(
-    illumination: Illumination, loss: Loss, clusters: Int[np.ndarray, " n"] | None = None, known: Iterable[Responses] | None = None
+    illumination: Illumination,
+    loss: Loss,
+    clusters: Int[np.ndarray, " n"] | None = None,
+    known: Iterable[Responses] | None = None,
 ) -> NormalEquations:
     """The system of the observations that are not held out.
 

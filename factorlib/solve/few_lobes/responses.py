@@ -43,12 +43,20 @@ class Responses(msgspec.Struct, frozen=True):
 
     def basis(self, materials: Materials, c: int) -> Float[Tensor, "n p"]:
         """Radiance in channel c by the lobes' weights there: k_d D + k_s S, exposed."""
-        return materials.diffuse[self.material, c] * self.parts["diffuse"] + materials.specular[self.material, c] * self.parts["specular"]
+        return (
+            materials.diffuse[self.material, c] * self.parts["diffuse"]
+            + materials.specular[self.material, c] * self.parts["specular"]
+        )
 
 
 def responses(illumination: Illumination) -> Iterator[Responses]:
     """The responses of all observations of an illumination, in chunks of rows."""
-    block, light, materials, operator = illumination.block, illumination.light, illumination.materials, illumination.operator
+    block, light, materials, operator = (
+        illumination.block,
+        illumination.light,
+        illumination.materials,
+        illumination.operator,
+    )
     for m, rows in material_slices(block):
         roughness = float(materials.roughness[m])
         exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
@@ -79,7 +87,9 @@ def shadowed_response(
         return r, None
     r = {name: value.clone() for name, value in r.items()}
     turning = Turning(*(tuple(torch.zeros_like(r["diffuse"]) for _ in range(2)) for _ in range(2)))
-    axis, sharpness, *toward = (torch.from_numpy(v).float() for v in (light.axis, light.sharpness, *tangents(light.axis)))
+    axis, sharpness, *toward = (
+        torch.from_numpy(v).float() for v in (light.axis, light.sharpness, *tangents(light.axis))
+    )
     lobes = MovingLobes(axis, sharpness, tuple(toward))
     for some in shadowed_rows(block, rows):
         glossy, by_roughness = highlight_weights(some.normal, some.view, some.directions, float(roughness))

@@ -65,7 +65,9 @@ def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Lo
     radiance = np.concatenate([straightened(one.block.radiance, one.light, one.block.photo) for one in voters])
     trials = []
     for roughness in (present.roughness, *GRID):
-        diffuse, specular = (np.concatenate(part) for part in zip(*(_exposed(one, roughness) for one in voters), strict=True))
+        diffuse, specular = (
+            np.concatenate(part) for part in zip(*(_exposed(one, roughness) for one in voters), strict=True)
+        )
         trials.append((*reflectances(diffuse, specular, radiance, weight), roughness))
     best = min(trials, key=lambda trial: trial[0])
     return Material(*best[1:]) if best[0] < BETTER * trials[0][0] else present
@@ -86,12 +88,17 @@ def _exposed(voters: Illumination, roughness: float) -> tuple[Float[np.ndarray, 
 
 
 def reflectances(
-    diffuse: Float[np.ndarray, "n 3"], specular: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n 3"]
+    diffuse: Float[np.ndarray, "n 3"],
+    specular: Float[np.ndarray, "n 3"],
+    radiance: Float[np.ndarray, "n 3"],
+    weight: Float[np.ndarray, "n 3"],
 ) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Loss, k_d and k_s of the non-negative least-squares fit of radiance by k_d · diffuse + k_s · specular."""
     total, factors = 0.0, np.zeros((3, 2))
     for c in range(3):
-        factors[c], residual = nnls(np.column_stack([diffuse[:, c], specular[:, c]]) * weight[:, c, None], radiance[:, c] * weight[:, c])
+        factors[c], residual = nnls(
+            np.column_stack([diffuse[:, c], specular[:, c]]) * weight[:, c, None], radiance[:, c] * weight[:, c]
+        )
         total += residual**2
     factors = np.maximum(factors, LEAST_REFLECTANCE)
     return total, factors[:, 0], factors[:, 1]

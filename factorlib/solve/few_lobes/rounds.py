@@ -1,14 +1,14 @@
 """Rounds, which find the lobes.
 
-    round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
-            descend on all unknowns (descent), look for a better roughness (roughness), prune, fix the gauge
-            (all on a sample of the observations, which finds the lobes as well as all of them do)
-    best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
-    chosen: the last round whose held-out loss is above the best one's by no more than the standard error of their difference,
-            observation by observation.  Where held-out observations cannot tell two rounds apart, the fitted ones do, which the
-            later round explains better; the least of two losses that are equal up to noise would be rounding's choice
-    stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
-            evidence), at `lobes` lobes per light, or after `rounds`
+round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
+        descend on all unknowns (descent), look for a better roughness (roughness), prune, fix the gauge
+        (all on a sample of the observations, which finds the lobes as well as all of them do)
+best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
+chosen: the last round whose held-out loss is above the best one's by no more than the standard error of their difference,
+        observation by observation.  Where held-out observations cannot tell two rounds apart, the fitted ones do, which the
+        later round explains better; the least of two losses that are equal up to noise would be rounding's choice
+stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fitted loss (a few held-out pixels are noisy
+        evidence), at `lobes` lobes per light, or after `rounds`
 """
 
 from __future__ import annotations
@@ -134,7 +134,9 @@ def _next_round(problem: JointProblem, rounds: Rounds, run: Run) -> Rounds:
     record = Recorder(sample, history, run).record
     fitting = sample.with_loss(robust(sample, rounds.current))
     current = with_new_lobes(fitting, rounds.current, options, number)
-    current = descend(fitting, current, Descent(options.iterations, options.tolerance), partial(record, number, "descent"))
+    current = descend(
+        fitting, current, Descent(options.iterations, options.tolerance), partial(record, number, "descent")
+    )
     current = pruned_in_gauge(fitting, _with_best_roughness(fitting, current).point)
     held_out = record(number, "round", -1, current)
     gain, error = gained(sample, rounds, current.point)
@@ -195,7 +197,9 @@ def _with_best_roughness(problem: JointProblem, current: Iterate) -> Iterate:
 
 def pruned_in_gauge(problem: JointProblem, point: Point) -> Iterate:
     """The point without lobes that have no energy, in the gauge."""
-    return evaluate(problem, in_gauge(Point(point.materials, [pruned(light) for light in point.lights]), problem.blocks))
+    return evaluate(
+        problem, in_gauge(Point(point.materials, [pruned(light) for light in point.lights]), problem.blocks)
+    )
 
 
 def answer_of(problem: JointProblem, point: Point) -> Point:

@@ -62,7 +62,11 @@ class Trials:
 
         most: if the held-out loss exceeds it after the `FIRST` iterations, no more are made
         """
-        own, judge, fixed = self.fitting.restricted(lights), self.problem.restricted(lights), specular_unknowns(lambertian)
+        own, judge, fixed = (
+            self.fitting.restricted(lights),
+            self.problem.restricted(lights),
+            specular_unknowns(lambertian),
+        )
         before = evaluate(own, Point(materials, self.start.restricted(lights).lights))
         after = descend(own, before, Descent(FIRST), fixed=fixed)
         if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):

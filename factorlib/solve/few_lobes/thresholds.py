@@ -16,7 +16,13 @@ class Threshold(msgspec.Struct, frozen=True):
 # The held-out loss of all observations moves by some 3 % as a descent goes on: less says nothing of a specular part.
 SPECULAR = Threshold(gain=0.03, harm=0.05)
 
-NEEDED_EARLY = 1.3  # times the held-out loss: if it is higher after a few iterations without a specular part, that part is needed
+NEEDED_EARLY = (
+    1.3  # times the held-out loss: if it is higher after a few iterations without a specular part, that part is needed
+)
 
-LEAST_DECREASE = 0.005  # of the held-out loss by a round, in σ² of the noise model: a smaller decrease is the operator's error
-HALVED = 0.5  # a round that lowers the fitted loss to this share is not the last: few held-out observations are a noisy vote
+LEAST_DECREASE = (
+    0.005  # of the held-out loss by a round, in σ² of the noise model: a smaller decrease is the operator's error
+)
+HALVED = (
+    0.5  # a round that lowers the fitted loss to this share is not the last: few held-out observations are a noisy vote
+)

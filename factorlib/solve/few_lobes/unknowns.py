@@ -62,7 +62,9 @@ def moved_light(light: Light, step: Float[np.ndarray, " l"], blur: float) -> Lig
     )
 
 
-def moved_point(point: Point, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]) -> Point:
+def moved_point(
+    point: Point, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]
+) -> Point:
     """The nearest point within bounds after a step in all unknowns."""
     blur = point.materials.blur
     lights = [moved_light(light, by, blur) for light, by in zip(point.lights, by_lights, strict=True)]
@@ -71,7 +73,9 @@ def moved_point(point: Point, by_materials: Float[np.ndarray, " 7m"], by_lights:
 
 def taken(light: Light, rows: np.ndarray | slice) -> Light:
     """The lobes `rows` alone, by numbers or a mask."""
-    return msgspec.structs.replace(light, axis=light.axis[rows], log_sharpness=light.log_sharpness[rows], weight=light.weight[rows])
+    return msgspec.structs.replace(
+        light, axis=light.axis[rows], log_sharpness=light.log_sharpness[rows], weight=light.weight[rows]
+    )
 
 
 def joined(light: Light, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:

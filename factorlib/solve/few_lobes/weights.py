@@ -18,7 +18,12 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.solve.few_lobes.jacobian import fitted, with_light
-from factorlib.solve.few_lobes.normal_equations import EnergyEquations, NormalEquations, energy_equations, normal_equations
+from factorlib.solve.few_lobes.normal_equations import (
+    EnergyEquations,
+    NormalEquations,
+    energy_equations,
+    normal_equations,
+)
 from factorlib.solve.few_lobes.responses import responses
 from factorlib.solve.few_lobes.unknowns import unit_energy
 
@@ -44,7 +49,11 @@ def fitted_illumination(illumination: Illumination, loss: Loss) -> Fitted:
     before = energy_equations(own, computed if kept is None else kept, loss)
     found = with_light(own, with_fitted_weights(own.light, before))
     after = normal_equations(found, loss, known=kept)
-    return Fitted(found.light, after) if after.loss <= before.loss else Fitted(own.light, normal_equations(own, loss, known=kept))
+    return (
+        Fitted(found.light, after)
+        if after.loss <= before.loss
+        else Fitted(own.light, normal_equations(own, loss, known=kept))
+    )
 
 
 def with_fitted_weights(light: Light, equations: EnergyEquations) -> Light:

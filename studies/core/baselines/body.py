@@ -75,7 +75,9 @@ def seen(seed: int, size: int, view_from_photo: Float[np.ndarray, "3 3"] = np.ey
     inside = np.zeros(size * size, bool)
     inside[np.flatnonzero(hit)[kept]] = True
     photo_from_body = pose(seed)
-    return Seen(inside.reshape(size, size), points[kept] @ photo_from_body.T, normals[kept] @ photo_from_body.T, view_from_photo)
+    return Seen(
+        inside.reshape(size, size), points[kept] @ photo_from_body.T, normals[kept] @ photo_from_body.T, view_from_photo
+    )
 
 
 def level(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:

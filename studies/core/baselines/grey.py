@@ -21,6 +21,9 @@ ROWS = 32  # of an even map
 
 def grey(photos: Photos, truths: Mapping[str, Reflectance]) -> Rendered:
     """truths: for the gauge alone."""
-    means = {li: np.mean([photos.radiance[entry].mean(axis=0) for entry in photos.radiance if entry[1] == li], axis=0) for li in photos.lights}
+    means = {
+        li: np.mean([photos.radiance[entry].mean(axis=0) for entry in photos.radiance if entry[1] == li], axis=0)
+        for li in photos.lights
+    }
     lights = {li: np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3)) for li, colour in means.items()}
     return Rendered(*in_gauge(dict.fromkeys(photos.materials, GREY), lights, truths), lambertian=True)

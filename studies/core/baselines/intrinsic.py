@@ -29,7 +29,9 @@ from studies.core.baselines.projective import Texture
 from studies.core.baselines.scene import Map, Radiance, Scene
 from studies.core.gauge import factor_of
 
-LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic of a light
+LAMBERT = np.array(
+    [1, *[2 / 3] * 3, *[1 / 4] * 5]
+)  # A_l / π: what a white Lambert surface reflects of each harmonic of a light
 ITERATIONS, LEAST, DARKEST = 60, 0.01, 1e-4
 ROWS = 32  # of the map of a recovered light
 
@@ -47,7 +49,9 @@ def harmonics(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 9"
 def light_coefficients(light: Map) -> Coefficients:
     """∫ L Y over the sphere."""
     height, width = light.shape[:2]
-    return np.einsum("h,hwk,hwc->kc", lat_long_solid_angles(height, width), harmonics(lat_long_directions(height, width)), light)
+    return np.einsum(
+        "h,hwk,hwc->kc", lat_long_solid_angles(height, width), harmonics(lat_long_directions(height, width)), light
+    )
 
 
 class Decomposed(msgspec.Struct, frozen=True):
@@ -75,7 +79,9 @@ def decomposed(normals: Float[np.ndarray, "n 3"], shown: Mapping[str, Radiance])
 def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "9"]:
     """argmin Σ w (I − a Y·e)² of one channel."""
     of_pixel = np.einsum("mn,m->n", weight, albedo**2)
-    return np.linalg.solve((basis * of_pixel[:, None]).T @ basis, basis.T @ np.einsum("mn,m,mn->n", weight, albedo, image))
+    return np.linalg.solve(
+        (basis * of_pixel[:, None]).T @ basis, basis.T @ np.einsum("mn,m,mn->n", weight, albedo, image)
+    )
 
 
 def _weights(residual: Float[np.ndarray, "m n 3"], image: Float[np.ndarray, "m n 3"]) -> Float[np.ndarray, "m n"]:
@@ -127,7 +133,10 @@ class Intrinsic(msgspec.Struct, frozen=True):
 
 def intrinsic(photos: Photos, truths: Mapping[str, Reflectance]) -> Intrinsic:
     """Decompose each photo, average.  truths: for the gauge alone, by their Lambertian parts, for only those does it state."""
-    parts = {li: decomposed(photos.seen.normals, {n: v for (n, at), v in photos.radiance.items() if at == li}) for li in photos.lights}
+    parts = {
+        li: decomposed(photos.seen.normals, {n: v for (n, at), v in photos.radiance.items() if at == li})
+        for li in photos.lights
+    }
     albedo, scale = averaged(parts)
     found = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
     factor = factor_of(found, lambertian_part(truths))

@@ -89,8 +89,19 @@ class Bodies(Joint):
         self.integrator = self.mi.load_dict({"type": "prb", "max_depth": 2})
 
     def _scene(self, seen_by: int) -> Any:
-        gloss = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 0.16, "specular_reflectance": rgb(0.2)}
-        look = {"type": "blendbsdf", "weight": 0.5, "bsdf_0": {"type": "diffuse", "reflectance": rgb(0.6)}, "bsdf_1": gloss}
+        gloss = {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha": 0.16,
+            "specular_reflectance": rgb(0.2),
+        }
+        look = {
+            "type": "blendbsdf",
+            "weight": 0.5,
+            "bsdf_0": {"type": "diffuse", "reflectance": rgb(0.6)},
+            "bsdf_1": gloss,
+        }
         return self.mi.load_dict({
             "type": "scene", "integrator": {"type": "prb", "max_depth": 2}, "sensor": sensor(seen_by),
             "ball": {"type": "ply", "filename": str(self.mesh), "bsdf": look},
@@ -111,9 +122,16 @@ class Bodies(Joint):
 
 def sensor(pixels: int) -> dict[str, Any]:
     """The photos' camera: far in front, `body.REACH` to either side."""
-    world_from_camera = rigid(YUP_FROM_CAMERA, (0.0, 0.0, AWAY)) @ MITSUBA_FROM_CAMERA @ np.diag([body.REACH, body.REACH, 1.0, 1.0])
+    world_from_camera = (
+        rigid(YUP_FROM_CAMERA, (0.0, 0.0, AWAY)) @ MITSUBA_FROM_CAMERA @ np.diag([body.REACH, body.REACH, 1.0, 1.0])
+    )
     film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    return {"type": "orthographic", "to_world": transform(world_from_camera), "sampler": {"type": "independent"}, "film": film}
+    return {
+        "type": "orthographic",
+        "to_world": transform(world_from_camera),
+        "sampler": {"type": "independent"},
+        "film": film,
+    }
 
 
 def _pictures(photos: Photos, pixels: int, mask: Bool[np.ndarray, "h w"]) -> Pictures:
@@ -145,7 +163,9 @@ def flat(losses: list[float]) -> bool:
 
 def optimised(seed: int, photos: Photos, how: case.Joint, rate: float = RATE) -> Optimised:
     """Optimise in a process of its own.  InputError where Mitsuba has no derivatives on this machine."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_end_with, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(
+        1, mp_context=get_context("spawn"), initializer=_end_with, initargs=(os.getpid(),)
+    ) as pool:
         return pool.submit(_optimised, seed, photos.seen, photos.radiance, how, rate).result()
 
 

@@ -47,7 +47,9 @@ def photographed(case: Comparison, materials: Mapping[str, Reflectance], lights:
     for m, li in case.entries:
         name, material = named[m]
         exact = scenes[li].of(material)
-        shown[name, li] = exact * (1 + NOISE * np.random.default_rng([15, case.seed, li, m]).standard_normal(exact.shape))
+        shown[name, li] = exact * (
+            1 + NOISE * np.random.default_rng([15, case.seed, li, m]).standard_normal(exact.shape)
+        )
     return Photos(camera, shown)
 
 

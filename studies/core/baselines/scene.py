@@ -43,4 +43,6 @@ class Scene:
     def of(self, material: Reflectance) -> Radiance:
         """Of a material."""
         value = np.asarray(material.diffuse) * self.diffuse
-        return value + np.asarray(material.specular) * self.glossy(material.roughness) if any(material.specular) else value
+        return (
+            value + np.asarray(material.specular) * self.glossy(material.roughness) if any(material.specular) else value
+        )

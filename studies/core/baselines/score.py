@@ -67,7 +67,11 @@ def shots(case: Comparison, world: World, prediction: Prediction) -> list[Shot]:
     scenes = {(li, view): Scene(world.lights[li], camera) for li in world.lights for view, camera in cameras.items()}
     found = ((a, cameras[a.view], scenes[a.light, a.view].of(world.materials[a.material])) for a in asked(case, world))
     answered = ((a, camera, truth, _predicted(a, prediction, world, camera)) for a, camera, truth in found)
-    return [Shot(a, camera, truth, p, white_of(camera.picture(truth), camera.inside)) for a, camera, truth, p in answered if p is not None]
+    return [
+        Shot(a, camera, truth, p, white_of(camera.picture(truth), camera.inside))
+        for a, camera, truth, p in answered
+        if p is not None
+    ]
 
 
 def asked(case: Comparison, world: World) -> Iterator[Asked]:
@@ -75,7 +79,12 @@ def asked(case: Comparison, world: World) -> Iterator[Asked]:
     names, first, unseen = list(world.materials), case.lights[0], sorted(world.lights.keys() - set(case.lights))
     yield from (Asked("novel_view", names[m], li, view, li) for view in VIEWS for m, li in case.entries)
     yield from (Asked("novel_light", name, li, "front", first) for name in case.material_names for li in unseen)
-    yield from (Asked("novel_material", name, li, "front", None) for name in names if name not in case.material_names for li in case.lights)
+    yield from (
+        Asked("novel_material", name, li, "front", None)
+        for name in names
+        if name not in case.material_names
+        for li in case.lights
+    )
 
 
 def _predicted(a: Asked, by: Prediction, world: World, camera: Seen) -> Radiance | None:
@@ -99,7 +108,10 @@ def _errors(found: list[Shot]) -> dict[str, float]:
     """Mean DSSIM in each gauge."""
     samples = [[getattr(shot, part) for shot in found] for part in ("predicted", "truth", "white")]
     factors = gauge_factors(*samples, below_white=True)
-    return {gauge: float(np.mean([shot.dssim(f) for shot, f in zip(found, factor, strict=True)])) for gauge, factor in factors.items()}
+    return {
+        gauge: float(np.mean([shot.dssim(f) for shot, f in zip(found, factor, strict=True)]))
+        for gauge, factor in factors.items()
+    }
 
 
 def _of_materials(prediction: Prediction, world: World) -> Score:
@@ -107,11 +119,18 @@ def _of_materials(prediction: Prediction, world: World) -> Score:
     if not prediction.materials:
         return Score({})
     truths = lambertian_part(world.materials) if prediction.lambertian else world.materials
-    return material_errors(prediction.materials, truths, dict.fromkeys(prediction.materials, 0), PARTS[:1] if prediction.lambertian else PARTS)
+    return material_errors(
+        prediction.materials,
+        truths,
+        dict.fromkeys(prediction.materials, 0),
+        PARTS[:1] if prediction.lambertian else PARTS,
+    )
 
 
 def _of_lights(prediction: Prediction, world: World) -> Score:
     if not prediction.lights:
         return Score({})
-    estimates, truths = ({li: light_of_lat_long(of[li]) for li in prediction.lights} for of in (prediction.lights, world.lights))
+    estimates, truths = (
+        {li: light_of_lat_long(of[li]) for li in prediction.lights} for of in (prediction.lights, world.lights)
+    )
     return light_errors(named(estimates), named(truths))

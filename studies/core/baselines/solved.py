@@ -17,7 +17,9 @@ from studies.core.lights import maps_of
 def ours(folder: Path, numbers: list[int], truths: Mapping[str, Reflectance]) -> Rendered:
     """What the stage `solve` wrote; numbers: of the lights.  truths: for the gauge alone."""
     table = read_materials(folder / "materials.json").materials
-    return Rendered(*in_gauge({name: solved.reflectance for name, solved in table.items()}, maps_of(folder, numbers), truths))
+    return Rendered(
+        *in_gauge({name: solved.reflectance for name, solved in table.items()}, maps_of(folder, numbers), truths)
+    )
 
 
 def mitsubas(found: Optimised, truths: Mapping[str, Reflectance]) -> Rendered:

@@ -37,4 +37,8 @@ class LeftOutCase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def shells(self) -> tuple[str, ...]:
         """The materials that are left out one at a time."""
-        return tuple(shell for shell in CHAIRS[self.photo] if any(shell in CHAIRS[other] for other in self.photos if other != self.photo))
+        return tuple(
+            shell
+            for shell in CHAIRS[self.photo]
+            if any(shell in CHAIRS[other] for other in self.photos if other != self.photo)
+        )

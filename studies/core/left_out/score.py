@@ -47,7 +47,9 @@ class Chair(msgspec.Struct, frozen=True):
     def cut_out(self, image: Image) -> UInt8[np.ndarray, "h w 3"]:
         """A picture of the shell alone, exposed as the photo's."""
         rows, columns = np.nonzero(self.mask)
-        box = np.s_[max(rows.min() - MARGIN, 0) : rows.max() + MARGIN, max(columns.min() - MARGIN, 0) : columns.max() + MARGIN]
+        box = np.s_[
+            max(rows.min() - MARGIN, 0) : rows.max() + MARGIN, max(columns.min() - MARGIN, 0) : columns.max() + MARGIN
+        ]
         return np.where(self.mask[box][..., None], picture(image[box], 1 / self.white), np.uint8(255))
 
 
@@ -75,7 +77,9 @@ def predicted(photos: Path, solved: Path, chair: Chair, materials: list[str], bo
         around = Surroundings(seen, sent)
     reflectances = in_order(table, materials, solved / "materials.json")
     alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
-    found = resynthesised(Reflector(reflection_operator("network"), lobes), reflectances, alone, geometry, around=around)
+    found = resynthesised(
+        Reflector(reflection_operator("network"), lobes), reflectances, alone, geometry, around=around
+    )
     tone = table.model.tone.get(chair.photo)
     return shown(found, tone.exponent, tone.pivot) if tone else found
 
@@ -87,7 +91,11 @@ def score_of(chairs: list[Chair], images: list[Image]) -> Score:
         "chair": [_dssim(chair, image) for chair, image in pairs],
         "chair_scaled": [_dssim(chair, image * _factor(chair, image)) for chair, image in pairs],
     }
-    null = float(np.mean([_dssim(chair, np.broadcast_to(chair.truth[chair.mask].mean(0), chair.truth.shape)) for chair in chairs]))
+    null = float(
+        np.mean(
+            [_dssim(chair, np.broadcast_to(chair.truth[chair.mask].mean(0), chair.truth.shape)) for chair in chairs]
+        )
+    )
     return Score({name: float(np.mean(of)) for name, of in values.items()}, dict.fromkeys(values, null))
 
 

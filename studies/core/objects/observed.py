@@ -49,9 +49,14 @@ class Given(msgspec.Struct, frozen=True):
     pose: Pose
 
 
-def observations_of(case: ObjectsCase, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]) -> dict[str, list[Seen]]:
+def observations_of(
+    case: ObjectsCase, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+) -> dict[str, list[Seen]]:
     """The entries of each photo, one photo a light, by name."""
-    return {light_name(li): [_entry(case, m, li, materials, lights[li]) for m, at in case.entries if at == li] for li in case.lights}
+    return {
+        light_name(li): [_entry(case, m, li, materials, lights[li]) for m, at in case.entries if at == li]
+        for li in case.lights
+    }
 
 
 def together(entries: list[Seen]) -> Observations:
@@ -108,7 +113,9 @@ def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"])
     return float(np.degrees(np.median(np.arccos(cosine)))) if len(cosine) else 180.0
 
 
-def _observations(case: ObjectsCase, m: int, li: int, normal: np.ndarray, radiance: np.ndarray, sure: np.ndarray) -> Observations:
+def _observations(
+    case: ObjectsCase, m: int, li: int, normal: np.ndarray, radiance: np.ndarray, sure: np.ndarray
+) -> Observations:
     n, zero, photo = len(normal), np.zeros(len(normal), int), (light_name(li),)
     return Observations(
         normal=normal, view=np.tile(FRONT, (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool),

@@ -16,13 +16,17 @@ RIM = 3  # pixels
 def column(pictures: Pictures, light: int, true: bool = False) -> UInt8[np.ndarray, "h w 3"]:
     """Spheres of the recovered materials, or of the true ones, one below the other, in a true light."""
     of = pictures.truths if true else pictures.answer.materials
-    return np.concatenate([shown(pictures, pictures.true[light].ball(of[n]), n, light) for n in pictures.case.material_names])
+    return np.concatenate(
+        [shown(pictures, pictures.true[light].ball(of[n]), n, light) for n in pictures.case.material_names]
+    )
 
 
 def matrix(pictures: Pictures, true: bool = False) -> UInt8[np.ndarray, "h w 3"]:
     """All materials in all lights, recovered or true; entries that were observed have a bright frame."""
     case = pictures.case
-    return np.concatenate([np.concatenate([_cell(pictures, m, li, true) for li in case.lights], axis=1) for m in case.materials])
+    return np.concatenate(
+        [np.concatenate([_cell(pictures, m, li, true) for li in case.lights], axis=1) for m in case.materials]
+    )
 
 
 def _cell(pictures: Pictures, material: int, light: int, true: bool) -> UInt8[np.ndarray, "h w 3"]:

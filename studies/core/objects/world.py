@@ -24,7 +24,11 @@ from studies.core.objects.case import SEVEN
 
 FURTHER = (Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45), Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38))
 BODIES = ("blob", "jug", "hook")
-SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; of it, the mesh's diameter; focal length over the picture's side
+SIDE, FILL, FAR = (
+    160,
+    0.9,
+    100.0,
+)  # pixels of a picture; of it, the mesh's diameter; focal length over the picture's side
 
 
 def materials_of(seed: int) -> dict[str, Reflectance]:

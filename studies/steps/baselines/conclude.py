@@ -32,11 +32,16 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Sum up the scores of all cases."""
     seed = inputs.facts["dataset.study"]["scale"]["seeds"][0]
-    conclude(inputs, out, pictures={_named(kind, seed): png_bytes(_sheet(inputs["score"], seed, kind)) for kind in CAPTIONS})
+    conclude(
+        inputs, out, pictures={_named(kind, seed): png_bytes(_sheet(inputs["score"], seed, kind)) for kind in CAPTIONS}
+    )
 
 
 def _named(kind: str, seed: int) -> Picture:
-    return Picture(f"{kind}.png", CAPTIONS[kind].format(about=f"Seed {seed}; every column at its truth's exposure, nothing scaled."))
+    return Picture(
+        f"{kind}.png",
+        CAPTIONS[kind].format(about=f"Seed {seed}; every column at its truth's exposure, nothing scaled."),
+    )
 
 
 def _sheet(scores: Path, seed: int, kind: str) -> Pixels:
@@ -45,7 +50,11 @@ def _sheet(scores: Path, seed: int, kind: str) -> Pixels:
     first = folders[LABELS["ours"]]
     every = [shot.asked for shot in _shots(first) if shot.asked.kind == kind]
     chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, MOST_COLUMNS).round().astype(int))]
-    rows = [("photo", [read_png(first / f"{photo_name(a.material, a.photo)}.png") for a in chosen])] if chosen[0].photo is not None else []
+    rows = (
+        [("photo", [read_png(first / f"{photo_name(a.material, a.photo)}.png") for a in chosen])]
+        if chosen[0].photo is not None
+        else []
+    )
     rows.append(("truth", [read_png(first / f"{a.name}-truth.png") for a in chosen]))
     for label, names in answered.items():
         rows.append((label, [read_png(folders[label] / f"{a.name}.png") if a.name in names else None for a in chosen]))

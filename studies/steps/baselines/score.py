@@ -29,8 +29,13 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with the truth."""
-    case, lights = (msgspec.convert(inputs.facts[f"dataset.{name}"], of) for name, of in (("case", Comparison), ("worlds", Lights)))
-    world = World(materials_of(case.seed), {li: read_rgb_exr(inputs["worlds"] / light_file(case.seed, li)) for li in range(lights.lights)})
+    case, lights = (
+        msgspec.convert(inputs.facts[f"dataset.{name}"], of) for name, of in (("case", Comparison), ("worlds", Lights))
+    )
+    world = World(
+        materials_of(case.seed),
+        {li: read_rgb_exr(inputs["worlds"] / light_file(case.seed, li)) for li in range(lights.lights)},
+    )
     photos = read_photos(case, inputs["observe"] / inputs.photo)
     prediction, seconds = answer(case, photos, _written(case, inputs), world.materials)
     found = shots(case, world, prediction)

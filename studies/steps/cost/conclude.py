@@ -13,7 +13,11 @@ from studies.core.table import Conclusion, Spread
 from studies.report.curves import curves
 from studies.steps.conclusion import conclude
 
-ANSWERS = {"linear": "agrees", "less than linear": "disagrees: less than linear", "more than linear": "disagrees: more than linear"}
+ANSWERS = {
+    "linear": "agrees",
+    "less than linear": "disagrees: less than linear",
+    "more than linear": "disagrees: more than linear",
+}
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -28,7 +32,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def notes(found: Conclusion) -> list[str]:
     """Exponents, where there are two sizes or more; and what a GPU would do."""
     kinds = {"6 lobes a light": "", "as the solve is by default": "default-"}
-    said = [_said(found, words, prefix, m) for words, prefix in kinds.items() for m in ("seconds", "grown") if len(_sizes(found, prefix)) > 1]
+    said = [
+        _said(found, words, prefix, m)
+        for words, prefix in kinds.items()
+        for m in ("seconds", "grown")
+        if len(_sizes(found, prefix)) > 1
+    ]
     return [*said, "The paper's 30 minutes are of other pictures, another machine and a GPU: no ratio is drawn."]
 
 

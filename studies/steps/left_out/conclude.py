@@ -28,9 +28,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     pictures = {}
     for setting in study.settings(scale):
         cases = [case_name(setting.name, seed) for seed in study.seeds_of(scale)]
-        shown = ", ".join(f"{setting.case(seed).photo} ({', '.join(setting.case(seed).shells)})" for seed in study.seeds_of(scale))
-        caption = f"{setting.label}: the chairs' shells in the photos (above) and predicted (below), exposed alike: {shown}."
-        pictures[Picture(f"{setting.name}.png", caption)] = png_bytes(side_by_side([read_png(inputs["score"] / f"chairs-{case}.png") for case in cases]))
+        shown = ", ".join(
+            f"{setting.case(seed).photo} ({', '.join(setting.case(seed).shells)})" for seed in study.seeds_of(scale)
+        )
+        caption = (
+            f"{setting.label}: the chairs' shells in the photos (above) and predicted (below), exposed alike: {shown}."
+        )
+        pictures[Picture(f"{setting.name}.png", caption)] = png_bytes(
+            side_by_side([read_png(inputs["score"] / f"chairs-{case}.png") for case in cases])
+        )
     photos = {seed: study.settings(scale)[0].case(seed).photo for seed in study.seeds_of(scale)}
     conclude(inputs, out, pictures=pictures, notes=lambda found: [by_photo(found, photos)])
 

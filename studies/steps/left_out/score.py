@@ -39,7 +39,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     images = [image(shell, chair) for shell, chair in zip(case.shells, chairs, strict=True)]
     write_json(out / f"{inputs.photo}.json", score_of(chairs, images))
-    pairs = [np.concatenate([chair.cut_out(chair.truth), chair.cut_out(found)]) for chair, found in zip(chairs, images, strict=True)]
+    pairs = [
+        np.concatenate([chair.cut_out(chair.truth), chair.cut_out(found)])
+        for chair, found in zip(chairs, images, strict=True)
+    ]
     height = max(len(pair) for pair in pairs)
     padded = [np.pad(pair, ((0, height - len(pair)), (0, 0), (0, 0)), constant_values=255) for pair in pairs]
     write_png(out / f"chairs-{inputs.photo}.png", np.concatenate(padded, axis=1))

@@ -26,8 +26,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def notes(found: Conclusion) -> list[str]:
     """The spread over all seeds as runs are, then what other instructions change of the same seeds."""
     fixed = [row for row in found.rows if row.name.startswith("fixed")]
-    over = [_spread(measure, [v for row in fixed for v in row.cells[measure].values.values()]) for measure in found.measures]
-    return over + [_changed(row.label, row.cells, fixed[0].cells, found.measures) for row in found.rows if not row.name.startswith("fixed")]
+    over = [
+        _spread(measure, [v for row in fixed for v in row.cells[measure].values.values()]) for measure in found.measures
+    ]
+    return over + [
+        _changed(row.label, row.cells, fixed[0].cells, found.measures)
+        for row in found.rows
+        if not row.name.startswith("fixed")
+    ]
 
 
 def _spread(measure: str, values: list[float]) -> str:

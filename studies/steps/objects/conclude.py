@@ -29,7 +29,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     study, scale = STUDIES[facts["name"]], msgspec.convert(facts["scale"], Scale)
     settings, seed = study.settings(scale), scale.seeds[0]
     materials = {tuple(_case(setting, seed).material_names) for setting in settings}
-    pictures = by_setting(settings, seed, inputs["score"]) if len(materials) == 1 else matrices(settings, seed, inputs["score"])
+    pictures = (
+        by_setting(settings, seed, inputs["score"])
+        if len(materials) == 1
+        else matrices(settings, seed, inputs["score"])
+    )
     conclude(inputs, out, pictures=pictures)
 
 

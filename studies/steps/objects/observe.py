@@ -35,4 +35,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if case.start == "earlier":
         for name in list(photos)[:-1]:
             write_observations(folder / "earlier" / f"{name}.parquet", together(photos[name]))
-    write_json(folder / "normals.json", float(np.mean([each.normal_error_deg for entries in photos.values() for each in entries])))
+    write_json(
+        folder / "normals.json",
+        float(np.mean([each.normal_error_deg for entries in photos.values() for each in entries])),
+    )

@@ -20,4 +20,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Solve and compare."""
     case = msgspec.convert(inputs.facts["dataset.case"], Part)
     folder = str(case.seed)
-    write_json(out / f"{inputs.photo}.json", score_of(case, inputs["sets"] / folder, inputs["observe"] / folder / "urm"))
+    write_json(
+        out / f"{inputs.photo}.json", score_of(case, inputs["sets"] / folder, inputs["observe"] / folder / "urm")
+    )

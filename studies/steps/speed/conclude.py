@@ -17,4 +17,6 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Sum up the scores of all cases."""
-    conclude(inputs, out, drawn=lambda found: against(found, "seconds", ("entries", "new_light", "diffuse", "roughness")))
+    conclude(
+        inputs, out, drawn=lambda found: against(found, "seconds", ("entries", "new_light", "diffuse", "roughness"))
+    )

@@ -21,7 +21,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with all lights of the world."""
-    case, world = (msgspec.convert(inputs.facts[f"dataset.{name}"], of) for name, of in (("case", Case), ("worlds", World)))
+    case, world = (
+        msgspec.convert(inputs.facts[f"dataset.{name}"], of) for name, of in (("case", Case), ("worlds", World))
+    )
     lights = {li: light(read_rgb_exr(inputs["worlds"] / light_file(case.seed, li))) for li in range(world.lights)}
     found = scored(case, materials_of(case.seed), solved := inputs["solve"] / inputs.photo, lights)
     write_json(out / f"{inputs.photo}.json", found.score | Score({"seconds": read_json(solved / "seconds.json")}))

@@ -34,7 +34,10 @@ def iterate():
 
 def blocks():
     rng = np.random.default_rng(2)
-    return [block(f"room{k}", random_light(rng, 4, photos), MATERIALS, SHOWN[k], OPERATOR, size=12) for k, photos in enumerate((1, 2))]
+    return [
+        block(f"room{k}", random_light(rng, 4, photos), MATERIALS, SHOWN[k], OPERATOR, size=12)
+        for k, photos in enumerate((1, 2))
+    ]
 
 
 def dense(system):
@@ -65,7 +68,9 @@ def blocks_damped(system, damping):
 
 
 def unbounded(iterate):
-    bounds = [Bounds(part, light, MATERIALS) for part, light in zip(iterate.system.parts, iterate.point.lights, strict=True)]
+    bounds = [
+        Bounds(part, light, MATERIALS) for part, light in zip(iterate.system.parts, iterate.point.lights, strict=True)
+    ]
     assert all(bound.free.all() for bound in bounds)
     return bounds
 
@@ -89,13 +94,17 @@ def test_the_equations_are_those_of_the_jacobian_by_all_unknowns(iterate):
         shown = np.flatnonzero(np.diag(hessian)[:21])
         np.testing.assert_array_equal(part.places, shown)
         np.testing.assert_allclose(part.cross_hessian, hessian[shown, 21:], rtol=1e-9, atol=1e-9 * hessian.max())
-        np.testing.assert_allclose(part.material_hessian, hessian[np.ix_(shown, shown)], rtol=1e-9, atol=1e-9 * hessian.max())
+        np.testing.assert_allclose(
+            part.material_hessian, hessian[np.ix_(shown, shown)], rtol=1e-9, atol=1e-9 * hessian.max()
+        )
 
 
 def test_the_step_is_that_of_a_dense_solve(iterate):
     by_materials, by_lights = iterate.system.solved(EVERY, unbounded(iterate), DAMPING)
     expected = np.linalg.solve(blocks_damped(iterate.system, DAMPING), -dense(iterate.system)[1])
-    np.testing.assert_allclose(np.concatenate([by_materials, *by_lights]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        np.concatenate([by_materials, *by_lights]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max()
+    )
 
 
 def test_what_is_fixed_is_what_a_dense_solve_of_the_rest_leaves_out(iterate):
@@ -108,7 +117,9 @@ def test_what_is_fixed_is_what_a_dense_solve_of_the_rest_leaves_out(iterate):
     expected = np.concatenate([np.zeros(len(free)), *(bound.fixed for bound in bounds)])
     right = -(gradient + whole @ expected)
     expected[loose] = np.linalg.solve(hessian[np.ix_(loose, loose)], right[loose])
-    np.testing.assert_allclose(np.concatenate([by_materials, *by_lights]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        np.concatenate([by_materials, *by_lights]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max()
+    )
 
 
 def test_the_schur_complement_is_the_inverse_of_the_materials_part_of_the_dense_inverse(iterate):
@@ -130,7 +141,9 @@ def test_the_predicted_decrease_is_that_of_the_quadratic_model(iterate):
 def test_a_small_step_lowers_the_loss_as_predicted(iterate):
     """Where the quadratic model holds: at strong damping."""
     step = damped_step(iterate, 1e4)
-    gained = iterate.loss - fit_loss_of(JointProblem(blocks(), OPERATOR), moved_point(iterate.point, step.materials, step.lights))
+    gained = iterate.loss - fit_loss_of(
+        JointProblem(blocks(), OPERATOR), moved_point(iterate.point, step.materials, step.lights)
+    )
     assert gained == pytest.approx(step.predicted, rel=0.02)
 
 
@@ -139,7 +152,10 @@ def test_no_step_leaves_its_bounds(iterate):
         step = damped_step(iterate, damping)
         for light, by in zip(iterate.point.lights, step.lights, strict=True):
             p = len(light)
-            turn, widths = np.hypot(by[:p], by[p : 2 * p]), np.minimum(MOST_WIDTHS / np.sqrt(light.sharpness), MOST_TURN)
+            turn, widths = (
+                np.hypot(by[:p], by[p : 2 * p]),
+                np.minimum(MOST_WIDTHS / np.sqrt(light.sharpness), MOST_TURN),
+            )
             assert (turn <= widths * 1.0001).all() or (np.abs(by[2 * p : 3 * p]) <= MOST_S).all()
             moved = moved_light(light, by, MATERIALS.blur)
             assert (moved.sharpness <= MATERIALS.sharpest * (1 + 1e-9)).all() and (moved.weight >= 0).all()
@@ -159,7 +175,9 @@ def test_tightening_fixes_a_sharpness_at_the_end_of_its_range_and_damps_a_lobe_t
 
 def test_an_unknown_at_its_bound_stays_where_the_loss_pushes_beyond():
     materials = Materials(np.full((1, 3), LEAST_REFLECTANCE), np.full((1, 3), 0.2), np.array([ROUGHNESS[1]]))
-    inward = np.array([-1.0, -1, -1, 1, 1, 1, 1])  # gradients: the loss falls as the unknown grows where they are negative
+    inward = np.array(
+        [-1.0, -1, -1, 1, 1, 1, 1]
+    )  # gradients: the loss falls as the unknown grows where they are negative
     assert not materials_at_bound(materials, inward).any()
     np.testing.assert_array_equal(materials_at_bound(materials, -inward), [True] * 3 + [False] * 3 + [True])
 

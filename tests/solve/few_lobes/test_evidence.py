@@ -16,13 +16,20 @@ OPERATOR = reflection_operator("closed_form", dtype="float64")
 def two_lights():
     rng = np.random.default_rng(0)
     lights = [random_light(rng, 3) for _ in range(2)]
-    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=12, seed=k) for k, light in enumerate(lights)]
-    scaled = [msgspec.structs.replace(light, weight=light.weight / b.unit) for b, light in zip(blocks, lights, strict=True)]
+    blocks = [
+        block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=12, seed=k) for k, light in enumerate(lights)
+    ]
+    scaled = [
+        msgspec.structs.replace(light, weight=light.weight / b.unit) for b, light in zip(blocks, lights, strict=True)
+    ]
     return JointProblem(blocks, OPERATOR), Point(MATERIALS, scaled)
 
 
 def brighter(point, factor, lights=(0, 1)):
-    scaled = [msgspec.structs.replace(li, weight=li.weight * factor) if k in lights else li for k, li in enumerate(point.lights)]
+    scaled = [
+        msgspec.structs.replace(li, weight=li.weight * factor) if k in lights else li
+        for k, li in enumerate(point.lights)
+    ]
     return Point(point.materials, scaled)
 
 

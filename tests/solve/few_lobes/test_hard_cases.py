@@ -37,13 +37,17 @@ ONE = "1 material × 1 light"
 
 def bytes_of(answer: Answer) -> bytes:
     lights = b"".join(
-        light.axis.tobytes() + light.log_sharpness.tobytes() + light.weight.tobytes() for light in answer.solution.point.lights
+        light.axis.tobytes() + light.log_sharpness.tobytes() + light.weight.tobytes()
+        for light in answer.solution.point.lights
     )
     return answer.materials.vector().tobytes() + lights
 
 
 def scaled(given: Case, factor: float) -> Case:
-    parts = {name: msgspec.structs.replace(o, radiance=o.radiance * factor) for name, o in (("seen", given.seen), ("clean", given.clean))}
+    parts = {
+        name: msgspec.structs.replace(o, radiance=o.radiance * factor)
+        for name, o in (("seen", given.seen), ("clean", given.clean))
+    }
     return msgspec.structs.replace(given, **parts)
 
 
@@ -57,8 +61,18 @@ def run_stage(folder, seen, **params):
         )  # fmt: skip
         write_observations(folder / "urm" / f"{name}.parquet", own)
     light = {name: {"illumination": name, "world_from_camera": None} for name in seen.photos}
-    inputs = Inputs({"urm": folder / "urm", "train": folder}, {"dataset.materials": list(seen.materials), "dataset.light": light})
-    quick = {"solver": "few_lobes", "operator": "closed_form", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 4, "polish": 3}
+    inputs = Inputs(
+        {"urm": folder / "urm", "train": folder}, {"dataset.materials": list(seen.materials), "dataset.light": light}
+    )
+    quick = {
+        "solver": "few_lobes",
+        "operator": "closed_form",
+        "lobes": 4,
+        "insert": 4,
+        "rounds": 1,
+        "iterations": 4,
+        "polish": 3,
+    }
     stage.main(stage.Params(**(quick | params)), inputs, folder / "out", silent)
     return read_json(folder / "out" / "materials.json")["materials"]
 
@@ -108,7 +122,11 @@ def test_observations_and_photos_in_another_order_are_the_same_blocks():
     seen = CASES["unconnected: 2 × 1 and 3 × 1"](0).seen
     other = seen.take(np.random.default_rng(0).permutation(len(seen)))
     other = msgspec.structs.replace(
-        other, photo=1 - other.photo, illumination=1 - other.illumination, photos=seen.photos[::-1], illuminations=seen.illuminations[::-1]
+        other,
+        photo=1 - other.photo,
+        illumination=1 - other.illumination,
+        photos=seen.photos[::-1],
+        illuminations=seen.illuminations[::-1],
     )
     for a, b in zip(blocks_of_observations(seen, Noise()), blocks_of_observations(other, Noise()), strict=True):
         for field in a.__struct_fields__:
@@ -137,7 +155,9 @@ def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp
         found = run_stage(tmp_path / "harmed", given.seen, merge_degrees=20.0)
     assert "observations are left out" in caplog.text
     assert np.isfinite(numbers(found)).all()
-    kept = np.isfinite(given.seen.radiance).all(1) & np.isfinite(given.seen.normal).all(1) & (given.seen.view != 0).any(1)
+    kept = (
+        np.isfinite(given.seen.radiance).all(1) & np.isfinite(given.seen.normal).all(1) & (given.seen.view != 0).any(1)
+    )
     assert found == run_stage(tmp_path / "whole", given.seen.take(kept), merge_degrees=20.0)
 
 

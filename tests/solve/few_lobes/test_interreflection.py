@@ -35,7 +35,10 @@ def moved_materials(given, step):
 def test_gradients_are_finite_differences_of_the_loss(given, moved):
     found, step = normal_equations(given, LOSS), 1e-6
     gradient = found.light_gradient if moved is moved_light else found.material_gradient
-    expected = [(fit_loss(moved(given, d), LOSS) - fit_loss(moved(given, -d), LOSS)) / (4 * step) for d in np.eye(len(gradient)) * step]
+    expected = [
+        (fit_loss(moved(given, d), LOSS) - fit_loss(moved(given, -d), LOSS)) / (4 * step)
+        for d in np.eye(len(gradient)) * step
+    ]
     np.testing.assert_allclose(gradient, expected, rtol=2e-4, atol=1e-4 * np.abs(expected).max())
 
 

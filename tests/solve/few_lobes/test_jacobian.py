@@ -53,7 +53,9 @@ def test_the_jacobian_is_the_finite_difference_of_the_one_forward_model(given, m
         of_channel[:, part.places] = part.jacobian.numpy()
     jacobian = whole[..., first:] if moved is moved_light else whole[..., :first]
     expected = np.moveaxis(derivative(lambda d: moved(given, d).residuals(), jacobian.shape[-1]), 0, -1)
-    compared = ~given.block.held_out[:, None] & (np.abs(given.residuals()) > 1e-3)  # a clipped channel just satisfied has two slopes
+    compared = ~given.block.held_out[:, None] & (
+        np.abs(given.residuals()) > 1e-3
+    )  # a clipped channel just satisfied has two slopes
     np.testing.assert_allclose(jacobian[compared], expected[compared], atol=1e-5 * np.abs(expected).max())
 
 

@@ -38,10 +38,15 @@ def small():
 def blocks():
     """Two lights with two photos each, some of which is hidden by what is made up."""
     rng = np.random.default_rng(4)
-    made = [block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=8, seed=i) for i in range(2)]
+    made = [
+        block(f"room{i}", random_light(rng, 2, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=8, seed=i)
+        for i in range(2)
+    ]
     visibility = [(255 * (rng.random((len(b), 96)) < 0.9)).astype(np.uint8) for b in made]
     directions = np.stack([fibonacci_sphere(96)] * 2)
-    return [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, visibility, strict=True)]
+    return [
+        msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, visibility, strict=True)
+    ]
 
 
 def answer(blocks, journal=None, stop=lambda event: False):
@@ -53,9 +58,15 @@ def answer(blocks, journal=None, stop=lambda event: False):
         if stop(event):
             raise Killed
 
-    found = few_lobes(JointProblem(blocks, OPERATOR), from_nothing(3), Run(OPTIONS, report, journal=journal or Journal()))
+    found = few_lobes(
+        JointProblem(blocks, OPERATOR), from_nothing(3), Run(OPTIONS, report, journal=journal or Journal())
+    )
     p = found.point
-    parts = [p.materials.vector(), found.lambertian, *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
+    parts = [
+        p.materials.vector(),
+        found.lambertian,
+        *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__),
+    ]
     decided = msgspec.json.encode([found.history, found.shadows, found.specular, found.loss])
     return np.concatenate(parts).tobytes() + decided, events
 
@@ -87,7 +98,9 @@ def test_a_killed_solve_goes_on_to_the_same_bits(blocks, whole, tmp_path, place)
     at = places(events)[place]
     seen = []
     with pytest.raises(Killed):
-        answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")), lambda event: seen.append(event) or len(seen) == at + 1)
+        answer(
+            blocks, Journal(Checkpoint(tmp_path / "solve.pt")), lambda event: seen.append(event) or len(seen) == at + 1
+        )
     again, _ = answer(blocks, Journal(Checkpoint(tmp_path / "solve.pt")))
     assert again == bits
 

@@ -22,7 +22,10 @@ def problem(materials: int, lights: int):
     truth = Materials(MATERIALS.diffuse[:materials], MATERIALS.specular[:materials], MATERIALS.roughness[:materials])
     found = [random_light(rng, 5) for _ in range(lights)]
     blocks = [block(f"light_{k}", light, truth, range(materials), OPERATOR) for k, light in enumerate(found)]
-    scaled = [Light(li.axis, li.log_sharpness, li.weight / b.unit, li.log_exposure) for b, li in zip(blocks, found, strict=True)]
+    scaled = [
+        Light(li.axis, li.log_sharpness, li.weight / b.unit, li.log_exposure)
+        for b, li in zip(blocks, found, strict=True)
+    ]
     return blocks, truth, scaled
 
 

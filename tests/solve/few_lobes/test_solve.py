@@ -23,7 +23,10 @@ QUICK = FewLobes(lobes=12, insert=6, rounds=3, iterations=20, polish=60, toleran
 
 def rooms(count=2, lobes=4, photos=1, seed=3):
     rng = np.random.default_rng(seed)
-    return [block(f"room{i}", random_light(rng, lobes, photos), MATERIALS, [0, 1, 2], OPERATOR, seed=i) for i in range(count)]
+    return [
+        block(f"room{i}", random_light(rng, lobes, photos), MATERIALS, [0, 1, 2], OPERATOR, seed=i)
+        for i in range(count)
+    ]
 
 
 def run(blocks, materials=3, options=QUICK):
@@ -93,12 +96,16 @@ def test_exposures_of_photos_that_share_a_light_are_found():
 def test_neither_threads_nor_processes_change_a_bit():
     operator = reflection_operator("network")
     rng = np.random.default_rng(9)
-    blocks = [block(f"room{i}", random_light(rng, 3), MATERIALS, [0, 1, 2], operator, size=12, seed=i) for i in range(3)]
+    blocks = [
+        block(f"room{i}", random_light(rng, 3), MATERIALS, [0, 1, 2], operator, size=12, seed=i) for i in range(3)
+    ]
     options = FewLobes(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
     def answer(map_):
         point = few_lobes(JointProblem(blocks, operator, spread=map_), from_nothing(3), Run(options)).point
-        return np.concatenate([point.materials.vector(), *(v.reshape(-1) for li in point.lights for v in (li.axis, li.weight))])
+        return np.concatenate(
+            [point.materials.vector(), *(v.reshape(-1) for li in point.lights for v in (li.axis, li.weight))]
+        )
 
     serial = answer(serial_map)
     with ThreadPoolExecutor(3) as threads, ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
@@ -125,7 +132,10 @@ def test_what_held_out_observations_cannot_tell_apart_the_fitted_ones_decide(mon
     options = msgspec.structs.replace(QUICK, lobes=18, insert=6, rounds=3)
 
     def lost_at(gain):  # the fitted loss, where each round after the first seems to have this gain, ± 1
-        monkeypatch.setattr("factorlib.solve.few_lobes.rounds.gained", lambda sample, rounds, point: (gain, 1.0) if rounds.done else (np.inf, 0.0))
+        monkeypatch.setattr(
+            "factorlib.solve.few_lobes.rounds.gained",
+            lambda sample, rounds, point: (gain, 1.0) if rounds.done else (np.inf, 0.0),
+        )
         return evaluate(problem, chosen_round(problem, from_nothing(3), Run(options)).point).loss
 
     assert lost_at(-0.9) < 0.5 * lost_at(-1.1)

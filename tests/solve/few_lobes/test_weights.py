@@ -42,7 +42,9 @@ def test_energy_equations_are_those_parts_of_the_normal_equations(data):
     part, whole, p = energy_equations(given, responses(given), loss), normal_equations(given, loss), len(light)
     gradients, hessians = part.gradients, part.hessians
     np.testing.assert_allclose(part.loss, whole.loss, rtol=1e-12)
-    np.testing.assert_allclose(gradients, by_energy(light, whole.light_gradient), rtol=1e-9, atol=1e-9 * np.abs(gradients).max())
+    np.testing.assert_allclose(
+        gradients, by_energy(light, whole.light_gradient), rtol=1e-9, atol=1e-9 * np.abs(gradients).max()
+    )
     for c in range(3):
         own = slice((3 + c) * p, (4 + c) * p)
         np.testing.assert_allclose(hessians[c], whole.light_hessian[own, own], rtol=1e-9, atol=1e-12 * hessians.max())
@@ -65,7 +67,9 @@ def test_everything_else_stays(data):
     for name in ("axis", "log_sharpness", "log_exposure"):
         np.testing.assert_array_equal(getattr(found, name), getattr(light, name))
     again = normal_equations(lit(observed, found), LOSS)
-    np.testing.assert_allclose(at.light_hessian, again.light_hessian, rtol=1e-12, atol=1e-12 * again.light_hessian.max())
+    np.testing.assert_allclose(
+        at.light_hessian, again.light_hessian, rtol=1e-12, atol=1e-12 * again.light_hessian.max()
+    )
 
 
 def test_the_loss_falls_with_outliers_and_clipped_values_too(data):
@@ -83,7 +87,9 @@ def test_the_loss_falls_with_outliers_and_clipped_values_too(data):
 
 def test_weights_that_would_raise_the_loss_are_not_taken(data, monkeypatch):
     observed, light = data
-    monkeypatch.setattr(weights, "with_fitted_weights", lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight))
+    monkeypatch.setattr(
+        weights, "with_fitted_weights", lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight)
+    )
     found, at = fitted_illumination(lit(observed, light), LOSS)
     np.testing.assert_array_equal(found.weight, light.weight)
     assert at.loss == normal_equations(lit(observed, light), LOSS).loss
