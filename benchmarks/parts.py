@@ -36,9 +36,8 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
 from factorlib.solve.few_lobes.descent import Descent, descend
-from factorlib.solve.few_lobes.insertion import blurred, pruned
 from factorlib.solve.few_lobes.rounds import with_new_lobes
-from factorlib.solve.few_lobes.start import starting_light
+from factorlib.solve.few_lobes.unknowns import blurred, pruned, starting_light
 from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations, read_observations
 
@@ -48,7 +47,7 @@ VARIANTS: dict[str, dict] = {
     "as it is": {},
     "no self-shadowing": {"shadows": False},
     "every material specular": {"specular": "on"},
-    "no material specular": {"lambertian": True},
+    "no material specular": {"specular": "off"},
     "no tint prior": {"prior": 0.0},
     "tint prior .1, the paper's": {"prior": 0.1},
     "no interreflection": {"bounces": False},

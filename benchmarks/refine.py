@@ -43,7 +43,6 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
@@ -161,7 +160,7 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
     options = FewLobes(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
-    return few_lobes(JointProblem(blocks, operator), from_nothing(3), Run(options)).point.materials
+    return few_lobes(JointProblem(blocks, operator), 3, Run(options)).point.materials
 
 
 def normal_error(photo: Photo, pose: Pose) -> float:

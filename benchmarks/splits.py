@@ -23,7 +23,6 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection.operator import Operator
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import Start, from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.merge import merge
@@ -83,12 +82,11 @@ def _cells(block: Block) -> Int[np.ndarray, " n"]:
 def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
     """With lights of few lobes.  how: options of `FewLobes`, of the loss and of the start, and effects that are off."""
     how = {key: value for key, value in how.items() if key not in ("seen", "solver")}
-    none_specular, usual = np.full(materials, how.pop("lambertian", False)), Loss()
+    usual = Loss()
     loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
-    start = Start(from_nothing(materials).point, none_specular, none_specular)
     effects = how.pop("shadows", True), how.pop("bounces", True)
     problem = JointProblem(list(blocks), operator, loss, threaded).with_effects(*effects)
-    return few_lobes(problem, start, Run(msgspec.structs.replace(DEFAULT, **how)))
+    return few_lobes(problem, materials, Run(msgspec.structs.replace(DEFAULT, **how)))
 
 
 def shown(solution: Solution, block: Block, operator: Operator) -> Block:

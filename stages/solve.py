@@ -38,7 +38,6 @@ from factorlib.results.uncertainty import write_uncertainty
 from factorlib.solve import options
 from factorlib.solve.few_lobes.history import Run as FewLobesRun
 from factorlib.solve.few_lobes.options import FewLobes, LobeChoices
-from factorlib.solve.few_lobes.rounds import from_nothing as one_lobe_each
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.fit import sure_ones
 from factorlib.solve.history import Event, Solution
@@ -145,12 +144,10 @@ def _solved(
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
         return solve_as_the_paper(problem, len(names), paper, of_subsets(progress))
-    journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
     if params.solver == "few_lobes":
         few = FewLobes(**_own(params, LobeChoices))
-        return few_lobes(
-            problem, one_lobe_each(len(names)), FewLobesRun(few, of_rounds(progress, few.rounds), journal=journal)
-        )
+        return few_lobes(problem, len(names), FewLobesRun(few, of_rounds(progress, few.rounds)))
+    journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
     choices = Choices(**_own(params, Choices))
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(choices, earlier) if earlier else choices

@@ -26,7 +26,6 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations
@@ -301,7 +300,7 @@ def answered(given: Case, options: FewLobes = QUICK, operator: Operator = OPERAT
         given.seen.materials,
     )
     said = undetermined_by_observations(names, problem.blocks)
-    solution = few_lobes(problem, from_nothing(len(given.truth)), Run(options))
+    solution = few_lobes(problem, len(given.truth), Run(options))
     found, materials = solution.point, solution.point.materials
     errors = standard_errors(problem.with_loss(solution.loss), found)
     said += undetermined_by_answer(names, problem.blocks, materials, errors.materials)

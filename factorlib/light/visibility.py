@@ -8,16 +8,13 @@ hidden.  The reflection operator knows the integral without V.  What V leaves of
 
 with L_k the lobe at d_k.  V = 1 gives 1 exactly, a constant light the ambient occlusion.  V is known at the d_k alone,
 so nothing may be narrower than their spacing: a lobe's sharpness λ becomes κ = 1/(1/λ + 1/κ_K), α² grows likewise.
-Two sums over k for all points and lobes are two matrix products; derivatives by axis and log λ are further columns of
-L, that by roughness is a further f.
+Two sums over k for all points and lobes are two matrix products.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,19 +25,6 @@ FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal n
 LEAST = (
     1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
 )
-
-
-class Seen(msgspec.Struct, frozen=True):
-    """The seen share v of p lobes at n points, 0 to 1, and its derivatives; every field [n, p], float32.
-
-    by_first, by_second:  as the lobe's axis turns toward the tangents, per radian
-    """
-
-    share: Tensor
-    by_first: Tensor
-    by_second: Tensor
-    by_log_sharpness: Tensor
-    by_roughness: Tensor | None = None
 
 
 def widest_sharpness(count: int) -> float:
@@ -56,8 +40,8 @@ def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3
 
 def highlight_weights(
     normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"], roughness: float
-) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """f of equation (2), each row's sum 1, and its derivative by roughness."""
+) -> Float[Tensor, "n k"]:
+    """f of equation (2), each row's sum 1."""
     square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
     nd, no, od = product(normals, directions.T), (normals * views).sum(1, keepdim=True), product(views, directions.T)
     upper = (nd > 0).to(nd.dtype)
@@ -66,9 +50,7 @@ def highlight_weights(
     spread = nh2 * (square - 1) + 1
     root = square_root(square + (1 - square) * nd * nd)
     weight = upper * square / spread**2 * nd / (nd + root)
-    weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
-    by_square = weight * (1 / square - 2 * nh2 / spread - (1 - nd * nd) / (2 * root * (nd + root)))
-    return weight, (by_square - weight * by_square.sum(1, keepdim=True)) * (4 * roughness**3)
+    return weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
 
 
 def kernel(
@@ -89,37 +71,3 @@ def seen_share(
 ) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
     return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
-
-
-class MovingLobes(NamedTuple):
-    """p lobes, and the two tangents along which each can turn: unit, at right angles to its axis and to each other."""
-
-    axis: Float[Tensor, "p 3"]
-    sharpness: Float[Tensor, " p"]
-    tangents: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]
-
-
-def seen(
-    visibility: Float[Tensor, "n k"],
-    weights: Float[Tensor, "n k"],
-    directions: Float[Tensor, "k 3"],
-    moving: MovingLobes,
-    by_roughness: Float[Tensor, "n k"] | None = None,
-) -> Seen:
-    """v with its derivatives by turns and sharpness of the lobes; by_roughness: of the `weights`, where v is to be differentiated by it too."""
-    axis, sharpness, tangents = moving
-    p, kappa = len(sharpness), widened(sharpness, len(directions))
-    lobes = kernel(directions, axis, sharpness)
-    turned = [kappa * product(directions, t.T) * lobes for t in tangents]
-    sharpened = (product(directions, axis.T) - 1) * kappa**2 / sharpness * lobes
-    columns = torch.cat([lobes, *turned, sharpened], 1)
-    passed, whole = product(visibility * weights, columns), product(weights, columns)
-    below = whole[:, :p] + LEAST
-    share = (passed[:, :p] + LEAST) / below
-    slopes = [(passed[:, k * p : (k + 1) * p] - share * whole[:, k * p : (k + 1) * p]) / below for k in (1, 2, 3)]
-    rough = (
-        None
-        if by_roughness is None
-        else (product(visibility * by_roughness, lobes) - share * product(by_roughness, lobes)) / below
-    )
-    return Seen(share, *slopes, rough)

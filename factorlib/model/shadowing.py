@@ -67,7 +67,7 @@ def shadowed_specular(
     response = response.clone()
     axis, sharpness = (torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness))
     for some in shadowed_rows(block, rows):
-        weights, _ = highlight_weights(some.normal, some.view, some.directions, float(roughness))
+        weights = highlight_weights(some.normal, some.view, some.directions, float(roughness))
         share = seen_share(some.visibility, weights, kernel(some.directions, axis, sharpness))
         response[some.places] *= share.to(response.dtype)
     return response

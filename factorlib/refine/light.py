@@ -19,9 +19,9 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
 from factorlib.robust import robust_deviation
-from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted, pruned
-from factorlib.solve.few_lobes.start import starting_light
-from factorlib.solve.few_lobes.weights import nonnegative_minimum
+from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
+from factorlib.solve.few_lobes.normal_equations import nonnegative_minimum
+from factorlib.solve.few_lobes.unknowns import pruned, starting_light
 
 ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves
 SAMPLE = 1400  # observations that vote about lobes, the same in every round

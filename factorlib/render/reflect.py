@@ -110,7 +110,7 @@ class Reflector:
             views.float(),
             kernel(directions, self.axis.float(), self.sharpness.float()),
         )
-        weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)[0]
+        weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
         return tuple(seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
 
     # diffuse ----------------------------------------------------------------------------------------------------------

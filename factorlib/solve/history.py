@@ -29,15 +29,10 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Snapshot = Callable[[Event, Point], None]  # called with every point that is tried
 
 
 def unreported(event: Event) -> None:
     """The default: no reports."""
-
-
-def unwatched(event: Event, point: Point) -> None:
-    """The default: no snapshots."""
 
 
 class Solution(msgspec.Struct, frozen=True):

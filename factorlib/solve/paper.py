@@ -47,7 +47,7 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import UnitReflection, cosines, radiance_of
-from factorlib.solve.history import Event, Report, Snapshot, Solution, unreported, unwatched
+from factorlib.solve.history import Event, Report, Solution, unreported
 from factorlib.solve.options import Lobes, Seed
 from factorlib.solve.start import starting_materials
 
@@ -76,9 +76,7 @@ class Paper(msgspec.Struct, frozen=True):
     seed: Seed = 0
 
 
-def solve(
-    problem: JointProblem, materials: int, paper: Paper, report: Report = unreported, snapshot: Snapshot = unwatched
-) -> Solution:
+def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
     """As of the bundle solver: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.model.gauge`."""
     problem = problem.with_effects(False, False).with_loss(Loss(prior=paper.prior))
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
@@ -96,7 +94,6 @@ def solve(
                 Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, paper.lobes * len(blocks))
             )
             report(history[-1])
-            snapshot(history[-1], point)
     return Solution(in_gauge(objective.point(x), blocks), history, problem.loss, np.zeros(materials, bool))
 
 

@@ -56,13 +56,12 @@ def measured(case: Sized) -> Cost:
     from factorlib.reflection import reflection_operator
     from factorlib.solve.few_lobes.history import Run
     from factorlib.solve.few_lobes.options import FewLobes
-    from factorlib.solve.few_lobes.rounds import from_nothing
     from factorlib.solve.few_lobes.solve import few_lobes
 
     operator = reflection_operator("network")
     joint = JointProblem(problem(case.side, operator, case.seed), operator)
     before, start = peak_bytes(), time.process_time()
-    few_lobes(joint, from_nothing(case.side), Run(msgspec.convert({**case.solve, "seed": case.seed}, FewLobes)))
+    few_lobes(joint, case.side, Run(msgspec.convert({**case.solve, "seed": case.seed}, FewLobes)))
     return Cost(time.process_time() - start, before, peak_bytes())
 
 

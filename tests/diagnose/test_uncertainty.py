@@ -14,11 +14,9 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.arrow import ArrowSystem
-from factorlib.solve.few_lobes.descent import Descent, descend
+from factorlib.solve.few_lobes.descent import Descent, descend, evaluate
 from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.iterate import evaluate
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
@@ -85,7 +83,7 @@ def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within
             block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)
         ]
         problem = JointProblem(blocks, OPERATOR)
-        solution = few_lobes(problem, from_nothing(3), Run(FEW_LOBES))
+        solution = few_lobes(problem, 3, Run(FEW_LOBES))
         found, errors = (
             solution.point.materials,
             standard_errors(problem.with_loss(solution.loss), solution.point).materials,

@@ -1,4 +1,4 @@
-"""The arrow-shaped system of all illuminations, and its solution by elimination of every light.
+"""The arrow-shaped system of all illuminations, its solution by elimination of every light, and the limits of a light's step.
 
 With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i per illumination) and gradients g_m, g_i, eliminating every
 light leaves
@@ -7,8 +7,8 @@ light leaves
 
 with 7 unknowns a material.  The Schur complement on the left is the information that the data hold about the materials when the
 lights are unknown too.  A light's C and M have rows for the unknowns of the materials that it shows alone, and so has what its
-elimination adds: with many materials, of which a photo shows few, cost and memory grow with those few.  Levenberg–Marquardt damping multiplies the diagonal, so that the step does not depend on the units of an
-unknown.  Rows and columns of unknowns that are not free become those of the identity.
+elimination adds: with many materials, of which a photo shows few, cost and memory grow with those few.  Levenberg–Marquardt damping multiplies
+the diagonal, so that the step does not depend on the units of an unknown.  Rows and columns of unknowns that are not free become those of the identity.
 """
 
 from __future__ import annotations
@@ -21,12 +21,55 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 
+from factorlib.model.bounds import SHARPNESS
+from factorlib.model.lights import Light
+from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.solve.descent import damped, masked
-from factorlib.solve.few_lobes.bounds import Bounds, light_at_bound
 from factorlib.solve.few_lobes.normal_equations import NormalEquations
+from factorlib.solve.few_lobes.unknowns import light_at_bound
 
+MOST_WIDTHS, MOST_TURN, MOST_S = 0.4, 0.3, 0.25  # of a lobe in one step: its own widths, radians, s
 DEFINITE = 1e-9  # damping that makes a light's block definite where the step itself is not damped
+
+
+class Bounds:
+    """The limits of one light's step.
+
+    free    [l] unknowns that the step may choose
+    fixed   [l] the step of those that are not free
+    extra   [l] damping of an unknown of its own, added to the common damping
+
+    At the start an unknown is not free if it is at a bound and the loss would fall beyond it.  `tighten` adds further limits.
+    """
+
+    def __init__(self, equations: NormalEquations, light: Light, materials: Materials):
+        self.light, self.diagonal = light, np.diag(equations.light_hessian)
+        self.free = ~light_at_bound(light, materials, equations.light_gradient)
+        self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
+        p = len(light)
+        self.low, self.high = np.full(len(self.free), -np.inf), np.full(len(self.free), np.inf)
+        s_now, s_low, s_high = (
+            -np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest)
+        )
+        self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
+
+    def tighten(self, step: Float[np.ndarray, " l"]) -> bool:
+        """Tighten the limits where the step violates them; returns whether any was changed.
+
+        A sharpness that would leave its range is fixed at the end of the range.  A lobe that moves too far gets more damping.
+        """
+        p = len(self.light)
+        outside = self.free & ((step < self.low) | (step > self.high))
+        self.free &= ~outside
+        self.fixed[outside] = np.clip(step, self.low, self.high)[outside]
+        turn = np.hypot(step[:p], step[p : 2 * p]) / np.minimum(MOST_WIDTHS / np.sqrt(self.light.sharpness), MOST_TURN)
+        far = np.zeros(len(step), bool)
+        far[: 2 * p] = np.tile(turn > 1, 2)
+        far[2 * p : 3 * p] = np.abs(step[2 * p : 3 * p]) > MOST_S
+        far &= self.free
+        self.extra[far] = np.maximum(6 * self.extra[far], 1e-3 * self.diagonal[far])
+        return bool(outside.any() or far.any())
 
 
 class Eliminated(NamedTuple):

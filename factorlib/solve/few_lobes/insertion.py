@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.light.lobes import lobe_integral
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
-from factorlib.solve.few_lobes.unknowns import joined, taken
+from factorlib.solve.few_lobes.unknowns import joined
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations whose residuals choose the lobes
@@ -87,17 +86,3 @@ def _pursuit(
         apart = np.linalg.norm(axis - axis[best], axis=1)
         allowed &= (apart > width) | (np.abs(np.log(sharpness / sharpness[best])) > 1)
     return chosen, weights
-
-
-def blurred(light: Light, sharpest: float) -> Light:
-    """The light with lobes sharper than `sharpest` widened to it; their energy stays the same."""
-    log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
-    kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(log_sharpness))
-    return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
-
-
-def pruned(light: Light, least_share: float = 1e-5) -> Light:
-    """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
-    energy = lobe_integral(light.sharpness) * light.weight.sum(1)
-    kept = energy > least_share * max(float(energy.sum()), 1e-30)
-    return taken(light, kept if kept.any() else slice(0, 1))

@@ -1,21 +1,39 @@
-"""The normal equations of one illumination: half the gradient and half the Gauss–Newton Hessian of the loss (for Σ r²: Jᵀr and JᵀJ)."""
+"""The normal equations of one illumination, half the gradient and half the Gauss–Newton Hessian of the loss (for Σ r²: Jᵀr and JᵀJ), and
+its lobes' weights given everything else: a non-negative least-squares problem per illumination and channel.
+
+The weights are solved for on the Cholesky factor of the Gram matrix, so its size is the number of lobes, not of observations.  Clipped
+channels and outliers get the weights that they have at the current residual.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
 
 from factorlib.elementary import product
 from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
-from factorlib.solve.few_lobes.jacobian import fitted, linearise, places_of, whitened
-from factorlib.solve.few_lobes.responses import Responses, bounced_of
-from factorlib.solve.few_lobes.tint import tint_prior
+from factorlib.solve.few_lobes.jacobian import (
+    Responses,
+    fitted,
+    linearise,
+    places_of,
+    responses,
+    tint_prior,
+    whitened,
+    with_light,
+)
 from factorlib.solve.few_lobes.unknowns import unit_energy, unknowns
+
+KEPT = 1 << 20  # responses of observations to lobes that stay in memory; if there are more, they are computed twice
 
 
 class NormalEquations(msgspec.Struct, frozen=True):
@@ -67,7 +85,7 @@ def normal_equations(
     return NormalEquations(total + prior.value, every[:k], gradient[:k], gradient[k:], *blocks, scores)
 
 
-class EnergyEquations(msgspec.Struct, frozen=True):
+class EnergyEquations(NamedTuple):
     """Loss, gradient and Hessian of one illumination by the lobes' energies of each channel alone."""
 
     loss: float
@@ -80,15 +98,11 @@ def energy_equations(illumination: Illumination, known: Iterable[Responses], los
     block, light, materials = illumination.block, illumination.light, illumination.materials
     p, total = len(light), 0.0
     gradient, hessian = np.zeros((3, p)), np.zeros((3, p, p))
-    weight, per_energy = torch.from_numpy(light.weight), torch.from_numpy(unit_energy(light))
+    per_energy = torch.from_numpy(unit_energy(light))
     for some in known:
         for c in range(3):
-            basis = some.basis(materials, c)
-            linear = product(basis, weight[:, c])
-            if block.bounced is not None:
-                linear = linear + torch.from_numpy(bounced_of(block, some.rows, materials, some.material)[:, c])
-            seen = whitened(block, light, some.rows, c, linear, loss)
-            scaled = basis / per_energy * (seen.rising * seen.scale[:, None])
+            seen = whitened(block, some.rows, c, some.linear(block, light, materials, c), loss)
+            scaled = some.basis(materials, c) / per_energy * seen.scale[:, None]
             hessian[c] += product(scaled.T, scaled).numpy()
             gradient[c] += product(scaled.T, seen.residual).numpy()
             total += seen.loss
@@ -98,3 +112,44 @@ def energy_equations(illumination: Illumination, known: Iterable[Responses], los
         gradient[c] += prior.gradient[own]
         hessian[c] += prior.hessian[own, own]
     return EnergyEquations(total + prior.value, gradient, hessian)
+
+
+class Fitted(NamedTuple):
+    """A light with fitted weights, and the normal equations there."""
+
+    light: Light
+    equations: NormalEquations
+
+
+def with_weights_fitted(illumination: Illumination, loss: Loss) -> Fitted:
+    """The light with the weights that lower the loss most, while nothing else changes.
+
+    With clipped observations or outliers the loss is not quadratic in the weights.  If the fitted weights would raise the loss, the
+    light keeps its own.
+    """
+    own = fitted(illumination)
+    computed = responses(own)
+    kept = list(computed) if len(own.block) * len(own.light) <= KEPT else None
+    before = energy_equations(own, computed if kept is None else kept, loss)
+    other = with_light(own, of_least_loss(own.light, before))
+    after = normal_equations(other, loss, known=kept)
+    if after.loss <= before.loss:
+        return Fitted(other.light, after)
+    return Fitted(own.light, normal_equations(own, loss, known=kept))
+
+
+def of_least_loss(light: Light, equations: EnergyEquations) -> Light:
+    """The non-negative weights that minimise the quadratic model by the energies of each channel, all else as it is."""
+    energy = light.energy
+    for c, (gradient, hessian) in enumerate(zip(equations.gradients, equations.hessians, strict=True)):
+        energy[:, c] = nonnegative_minimum(hessian, hessian @ energy[:, c] - gradient)
+    return msgspec.structs.replace(light, weight=energy / unit_energy(light)[:, None])
+
+
+def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """argmin over w ≥ 0 of ½ wᵀHw − tᵀw, H made definite by 1e-9 of its mean diagonal."""
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12 * max(float(np.diag(hessian).max()), 1e-30)))
+    normalised = hessian / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    upper = cholesky(normalised)
+    right = solve_triangular(upper, target / scale, trans="T")
+    return nnls(upper, right, maxiter=50 * len(scale))[0] / scale

@@ -15,7 +15,7 @@ Polish = Annotated[int, Meta(ge=0, le=1000)]
 Sample = Annotated[int, Meta(ge=50)]
 Tolerance = Annotated[float, Meta(gt=0, lt=1)]
 Share = Annotated[float, Meta(ge=0, lt=1)]
-SpecularParts = Literal["auto", "on"]
+SpecularParts = Literal["auto", "on", "off"]
 
 
 class LobeChoices(Choices, frozen=True):
@@ -40,7 +40,7 @@ class LobeChoices(Choices, frozen=True):
     least_gain: Share = 0.01
     """Share of the held-out loss that a round must gain to be the best one; two rounds without gain are the last."""
     specular: SpecularParts = "auto"
-    """Whether every material has a specular part; auto: where held-out observations are explained worse without."""
+    """Whether materials have a specular part: all, none, or (auto) those without which held-out observations are explained worse."""
 
 
 class FewLobes(LobeChoices, frozen=True):

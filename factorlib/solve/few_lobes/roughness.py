@@ -21,7 +21,6 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
-from factorlib.model.tone import slope_at, straightened
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
 ROWS = 300  # observations of each material in each light that are used
@@ -62,7 +61,7 @@ def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Lo
     if not voters:
         return present
     weight = np.concatenate([_weight(one, loss) for one in voters])
-    radiance = np.concatenate([straightened(one.block.radiance, one.light, one.block.photo) for one in voters])
+    radiance = np.concatenate([one.block.radiance for one in voters])
     trials = []
     for roughness in (present.roughness, *GRID):
         diffuse, specular = (
@@ -74,10 +73,9 @@ def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Lo
 
 
 def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:
-    """Square roots of the weights of linear radiance: small for outliers of the present model, 0 for clipped channels."""
-    block = voters.block
-    precision = block.precision * slope_at(block.radiance, voters.light, block.photo)
-    return np.where(block.clipped, 0.0, precision * np.sqrt(loss.trust(voters.residuals())))
+    """Square roots of the weights of radiances: small for outliers of the present model, 0 for clipped channels."""
+    trusted = voters.block.precision * np.sqrt(loss.trust(voters.residuals()))
+    return np.where(voters.block.clipped, 0.0, trusted)
 
 
 def _exposed(voters: Illumination, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -13,12 +13,10 @@ stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
 
 from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
@@ -27,14 +25,12 @@ from factorlib.model.loss import Loss
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
-from factorlib.solve.few_lobes.descent import Descent, descend
+from factorlib.solve.few_lobes.descent import Descent, Iterate, descend, evaluate, fit_weights
 from factorlib.solve.few_lobes.history import Recorder, Run
-from factorlib.solve.few_lobes.insertion import blurred, candidates, lobes_inserted, pruned
-from factorlib.solve.few_lobes.iterate import Iterate, evaluate, fit_weights
+from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
 from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.roughness import materials_of_best_roughness
-from factorlib.solve.few_lobes.start import starting_light
-from factorlib.solve.few_lobes.thresholds import HALVED, LEAST_DECREASE
+from factorlib.solve.few_lobes.unknowns import blurred, pruned, starting_light
 from factorlib.solve.history import Event
 from factorlib.solve.start import starting_materials
 
@@ -42,53 +38,10 @@ A_LOBE = 60  # observations for each lobe of a light, so that lobes do not fit n
 ROBUST = 2.0  # standard deviations: larger residuals are features of the light that few lobes cannot show
 LEAST_ROBUST_SCALE = 0.02
 PATIENCE = 2  # rounds in a row without gain, after which no further one is tried
-
-
-class Start(msgspec.Struct, frozen=True):
-    """Where the rounds start, and what is decided before them.
-
-    point       gives materials and lights for a problem
-    decided     materials for which it is decided whether they have a specular part;  lambertian: those of them that have none
-    """
-
-    point: Callable[[JointProblem, FewLobes], Point]
-    decided: Bool[np.ndarray, " m"]
-    lambertian: Bool[np.ndarray, " m"]
-
-
-def from_nothing(materials: int) -> Start:
-    """Materials 0 … `materials`−1 and lights from mean radiances alone, nothing decided."""
-
-    def point(problem: JointProblem, options: FewLobes) -> Point:
-        """Materials whose diffuse part explains mean radiances, one broad lobe a light."""
-        start = starting_materials(problem.blocks, materials, options.start_specular_share, options.start_roughness)
-        return Point(start, [starting_light(block, start) for block in problem.blocks])
-
-    return Start(point, np.zeros(materials, bool), np.zeros(materials, bool))
-
-
-class Rounds(msgspec.Struct, frozen=True):
-    """The state between two rounds.
-
-    current       the point after the last round;  best: the best point so far, with its held-out loss `held_out`
-    chosen        the last point that held-out observations do not tell to be worse than the best
-    fitted        the fitted loss of the last round
-    without_gain  how many rounds in a row have gained nothing;  over: there is no further round
-    """
-
-    current: Point
-    best: Point
-    chosen: Point
-    held_out: float
-    fitted: float
-    history: list[Event]
-    without_gain: int = 0
-    over: bool = False
-
-    @property
-    def done(self) -> int:
-        """How many rounds."""
-        return sum(event.phase == "round" for event in self.history)
+LEAST_DECREASE = 0.005  # of the held-out loss, in σ² of the noise model: a smaller decrease is the operator's error
+HALVED = (
+    0.5  # a round that lowers the fitted loss to this share is not the last: few held-out observations are a noisy vote
+)
 
 
 class Fit(msgspec.Struct, frozen=True):
@@ -100,20 +53,27 @@ class Fit(msgspec.Struct, frozen=True):
     history: list[Event]
 
 
-def chosen_round(problem: JointProblem, start: Start, run: Run) -> Fit:
+def chosen_round(problem: JointProblem, materials: int, run: Run) -> Fit:
     """Rounds on a sample of the observations, until they gain nothing."""
-    rounds = run.journal.kept("rounds", Rounds)
-    for event in rounds.history if rounds else ():
-        run.report(event)
-    rounds = rounds or run.journal.keep("rounds", _before_rounds(problem, start, run.options))
-    while not rounds.over:
-        rounds = run.journal.keep("rounds", _next_round(problem, rounds, run))
-    sample = sampled_for(problem, rounds.chosen, run.options)
-    return Fit(rounds.chosen, sample.held_out_loss(rounds.chosen), robust(sample, rounds.chosen), rounds.history)
-
-
-def _full(point: Point, options: FewLobes) -> bool:
-    return max(map(len, point.lights)) >= options.lobes
+    options, history = run.options, list[Event]()
+    sample = problem.sampled(options.sample, options.seed)
+    start = starting_materials(sample.blocks, materials, options.start_specular_share, options.start_roughness)
+    current = fit_weights(sample, Point(start, [starting_light(block, start) for block in sample.blocks])).point
+    best = chosen = current
+    least, fitted, without_gain = np.inf, np.inf, 0
+    for number in range(options.rounds):
+        sample = sampled_for(problem, current, options, options.insert)
+        current = round_after(sample, current, run, history, number)
+        held_out, loss = history[-1].held_out, history[-1].loss
+        gain, error = gained(sample, None if np.isinf(least) else best, current)
+        better = gain >= max(options.least_gain * held_out, LEAST_DECREASE)
+        without_gain = 0 if better or loss < HALVED * fitted else without_gain + 1
+        best, least, fitted = current if better else best, held_out if better else least, loss
+        chosen = current if better or gain >= -error else chosen
+        if without_gain >= PATIENCE or max(map(len, current.lights)) >= options.lobes:
+            break
+    sample = sampled_for(problem, chosen, options)
+    return Fit(chosen, sample.held_out_loss(chosen), robust(sample, chosen), history)
 
 
 def sampled_for(problem: JointProblem, point: Point, options: FewLobes, more: int = 0, times: int = 1) -> JointProblem:
@@ -122,43 +82,29 @@ def sampled_for(problem: JointProblem, point: Point, options: FewLobes, more: in
     return problem.sampled(counts, options.seed)
 
 
-def _before_rounds(problem: JointProblem, start: Start, options: FewLobes) -> Rounds:
-    sample = problem.sampled(options.sample, options.seed)
-    current = fit_weights(sample, start.point(sample, options)).point
-    return Rounds(current, current, current, np.inf, np.inf, [])
+def round_after(sample: JointProblem, point: Point, run: Run, history: list[Event], number: int) -> Point:
+    """The point after one round; its events join the history."""
+    record, options = Recorder(sample, history, run).record, run.options
+    fitting = sample.with_loss(robust(sample, point))
+    current = with_new_lobes(fitting, point, options, number)
+    descent = Descent(options.iterations, options.tolerance)
+    current = _with_best_roughness(fitting, descend(fitting, current, descent, partial(record, number, "descent")))
+    lights = [pruned(light) for light in current.point.lights]
+    current = evaluate(fitting, in_gauge(Point(current.point.materials, lights), fitting.blocks))
+    record(number, "round", -1, current)
+    return current.point
 
 
-def _next_round(problem: JointProblem, rounds: Rounds, run: Run) -> Rounds:
-    options, history, number = run.options, list(rounds.history), rounds.done
-    sample = sampled_for(problem, rounds.current, options, options.insert)
-    record = Recorder(sample, history, run).record
-    fitting = sample.with_loss(robust(sample, rounds.current))
-    current = with_new_lobes(fitting, rounds.current, options, number)
-    current = descend(
-        fitting, current, Descent(options.iterations, options.tolerance), partial(record, number, "descent")
-    )
-    current = pruned_in_gauge(fitting, _with_best_roughness(fitting, current).point)
-    held_out = record(number, "round", -1, current)
-    gain, error = gained(sample, rounds, current.point)
-    better = gain >= max(options.least_gain * held_out, LEAST_DECREASE)
-    halved = history[-1].loss < HALVED * rounds.fitted
-    without_gain = 0 if better or halved else rounds.without_gain + 1
-    over = without_gain >= PATIENCE or _full(current.point, options) or number + 1 == options.rounds
-    best, least = (current.point, held_out) if better else (rounds.best, rounds.held_out)
-    chosen = current.point if better or gain >= -error else rounds.chosen
-    return Rounds(current.point, best, chosen, least, history[-1].loss, history, without_gain, bool(over))
-
-
-def gained(sample: JointProblem, rounds: Rounds, point: Point) -> tuple[float, float]:
+def gained(sample: JointProblem, best: Point | None, point: Point) -> tuple[float, float]:
     """By how much the held-out loss of `point` is below the best round's, and the standard error of this difference.
 
     Both points are judged by the same observations; those that are hard for both tell nothing of the difference.  Infinitely, before
     there is a best round.
     """
-    if np.isinf(rounds.held_out):
+    if best is None:
         return np.inf, 0.0
-    best, now = (np.concatenate(sample.held_out_losses(at)) for at in (rounds.best, point))
-    return float((best - now).mean()), float((best - now).std() / np.sqrt(len(now)))
+    before, now = (np.concatenate(sample.held_out_losses(at)) for at in (best, point))
+    return float((before - now).mean()), float((before - now).std() / np.sqrt(len(now)))
 
 
 def robust(problem: JointProblem, point: Point) -> Loss:
@@ -193,13 +139,6 @@ def _with_best_roughness(problem: JointProblem, current: Iterate) -> Iterate:
         return current
     trial = evaluate(problem, Point(materials, current.point.lights))
     return trial if trial.loss < current.loss else current
-
-
-def pruned_in_gauge(problem: JointProblem, point: Point) -> Iterate:
-    """The point without lobes that have no energy, in the gauge."""
-    return evaluate(
-        problem, in_gauge(Point(point.materials, [pruned(light) for light in point.lights]), problem.blocks)
-    )
 
 
 def answer_of(problem: JointProblem, point: Point) -> Point:

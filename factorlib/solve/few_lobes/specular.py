@@ -1,7 +1,7 @@
 """Which materials have a specular part: those without which held-out observations are explained worse.
 
 The specular part of a material that is Lambertian in truth would fit errors of normals and lights.  So each material in turn, the
-least specular first, is made Lambertian for a trial, the rest of the problem is brought near its optimum again, and `compare` decides.
+least specular first, is made Lambertian for a trial, the rest of the problem is brought near its optimum again, and held-out observations decide.
 A material that reflects more specularly than diffusely is not tried: where normals are wrong, a blurred highlight explains held-out
 observations better than the true one, and a dark glossy material would lose all that it reflects.
 
@@ -25,12 +25,15 @@ from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.evidence import Evidence
-from factorlib.solve.few_lobes.bounds import specular_unknowns
-from factorlib.solve.few_lobes.descent import Descent, descend
-from factorlib.solve.few_lobes.evidence import Candidates, compare
-from factorlib.solve.few_lobes.iterate import evaluate
-from factorlib.solve.few_lobes.thresholds import NEEDED_EARLY, SPECULAR
+from factorlib.solve.few_lobes.descent import Descent, descend, evaluate
+from factorlib.solve.few_lobes.unknowns import specular_unknowns
 
+# Without its specular part, the held-out loss of a material that needs it is higher by more than GAIN, or that of all observations that are
+# compared by more than HARM.  The latter moves by some 3 % as a descent goes on: less says nothing.
+GAIN, HARM = 0.03, 0.05
+NEEDED_EARLY = (
+    1.3  # times the held-out loss: if it is higher after a few iterations without a specular part, that part is needed
+)
 FIRST, ITERATIONS = 3, 6  # iterations of a trial, and further ones where the first do not decide
 LIGHTS = 8
 
@@ -71,7 +74,7 @@ class Trials:
         after = descend(own, before, Descent(FIRST), fixed=fixed)
         if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):
             after = descend(own, after, Descent(ITERATIONS), fixed=fixed)
-        harmless = (1 + SPECULAR.harm) * judge.held_out_loss(before.point)
+        harmless = (1 + HARM) * judge.held_out_loss(before.point)
         return after.point if judge.held_out_loss(after.point) <= harmless else before.point
 
     def lights_of(self, m: int) -> Int[np.ndarray, " k"]:
@@ -90,31 +93,28 @@ def without_needless_specular(
     problem: JointProblem,
     start: Point,
     robust: Loss,
-    decided: Bool[np.ndarray, " m"],
-    lambertian: Bool[np.ndarray, " m"],
     report: Callable[[int, float], None] = lambda trial, held_out: None,
 ) -> Specular:
     """The point with needless specular parts gone, which materials have none, and the evidence for every material.
 
     start: nearly at an optimum, so that iterations change the held-out loss less than what is decided;  robust: the loss to lower;
-    decided: materials that are not tried;  lambertian: those of them that have no specular part;  report: called with the number of
-    each trial, from 0, and the held-out loss that it is compared with
+    report: called with the number of each trial, from 0, and the held-out loss that it is compared with
     """
-    trials, lambertian = Trials(problem, start, robust), lambertian.copy()
+    trials, lambertian = Trials(problem, start, robust), np.zeros(len(start.materials), bool)
     every, numbers = np.arange(len(problem.blocks)), np.arange(len(lambertian))
     base = start.materials  # all go on from here by as many iterations
-    chosen, evidence = trials.near_optimum(every, base, lambertian), undecided(lambertian)
+    chosen, evidence = trials.near_optimum(every, base, lambertian), [Evidence(True) for _ in lambertian]
     current = True  # whether `chosen` is the fit of `base`
     for number, m in enumerate(np.argsort(base.specular.mean(1), kind="stable")):
         lights = trials.lights_of(m)
-        if decided[m] or not trials.shows_held_out(lights, m) or base.specular[m].mean() > base.diffuse[m].mean():
+        if not trials.shows_held_out(lights, m) or base.specular[m].mean() > base.diffuse[m].mean():
             continue
         richer = chosen.restricted(lights) if current else trials.near_optimum(lights, base, lambertian)
         judge, without = problem.restricted(lights), base.lambertian(m)
         report(number, held_out := judge.held_out_loss(richer))
         most = NEEDED_EARLY * held_out
         trial = trials.near_optimum(lights, without, lambertian | (numbers == m), most)
-        evidence[m] = compare(judge, Candidates(trial, richer), SPECULAR, int(m))
+        evidence[m] = compare(judge, trial, richer, int(m))
         if evidence[m].kept:
             continue
         base, lambertian[m] = without, True
@@ -123,6 +123,10 @@ def without_needless_specular(
     return Specular(chosen if current else trials.near_optimum(every, base, lambertian), lambertian, evidence)
 
 
-def undecided(lambertian: Bool[np.ndarray, " m"]) -> list[Evidence]:
-    """For materials that are not tried: what was decided before, without losses."""
-    return [Evidence(not one) for one in lambertian.tolist()]
+def compare(problem: JointProblem, without: Point, richer: Point, material: int) -> Evidence:
+    """Whether the specular part of a material is kept, by the held-out losses of two points at (or near) their optimum."""
+    losses = [np.concatenate(problem.held_out_losses(point)) for point in (without, richer)]
+    own = np.concatenate([b.material[b.held_out | problem.none_held_out] for b in problem.blocks]) == material
+    harmed = losses[0].mean() > (1 + HARM) * losses[1].mean()
+    plain, full = (float(of[own].mean()) if own.any() else 0.0 for of in losses)
+    return Evidence(bool(plain > (1 + GAIN) * full or harmed), full, plain)

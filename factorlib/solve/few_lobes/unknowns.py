@@ -1,4 +1,4 @@
-"""The vector of unknowns of a light as few lobes, with the exposures and tone curves of its photos.
+"""The vector of unknowns of a light as few lobes, with the exposures of its photos, and the ranges that they stay in.
 
 A lobe's unknowns are chosen so that they hardly depend on each other: its energy e = w/λ', with λ' = λ/(1 − e^{−2λ}), instead of
 its peak w, and
@@ -15,20 +15,29 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from factorlib.light.lobes import lobe_integral
-from factorlib.model.bounds import SHARPNESS, TONE, sharpest_resolved
+from factorlib.model.blocks import Block
+from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, sharpest_resolved
 from factorlib.model.lights import Light, UnitLobes, tangents
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 
-MOST_TURN, MOST_S, MOST_EXPOSURE, MOST_TONE = 0.3, 1.0, 1.0, 0.2  # largest change of an unknown in one step
+MOST_TURN, MOST_S, MOST_EXPOSURE = 0.3, 1.0, 1.0  # largest change of an unknown in one step
+
+
+def starting_light(block: Block, materials: Materials) -> Light:
+    """One broad lobe in front that gives the block's mean radiance."""
+    reflectance = np.average(materials.diffuse[block.material], axis=0, weights=block.precision.mean(1))
+    axis, sharpness = np.array([[0.0, 0.0, -1.0]]), 0.5
+    weight = block.radiance.mean(0) / np.maximum(reflectance, 1e-6)
+    return Light(axis, np.log([sharpness]), weight[None], np.zeros(len(block.photos)))
 
 
 def unknowns(light: Light) -> int:
     """How many unknowns the light has: the length of a step."""
-    return 6 * len(light) + len(light.log_exposure) - 1 + len(light.log_tone)
+    return 6 * len(light) + len(light.log_exposure) - 1
 
 
 def unit_energy(light: Light) -> Float[np.ndarray, " p"]:
@@ -44,7 +53,7 @@ def sharpness_slopes(light: Light, blur: float) -> tuple[Float[np.ndarray, " p"]
 
 
 def moved_light(light: Light, step: Float[np.ndarray, " l"], blur: float) -> Light:
-    """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1, tones; blur is b."""
+    """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1; blur is b."""
     p = len(light)
     by = step[: 6 * p].reshape(6, p)
     first, second = tangents(light.axis)
@@ -52,13 +61,11 @@ def moved_light(light: Light, step: Float[np.ndarray, " l"], blur: float) -> Lig
     axis = light.axis + turn[0][:, None] * first + turn[1][:, None] * second
     variance = (1 / light.sharpness + blur) * np.exp(-np.clip(by[2], -MOST_S, MOST_S)) - blur
     log_sharpness = -np.log(np.clip(variance, 1 / sharpest_resolved(blur), 1 / SHARPNESS[0]))
-    by_exposure, by_tone = np.split(step[6 * p :], [len(light.log_exposure) - 1])
     return Light(
         axis / np.linalg.norm(axis, axis=1, keepdims=True),
         log_sharpness,
         np.maximum(light.energy + by[3:].T, 0.0) / (lobe_integral(np.exp(log_sharpness))[:, None] / (2 * np.pi)),
-        light.log_exposure + np.concatenate([[0.0], np.clip(by_exposure, -MOST_EXPOSURE, MOST_EXPOSURE)]),
-        np.clip(light.log_tone + np.clip(by_tone, -MOST_TONE, MOST_TONE), *np.log(TONE)),
+        light.log_exposure + np.concatenate([[0.0], np.clip(step[6 * p :], -MOST_EXPOSURE, MOST_EXPOSURE)]),
     )
 
 
@@ -69,6 +76,33 @@ def moved_point(
     blur = point.materials.blur
     lights = [moved_light(light, by, blur) for light, by in zip(point.lights, by_lights, strict=True)]
     return Point(Materials.of_vector(point.materials.vector() + by_materials), lights)
+
+
+def materials_at_bound(materials: Materials, gradient: Float[np.ndarray, " 7m"]) -> Bool[np.ndarray, " 7m"]:
+    """Unknowns of the materials at a bound beyond which the loss would fall, and those on which the loss does not depend."""
+    values = materials.rows()
+    low = np.column_stack([values[:, :6] <= LEAST_REFLECTANCE, values[:, 6] <= ROUGHNESS[0]]).reshape(-1)
+    high = np.column_stack([np.zeros_like(values[:, :6], bool), values[:, 6] >= ROUGHNESS[1]]).reshape(-1)
+    return (low & (gradient > 0)) | (high & (gradient < 0)) | (gradient == 0)
+
+
+def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarray, " l"]) -> Bool[np.ndarray, " l"]:
+    """Unknowns of a light at a bound beyond which the loss would fall, and those of lobes without weight."""
+    p = len(light)
+    at_bound = np.zeros(len(gradient), bool)
+    low, high = np.log([SHARPNESS[0], materials.sharpest])
+    by_sharpness = gradient[2 * p : 3 * p]
+    at_bound[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | (
+        (light.log_sharpness >= high) & (by_sharpness < 0)
+    )
+    at_bound[3 * p : 6 * p] = (light.weight.T.reshape(-1) <= 0) & (gradient[3 * p : 6 * p] > 0)
+    at_bound[: 3 * p] |= np.tile(light.weight.sum(1) <= 0, 3)
+    return at_bound
+
+
+def specular_unknowns(which: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " 7m"]:
+    """Which unknowns are the specular ones (k_s and roughness) of the materials `which`."""
+    return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)
 
 
 def taken(light: Light, rows: np.ndarray | slice) -> Light:
@@ -86,3 +120,17 @@ def joined(light: Light, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> 
         log_sharpness=np.concatenate([light.log_sharpness, np.log(lobes.sharpness)]),
         weight=np.vstack([light.weight, weight]),
     )
+
+
+def blurred(light: Light, sharpest: float) -> Light:
+    """The light with lobes sharper than `sharpest` widened to it; their energy stays the same."""
+    log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
+    kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(log_sharpness))
+    return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
+
+
+def pruned(light: Light, least_share: float = 1e-5) -> Light:
+    """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
+    energy = lobe_integral(light.sharpness) * light.weight.sum(1)
+    kept = energy > least_share * max(float(energy.sum()), 1e-30)
+    return taken(light, kept if kept.any() else slice(0, 1))

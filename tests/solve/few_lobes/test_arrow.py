@@ -11,12 +11,16 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.descent import FLOOR
-from factorlib.solve.few_lobes.arrow import DEFINITE
-from factorlib.solve.few_lobes.bounds import MOST_S, MOST_TURN, MOST_WIDTHS, Bounds, light_at_bound, materials_at_bound
-from factorlib.solve.few_lobes.iterate import evaluate
+from factorlib.solve.few_lobes.arrow import DEFINITE, MOST_S, MOST_TURN, MOST_WIDTHS, Bounds
+from factorlib.solve.few_lobes.descent import damped_step, evaluate
 from factorlib.solve.few_lobes.jacobian import fit_loss, fitted, linearise
-from factorlib.solve.few_lobes.step import damped_step
-from factorlib.solve.few_lobes.unknowns import moved_light, moved_point, unknowns
+from factorlib.solve.few_lobes.unknowns import (
+    light_at_bound,
+    materials_at_bound,
+    moved_light,
+    moved_point,
+    unknowns,
+)
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2

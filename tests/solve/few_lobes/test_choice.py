@@ -2,6 +2,7 @@
 
 import msgspec
 import numpy as np
+import pytest
 
 from benchmarks.solve.problems import block, random_light
 from factorlib.geometry.sphere import mirror_cells
@@ -13,7 +14,6 @@ from factorlib.solve.few_lobes import specular
 from factorlib.solve.few_lobes.descent import descend
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 
 OPERATOR = reflection_operator("network")
@@ -37,7 +37,7 @@ def rooms(materials, shown, noise=0.3):
 
 def chosen(materials, shown, **options):
     options = FewLobes(lobes=16, insert=6, polish=10, **{"rounds": 3, "iterations": 12} | options)
-    return few_lobes(JointProblem(rooms(materials, shown), OPERATOR), from_nothing(3), Run(options))
+    return few_lobes(JointProblem(rooms(materials, shown), OPERATOR), 3, Run(options))
 
 
 def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it():
@@ -61,9 +61,11 @@ def test_a_lambertian_scene_ends_without_specular_and_with_few_lobes():
     assert sum(map(len, lambertian.point.lights)) <= 1.2 * sum(map(len, glossy.point.lights))
 
 
-def test_nothing_is_chosen_where_it_is_not_asked_for():
-    found = chosen(MIXED, [0, 1, 2], specular="on")
-    assert not found.lambertian.any() and found.specular == []
+@pytest.mark.parametrize("specular", ["on", "off"])
+def test_nothing_is_chosen_where_it_is_not_asked_for(specular):
+    found = chosen(MIXED, [0, 1, 2], specular=specular, rounds=1)
+    assert found.lambertian.all() == found.lambertian.any() == (specular == "off") and found.specular == []
+    assert (found.point.materials.specular.any() == 0) == (specular == "off")
 
 
 def test_what_shines_more_than_it_scatters_is_not_tried():
@@ -83,3 +85,31 @@ def test_a_descent_that_spoils_what_is_held_out_decides_nothing(monkeypatch):
 
     monkeypatch.setattr(specular, "descend", spoiled)
     assert chosen(MIXED, [2]).specular[2].kept
+
+
+def test_a_material_is_judged_by_its_held_out_observations_but_may_not_harm_the_others(monkeypatch):
+    problem, truth = JointProblem(rooms(MIXED, [0, 1, 2], noise=0.0), OPERATOR), scaled_truth()
+    rows = truth.materials.rows()
+    rows[0, :3] *= 1.2
+    brighter = [msgspec.structs.replace(light, weight=1.01 * light.weight) for light in truth.lights]
+    pair = Point(Materials.of_vector(rows.reshape(-1)), truth.lights), Point(truth.materials, brighter)
+    monkeypatch.setattr(specular, "HARM", 1e9)
+    assert specular.compare(problem, *pair, 0).kept and not specular.compare(problem, *pair, 1).kept
+    monkeypatch.setattr(specular, "HARM", 0.0)
+    assert specular.compare(problem, *pair, 1).kept
+    fitted = [np.where(b.held_out[:, None], b.radiance, 7.0) for b in problem.blocks]
+    blocks = [msgspec.structs.replace(b, radiance=r) for b, r in zip(problem.blocks, fitted, strict=True)]
+    other = msgspec.structs.replace(problem, blocks=blocks)
+    assert specular.compare(other, *pair, 0) == specular.compare(problem, *pair, 0)
+
+
+def scaled_truth():
+    """The point that `rooms` shows, in the units of its blocks."""
+    rng, blocks = np.random.default_rng(11), rooms(MIXED, [0, 1, 2], noise=0.0)
+    lights = []
+    for k, data in enumerate(blocks):
+        light = random_light(rng, 4)
+        block(f"room{k}", light, MIXED, [0, 1, 2], OPERATOR, size=20, seed=k)
+        rng.normal(size=data.radiance.shape), rng.random(len(np.unique(mirror_cells(data.normal, data.view, 0.2))))
+        lights.append(msgspec.structs.replace(light, weight=light.weight / data.unit))
+    return Point(MIXED, lights)

@@ -7,12 +7,10 @@ import pytest
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.reflection import reflection_operator
+from factorlib.solve.few_lobes.descent import damped_step, evaluate
 from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.iterate import evaluate
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
-from factorlib.solve.few_lobes.step import damped_step
 from tests.model.made import three_rooms
 
 ORDER = [2, 0, 1]  # material k of the permuted problem is material ORDER[k] of the other
@@ -57,9 +55,9 @@ def test_the_answer_does_not_depend_on_the_order_of_materials_or_lights(given):
     problem, _ = given
     problem = msgspec.structs.replace(problem, operator=reflection_operator("network"))  # compiled: five times as fast
     run = lambda: Run(FewLobes(lobes=6, insert=3, rounds=2, iterations=6, polish=8, specular="on"))  # noqa: E731
-    one = few_lobes(problem, from_nothing(3), run()).point.materials
-    permuted = few_lobes(with_materials_permuted(problem, given[1])[0], from_nothing(3), run()).point.materials
-    turned = few_lobes(problem.restricted([0, 2, 1]), from_nothing(3), run()).point.materials
+    one = few_lobes(problem, 3, run()).point.materials
+    permuted = few_lobes(with_materials_permuted(problem, given[1])[0], 3, run()).point.materials
+    turned = few_lobes(problem.restricted([0, 2, 1]), 3, run()).point.materials
     np.testing.assert_allclose(permuted.rows(), one.rows()[ORDER], atol=0.01)
     np.testing.assert_allclose(turned.rows(), one.rows(), atol=0.01)
 

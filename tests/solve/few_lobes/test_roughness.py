@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from benchmarks.solve.problems import MATERIALS, block, random_light
-from factorlib.images.tone import curve
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -39,17 +38,6 @@ def test_a_roughness_far_off_is_found_again():
     found = searched(blocks, wrong, lights)
     assert abs(found.roughness[0] - truth.roughness[0]) < 0.1  # the grid's own spacing
     np.testing.assert_array_equal(found.roughness[1:], wrong.roughness[1:])  # what is right stays
-
-
-def test_a_tone_curve_is_undone_first():
-    blocks, truth, lights = problem(materials=3, lights=2)
-    bent = [msgspec.structs.replace(b, radiance=curve(b.radiance, 1.6)) for b in blocks]
-    curved = [msgspec.structs.replace(light, log_tone=np.log([1.6])) for light in lights]
-    wrong = Materials(truth.diffuse * 1.3, truth.specular * 0.5, np.array([0.95, *truth.roughness[1:]]))
-    found = searched(bent, wrong, curved)
-    straight = searched(blocks, wrong, lights)
-    assert found.roughness[0] == straight.roughness[0]
-    np.testing.assert_allclose(found.diffuse[0], truth.diffuse[0], rtol=0.15)
 
 
 def test_a_material_that_nothing_shows_stays():

@@ -1,4 +1,4 @@
-"""Self-shadowing under few lobes: derivatives of visibility, and where no lobe is inserted."""
+"""Self-shadowing under few lobes: the derivatives, where shadows stay as lobes move, and where no lobe is inserted."""
 
 import msgspec
 import numpy as np
@@ -37,9 +37,9 @@ def problem():
 
 
 def test_gradients_are_finite_differences(problem):
-    """Visibility is computed in single precision, so steps are long and the tolerance is wide."""
+    """By weights, exposures, k_d and k_s, which move no shadow.  Visibility is computed in single precision, so steps are long."""
     data, light = problem
-    found, step = normal_equations(Illumination(data, light, MATERIALS, OPERATOR), LOSS), 2e-3
+    equations, step, p = normal_equations(Illumination(data, light, MATERIALS, OPERATOR), LOSS), 2e-3, len(light)
 
     def by_light(move):
         return fit_loss(Illumination(data, moved_light(light, move, MATERIALS.blur), MATERIALS, OPERATOR), LOSS)
@@ -47,10 +47,14 @@ def test_gradients_are_finite_differences(problem):
     def by_material(move):
         return fit_loss(Illumination(data, light, Materials.of_vector(MATERIALS.vector() + move), OPERATOR), LOSS)
 
-    for function, gradient in ((by_light, found.light_gradient), (by_material, found.material_gradient)):
-        moves = np.eye(len(gradient)) * step
+    still = np.arange(7 * len(MATERIALS)) % 7 < 6
+    for function, gradient, which in (
+        (by_light, equations.light_gradient, np.arange(len(equations.light_gradient)) >= 3 * p),
+        (by_material, equations.material_gradient, still),
+    ):
+        moves = np.eye(len(gradient))[which] * step
         expected = np.array([(function(d) - function(-d)) / (4 * step) for d in moves])
-        np.testing.assert_allclose(gradient, expected, rtol=0.02, atol=2e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(gradient[which], expected, rtol=0.02, atol=2e-3 * np.abs(expected).max())
 
 
 def test_no_lobe_is_inserted_where_its_light_cannot_arrive():

@@ -10,10 +10,10 @@ from factorlib.model import bounds
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.solve.few_lobes.descent import evaluate, fit_weights
 from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.iterate import evaluate, fit_weights
 from factorlib.solve.few_lobes.options import FewLobes
-from factorlib.solve.few_lobes.rounds import Rounds, answer_of, chosen_round, from_nothing, gained
+from factorlib.solve.few_lobes.rounds import answer_of, chosen_round, gained
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.stage import serial_map
 
@@ -30,7 +30,7 @@ def rooms(count=2, lobes=4, photos=1, seed=3):
 
 
 def run(blocks, materials=3, options=QUICK):
-    solution = few_lobes(JointProblem(blocks, OPERATOR), from_nothing(materials), Run(options))
+    solution = few_lobes(JointProblem(blocks, OPERATOR), materials, Run(options))
     return solution.point.materials, solution.point.lights, solution.history
 
 
@@ -102,7 +102,7 @@ def test_neither_threads_nor_processes_change_a_bit():
     options = FewLobes(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
     def answer(map_):
-        point = few_lobes(JointProblem(blocks, operator, spread=map_), from_nothing(3), Run(options)).point
+        point = few_lobes(JointProblem(blocks, operator, spread=map_), 3, Run(options)).point
         return np.concatenate(
             [point.materials.vector(), *(v.reshape(-1) for li in point.lights for v in (li.axis, li.weight))]
         )
@@ -117,14 +117,13 @@ def test_a_gain_is_the_fall_of_the_held_out_loss_and_its_error_that_of_other_dra
     blocks, materials, lights, _ = solved
     problem, best = JointProblem(blocks, OPERATOR), Point(materials, lights)
     worse = Point(materials, [msgspec.structs.replace(light, weight=1.1 * light.weight) for light in lights])
-    rounds = Rounds(best, best, best, problem.held_out_loss(best), 1.0, [])
-    gain, error = gained(problem, rounds, worse)
+    gain, error = gained(problem, best, worse)
     assert gain == pytest.approx(problem.held_out_loss(best) - problem.held_out_loss(worse))
     difference = np.subtract(*(np.concatenate(problem.held_out_losses(at)) for at in (best, worse)))
     rng = np.random.default_rng(0)
     drawn = [rng.choice(difference, len(difference)).mean() for _ in range(2000)]
     assert error == pytest.approx(np.std(drawn), rel=0.1)
-    assert gained(problem, rounds, best) == (0, 0)
+    assert gained(problem, best, best) == (0, 0)
 
 
 def test_what_held_out_observations_cannot_tell_apart_the_fitted_ones_decide(monkeypatch):
@@ -134,8 +133,8 @@ def test_what_held_out_observations_cannot_tell_apart_the_fitted_ones_decide(mon
     def lost_at(gain):  # the fitted loss, where each round after the first seems to have this gain, ± 1
         monkeypatch.setattr(
             "factorlib.solve.few_lobes.rounds.gained",
-            lambda sample, rounds, point: (gain, 1.0) if rounds.done else (np.inf, 0.0),
+            lambda sample, best, point: (np.inf, 0.0) if best is None else (gain, 1.0),
         )
-        return evaluate(problem, chosen_round(problem, from_nothing(3), Run(options)).point).loss
+        return evaluate(problem, chosen_round(problem, 3, Run(options)).point).loss
 
     assert lost_at(-0.9) < 0.5 * lost_at(-1.1)

@@ -8,11 +8,14 @@ from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes import weights
-from factorlib.solve.few_lobes.jacobian import fit_loss
-from factorlib.solve.few_lobes.normal_equations import energy_equations, normal_equations
-from factorlib.solve.few_lobes.responses import responses
-from factorlib.solve.few_lobes.weights import fitted_illumination, nonnegative_minimum
+from factorlib.solve.few_lobes import normal_equations as equations
+from factorlib.solve.few_lobes.jacobian import fit_loss, responses
+from factorlib.solve.few_lobes.normal_equations import (
+    energy_equations,
+    nonnegative_minimum,
+    normal_equations,
+    with_weights_fitted,
+)
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=1e6, prior=0.0)
@@ -53,7 +56,7 @@ def test_energy_equations_are_those_parts_of_the_normal_equations(data):
 def test_fitted_weights_are_the_optimum(data):
     """Karush, Kuhn and Tucker: no gradient where there is weight, none that asks for less than nothing elsewhere."""
     observed, light = data
-    found, at = fitted_illumination(lit(observed, light), LOSS)
+    found, at = with_weights_fitted(lit(observed, light), LOSS)
     before = np.abs(by_energy(light, normal_equations(lit(observed, light), LOSS).light_gradient)).max()
     gradient, energy = by_energy(found, at.light_gradient), found.energy.T
     assert (energy == 0).any() and (energy > 0).any()
@@ -63,7 +66,7 @@ def test_fitted_weights_are_the_optimum(data):
 
 def test_everything_else_stays(data):
     observed, light = data
-    found, at = fitted_illumination(lit(observed, light), LOSS)
+    found, at = with_weights_fitted(lit(observed, light), LOSS)
     for name in ("axis", "log_sharpness", "log_exposure"):
         np.testing.assert_array_equal(getattr(found, name), getattr(light, name))
     again = normal_equations(lit(observed, found), LOSS)
@@ -80,7 +83,7 @@ def test_the_loss_falls_with_outliers_and_clipped_values_too(data):
     harmed = msgspec.structs.replace(observed, radiance=wrong, clipped=high)
     for scale in (0.1, 1.0, 10.0):
         loss = Loss(robust_scale=scale, prior=0.0)
-        found, at = fitted_illumination(lit(harmed, light), loss)
+        found, at = with_weights_fitted(lit(harmed, light), loss)
         assert at.loss <= fit_loss(lit(harmed, light), loss) * (1 + 1e-12)
         np.testing.assert_allclose(at.loss, fit_loss(lit(harmed, found), loss), rtol=1e-5)
 
@@ -88,18 +91,18 @@ def test_the_loss_falls_with_outliers_and_clipped_values_too(data):
 def test_weights_that_would_raise_the_loss_are_not_taken(data, monkeypatch):
     observed, light = data
     monkeypatch.setattr(
-        weights, "with_fitted_weights", lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight)
+        equations, "of_least_loss", lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight)
     )
-    found, at = fitted_illumination(lit(observed, light), LOSS)
+    found, at = with_weights_fitted(lit(observed, light), LOSS)
     np.testing.assert_array_equal(found.weight, light.weight)
     assert at.loss == normal_equations(lit(observed, light), LOSS).loss
 
 
 def test_responses_computed_twice_give_the_same_bits(data, monkeypatch):
     observed, light = data
-    kept, at = fitted_illumination(lit(observed, light), LOSS)
-    monkeypatch.setattr(weights, "KEPT", 0)
-    again, other = fitted_illumination(lit(observed, light), LOSS)
+    kept, at = with_weights_fitted(lit(observed, light), LOSS)
+    monkeypatch.setattr(equations, "KEPT", 0)
+    again, other = with_weights_fitted(lit(observed, light), LOSS)
     np.testing.assert_array_equal(kept.weight, again.weight)
     np.testing.assert_array_equal(at.light_hessian, other.light_hessian)
 
@@ -109,7 +112,7 @@ def test_what_is_held_out_changes_nothing(data):
     out = np.random.default_rng(7).random(len(observed)) < 0.3
     one = msgspec.structs.replace(observed, held_out=out)
     other = msgspec.structs.replace(one, radiance=np.where(out[:, None], 100.0, one.radiance))
-    (a, at), (b, bt) = (fitted_illumination(lit(x, light), LOSS) for x in (one, other))
+    (a, at), (b, bt) = (with_weights_fitted(lit(x, light), LOSS) for x in (one, other))
     np.testing.assert_array_equal(a.weight, b.weight)
     assert at.loss == bt.loss
 
