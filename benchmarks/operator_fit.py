@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from factorlib.reflection.diffuse import REMAINDER, normal_mean_cosine
+from factorlib.reflection.closed_form import REMAINDER, normal_mean_cosine
 from factorlib.reflection.filtering import TAIL
 from factorlib.reflection.lobe import lobe_integral, lobe_moments
 from factorlib.reflection.reference import diffuse_quadrature

@@ -8,24 +8,21 @@ import msgspec
 import numpy as np
 
 from factorlib.align.confidence import confidence
-from factorlib.align.doubts import Standards, doubts
-from factorlib.align.earlier import earlier_focal, earlier_pose
-from factorlib.align.external_camera import focal_and_centre
-from factorlib.align.given import check_before_camera, warn_of_camera, warn_of_materials
+from factorlib.align.given import check_before_camera, focal_and_centre, warn_of_camera, warn_of_materials
 from factorlib.align.keypoints import Keypoints
 from factorlib.align.overlay import overlay
 from factorlib.align.place import KnownFocal, ObjectToPlace, Placed, placed
-from factorlib.align.search import Found, Search
+from factorlib.align.search import Search
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
-from factorlib.align.trust import trust_in
-from factorlib.dataset import schema
+from factorlib.align.trust import Standards, doubts, trust_in
+from factorlib.dataset.schema import SOURCES, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import PhotoFacts, read_photo_facts
 from factorlib.results.poses import (
@@ -63,83 +60,67 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Align the meshes of one photo and write its maps, its poses and the overlay."""
-    name = inputs.photo
-    slice_ = msgspec.convert(inputs.facts["dataset.objects"], schema.ObjectsSlice)
+    name, materials = inputs.photo, inputs.facts["dataset.materials"]
+    slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
     objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
     camera, known = camera_of(slice_, facts, name)
-    check_given_poses(slice_, objects, name)
-    warn_of_materials(
-        channels["label"], [each.caster.mesh.labels for each in objects], inputs.facts["dataset.materials"], name
-    )
+    external = slice_.external.source if slice_.external else None
+    sources = ["given" if own.pose else external for own in slice_.objects]
+    for each, source in zip(objects, sources, strict=True):
+        if each.pose is not None:
+            given_by = "dataset" if source == "given" else source
+            check_before_camera(each.caster.mesh, each.pose, name, each.name, given_by)
+    warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], materials, name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
-    before = earlier_focal(earlier.camera, facts.factor) if earlier else None
+    before = None
+    if earlier:  # the photo may have been averaged down by another factor then
+        focal = earlier.camera.focal_px * (earlier.camera.factor / facts.factor)
+        before = msgspec.structs.replace(earlier.camera, focal_px=focal, factor=facts.factor)
     result = placed(objects, camera, known, name, params.search, before)
-    maps = rasterise([each.caster for each in objects], result.camera, result.poses)
+    camera, maps = result.camera, rasterise([each.caster for each in objects], result.camera, result.poses)
     whole = silhouette_of_photo(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    external = slice_.external.source if slice_.external else None
-    sources = {obj.name: "given" if obj.pose else external for obj in slice_.objects}
-    entries = {each.name: entry(each, k, result, maps, params, sources[each.name]) for k, each in enumerate(objects)}
-    for object_name, found in entries.items():
-        complain(name, object_name, found, params.strict)
-    left_out = np.isin(maps.object, [k for k, found in enumerate(entries.values(), start=1) if found.left_out])
-    write_maps(out / f"{name}.exr", maps, np.where(left_out, 0.0, confidence(maps, whole)))
-    write_photo_poses(out / f"{name}.json", PhotoPoses(camera_entry(result, facts.factor), entries))
+    entries = [entry(each, k, result, maps, params, sources[k]) for k, each in enumerate(objects)]
+    for each, of_each in zip(objects, entries, strict=True):
+        complain(name, each.name, of_each, params.strict)
+    left_out = np.isin(maps.object, [k for k, of_each in enumerate(entries, start=1) if of_each.left_out])
+    channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
+    channels |= {kind: getattr(maps, kind) for kind in ("depth", "label", "object")}
+    certainty = np.where(left_out, 0.0, confidence(maps, whole))
+    write_exr(out / f"{name}.exr", {**channels, "confidence": certainty, "back": maps.back})
+    centre = float(camera.centre[0]), float(camera.centre[1])
+    of_camera = CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, facts.factor)
+    poses = {each.name: of_each for each, of_each in zip(objects, entries, strict=True)}
+    write_photo_poses(out / f"{name}.json", PhotoPoses(of_camera, poses))
 
 
 def objects_of(
-    slice_: schema.ObjectsSlice,
-    channels: dict,
-    inputs: Inputs,
-    params: Params,
-    factor: int = 1,
-    earlier: PhotoPoses | None = None,
+    slice_: ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int, earlier: PhotoPoses | None
 ) -> list[ObjectToPlace]:
     """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
     before those found earlier, these before keypoints."""
-    objects = []
-    for number, obj in enumerate(slice_.objects, start=1):
-        mesh, materials = slice_.meshes[obj.mesh], inputs.facts["dataset.materials"]
-        file = inputs.file(mesh.file)
-        pose = pose_of(obj, slice_.external)
-        before = earlier.objects.get(obj.name) if earlier and pose is None else None
-        scale = before.scale if before else AS_IT_IS
-        caster = Caster(scaled(_mesh(file, mesh, obj, materials, params), scale))
-        silhouette = silhouette_of_object(channels, number, caster.mesh.labels, obj.mask is not None)
-        found = earlier_pose(before) if before else None
-        objects.append(ObjectToPlace(obj.name, caster, silhouette, pose, keypoints_of(obj, factor), found, scale))
+    objects, materials = [], inputs.facts["dataset.materials"]
+    for number, own in enumerate(slice_.objects, start=1):
+        mesh, pose, keypoints = slice_.meshes[own.mesh], own.pose, None
+        if pose is None and slice_.external:
+            pose = slice_.external.poses.get(own.name)
+        before = earlier.objects.get(own.name) if earlier and pose is None else None
+        file, scale = inputs.file(mesh.file), before.scale if before else AS_IT_IS
+        read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
+        silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
+        if pose is not None:
+            pose = Pose(np.array(pose.rotation), np.array(pose.translation))
+        if own.keypoints:
+            pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
+            keypoints = Keypoints(pixels / factor, points)
+        caster = Caster(scaled(read, scale))
+        objects.append(ObjectToPlace(own.name, caster, silhouette, pose, keypoints, before, scale))
     return objects
 
 
-def _mesh(file: Path, mesh: schema.MeshEntry, obj: schema.ObjectEntry, materials: list[str], params: Params) -> Mesh:
-    return read_mesh(file, materials, mesh.made_of, obj.materials, params.crease_deg, params.limits)
-
-
-def check_given_poses(slice_: schema.ObjectsSlice, objects: list[ObjectToPlace], photo: str) -> None:
-    """Raise InputError where a pose of dataset.yaml, or of its source of cameras, puts its object behind the camera."""
-    for each, said in zip(objects, slice_.objects, strict=True):
-        if each.pose is not None:
-            check_before_camera(
-                each.caster.mesh, each.pose, photo, each.name, "dataset" if said.pose else slice_.external.source
-            )
-
-
-def pose_of(obj: schema.ObjectEntry, external: schema.ExternalCamera | None) -> Pose | None:
-    """The pose that dataset.yaml gives, or else its source of cameras."""
-    pose = obj.pose or (external.poses.get(obj.name) if external else None)
-    return Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
-
-
-def keypoints_of(obj: schema.ObjectEntry, factor: int) -> Keypoints | None:
-    """In pixels of the photo averaged down by `factor`."""
-    if not obj.keypoints:
-        return None
-    return Keypoints(np.array([k.pixel for k in obj.keypoints]) / factor, np.array([k.point for k in obj.keypoints]))
-
-
-def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
+def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
     """The photo's camera, its focal length to be found later, and what is known of that length.
 
     What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
@@ -155,75 +136,40 @@ def camera_of(slice_: schema.ObjectsSlice, facts: PhotoFacts, photo: str) -> tup
     return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)
 
 
-def camera_entry(result: Placed, factor: int) -> CameraEntry:
-    """Pixels are those of the stage's maps, `factor` of the photo's each."""
-    camera = result.camera
-    centre = float(camera.centre[0]), float(camera.centre[1])
-    return CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, factor)
-
-
 def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
     """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
     """
-    seen = np.where(maps.object == k + 1, maps.label, 0)
-    iou, agreement = silhouette_iou(obj.silhouette, seen), label_agreement(obj.silhouette, seen)
-    found, pose, trust = result.found[k], result.poses[k], trust_in(obj, result, k)
+    label = np.where(maps.object == k + 1, maps.label, 0)
+    iou, agreement = silhouette_iou(obj.silhouette, label), label_agreement(obj.silhouette, label)
+    found, trust, runner_up = result.found[k], trust_in(obj, result, k), None
     reasons = doubts(iou, agreement, trust, found, params)
+    if found is not None:
+        source = "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
+        if other := found.runner_up:
+            pose = entry_of(other.state.pose(obj.caster))
+            runner_up = RunnerUp(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
     return ObjectEntry(
-        **entry_of(pose),
+        **entry_of(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,
-        source=source
-        if found is None
-        else "refined"
-        if found.earlier
-        else "keypoints"
-        if found.by_keypoints
-        else "found",
+        source=source,
         score=found.score if found else None,
-        runner_up=runner_up_entry(found, obj.caster),
+        runner_up=runner_up,
         **msgspec.structs.asdict(trust),
         doubts=reasons,
         left_out=bool(reasons) and found is not None and not params.keep_doubtful,
     )
 
 
-def runner_up_entry(found: Found | None, caster: Caster) -> RunnerUp | None:
-    """The second-best pose as it stands in poses.json; None where no other was found."""
-    if found is None or found.runner_up is None:
-        return None
-    other = found.runner_up
-    return RunnerUp(
-        **entry_of(other.state.pose(caster)), score=other.score, normal_difference_deg=other.normal_difference_deg
-    )
-
-
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
     """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
-    cure = CURE_OF_EXTERNAL if entry.source in schema.SOURCES else CURE
+    cure = CURE_OF_EXTERNAL if entry.source in SOURCES else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)
         log.warning("%s: %s: %s; %s", photo, name, reason, cure)
     if entry.left_out:
         log.warning('%s: %s is left out of the solve; SET="align.keep_doubtful=true" lets it in as it is', photo, name)
-
-
-def write_maps(path: Path, maps: Maps, certainty: np.ndarray) -> None:
-    """Write the maps of a photo as EXR; the channels are listed in docs/formats.md.
-
-    certainty: [h, w], how much a pixel's normal is to be believed, 0 to 1
-    """
-    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
-    channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
-    channels |= {
-        "depth": maps.depth,
-        "label": maps.label,
-        "object": maps.object,
-        "confidence": certainty,
-        "back": maps.back,
-    }
-    write_exr(path, channels)

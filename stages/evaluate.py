@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import LightSlice, TruthFile
-from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
@@ -24,7 +24,7 @@ from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.results.materials import Reflectance, read_materials, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, Resynthesis, write_metrics
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, write_metrics
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -51,19 +51,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare everything that was solved with the photos and the truth, and write metrics.json."""
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
+    materials = inputs.facts["dataset.materials"]
     progress(0, 3, "re-synthesis")
-    resynthesis = compare_photos(lights, inputs.facts["dataset.materials"], lambda name: _shot(inputs, name))
-    seen = _seen(resynthesis, lights)
-    component = connected_components({light: names for light, names in seen.items() if names})
+    resynthesis = compare_photos(lights, materials, lambda name: _shot(inputs, name))
+    shown: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}  # materials in each light
+    for name, photo in resynthesis.photos.items():
+        row = shown[lights[name].illumination]
+        row.extend(m for m in photo.materials if m not in row)
+    component = connected_components({light: names for light, names in shown.items() if names})
     progress(1, 3, "materials, light and relighting")
-    sections = _against_truth(inputs, out, truth, lights, seen, component) if truth else dict.fromkeys(SECTIONS)
-    metrics = Metrics(
-        set=Counts(len(lights), len(inputs.facts["dataset.materials"]), len(seen), len(set(component.values()))),
-        resynthesis=resynthesis,
-        **sections,
-        reasons=reasons_of(sections, truth is not None),
-    )
-    write_metrics(out / "metrics.json", metrics)
+    sections = _against_truth(inputs, out, truth, lights, shown, component) if truth else dict.fromkeys(SECTIONS)
+    counts = Counts(len(lights), len(materials), len(shown), len(set(component.values())))
+    reasons = reasons_of(sections, truth is not None)
+    write_metrics(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     progress(3, 3)
 
 
@@ -81,54 +81,34 @@ def _against_truth(
     out: Path,
     truth: TruthFile,
     lights: dict[str, LightSlice],
-    seen: dict[str, list[str]],
+    shown: dict[str, list[str]],
     component: dict[str, int],
 ) -> dict:
-    materials = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
+    true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
     estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the gauge of the exported lights
-    true_lights = {
-        n: light_of_lat_long(read_true_light(inputs.file(path), n)) for n, path in truth.illumination.items()
-    }
-    paths = {n: inputs["export"] / "illumination" / f"{n}.exr" for n in true_lights}
-    found_lights = {n: _light(path) for n, path in paths.items() if path.exists()}
-    _write_lights(inputs, out, truth, found_lights, true_lights)
+    true_lights, estimated_lights = {}, {}
+    for name, path in truth.illumination.items():
+        true_lights[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
+        if (file := inputs["export"] / "illumination" / f"{name}.exr").exists():
+            estimated_lights[name] = light_of_lat_long(read_rgb_exr(file))
+            for kind in ("illumination", "spheres"):
+                (out / kind).mkdir(exist_ok=True)
+            write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(path)), LAT_LONG)
+            for which, light in (("truth", true_lights[name]), ("estimate", estimated_lights[name])):
+                write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
     return {
-        "materials": compare_materials(estimates, materials, component),
-        "relighting": compare_relighting(estimates, materials, found_lights, true_lights, seen),
-        "relit_set": compare_relit_set(estimates, materials, found_lights, true_lights),
-        "light": compare_lights(found_lights, true_lights, _mirrored(inputs, lights)),
+        "materials": compare_materials(estimates, true, component),
+        "relighting": compare_relighting(estimates, true, estimated_lights, true_lights, shown),
+        "relit_set": compare_relit_set(estimates, true, estimated_lights, true_lights),
+        "light": compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
         "normals": _normals(inputs, truth, lights),
         "poses": _poses(inputs, truth),
     }
 
 
-def _write_lights(inputs: Inputs, out: Path, truth: TruthFile, found: dict[str, Light], true: dict[str, Light]) -> None:
-    for name in found:
-        for kind in ("illumination", "spheres"):
-            (out / kind).mkdir(exist_ok=True)
-        write_rgb_exr(
-            out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(truth.illumination[name])), LAT_LONG
-        )
-        for which, light in (("truth", true[name]), ("estimate", found[name])):
-            write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
-
-
 def _shot(inputs: Inputs, name: str) -> Shot:
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
-
-
-def _light(path: Path) -> Light:
-    return light_of_lat_long(read_rgb_exr(path))
-
-
-def _seen(resynthesis: Resynthesis, lights: dict[str, LightSlice]) -> dict[str, list[str]]:
-    """The materials that were seen in each light."""
-    seen: dict[str, list[str]] = {slice.illumination: [] for slice in lights.values()}
-    for name, photo in resynthesis.photos.items():
-        row = seen[lights[name].illumination]
-        row.extend(m for m in photo.materials if m not in row)
-    return seen
 
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,31 +120,29 @@ def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.nda
 
 def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.ndarray]:
     """The directions of each light that an observed pixel mirrors."""
-    found: dict[str, np.ndarray] = {}
-    for name, slice in lights.items():
+    mirrored: dict[str, np.ndarray] = {}
+    for name, slice_ in lights.items():
         normal, view, pixels = _geometry(inputs, name)
-        frame = np.eye(3) if slice.world_from_camera is None else np.array(slice.world_from_camera)
+        frame = np.eye(3) if slice_.world_from_camera is None else np.array(slice_.world_from_camera)
         hit = mirrored_directions(normal[pixels], view[pixels], frame)
-        found[slice.illumination] = found.get(slice.illumination, False) | hit
-    return found
+        mirrored[slice_.illumination] = mirrored.get(slice_.illumination, False) | hit
+    return mirrored
 
 
 def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) -> dict[str, NormalError] | None:
-    found, photos = {}, read_photos(inputs["masks"] / "photos.json")
-    for name in lights:
-        if name in truth.normals:
-            true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name].original_size)
-            true = averaged_normals(true, photos[name].factor)  # as the photo was
-            normal, _, pixels = _geometry(inputs, name)
-            found[name] = normal_error(normal, true, pixels)
-    return {name: error for name, error in found.items() if error} or None
+    errors, photos = {}, read_photos(inputs["masks"] / "photos.json")
+    for name in [name for name in lights if name in truth.normals]:
+        true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name].original_size)
+        normal, _, pixels = _geometry(inputs, name)
+        errors[name] = normal_error(normal, averaged_normals(true, photos[name].factor), pixels)  # as the photo was
+    return {name: error for name, error in errors.items() if error} or None
 
 
 def _poses(inputs: Inputs, truth: TruthFile) -> dict[str, dict[str, PoseError]] | None:
     estimated = read_poses(inputs["align"] / "poses.json")
-    found: dict[str, dict[str, PoseError]] = {}
+    errors: dict[str, dict[str, PoseError]] = {}
     for photo, objects in truth.poses.items():
         for name, pose in objects.items():
             if photo in estimated and name in estimated[photo].objects:
-                found.setdefault(photo, {})[name] = pose_error(estimated[photo].objects[name], pose)
-    return found or None
+                errors.setdefault(photo, {})[name] = pose_error(estimated[photo].objects[name], pose)
+    return errors or None

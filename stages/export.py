@@ -6,6 +6,7 @@ and losses.json: what is lost on the way to other programs.
 """
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import write_materialx
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, View, write_scene
 from factorlib.export.usd import SUFFIX, write_usd_mesh, write_usd_scene
-from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
 from factorlib.images.write import write_hdr
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
@@ -32,8 +33,8 @@ from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.results.exposures import read_exposures, write_exposures
 from factorlib.results.lobes import read_lobes, write_lobes
-from factorlib.results.materials import MaterialTable, read_materials, reflectances, write_materials
-from factorlib.results.poses import CameraEntry, ObjectEntry, read_poses
+from factorlib.results.materials import read_materials, reflectances, write_materials
+from factorlib.results.poses import ObjectEntry, read_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.export")
@@ -53,83 +54,70 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write materials, lights, coverage and scenes in the forms of other programs."""
-    names: list[str] = inputs.facts["dataset.materials"]
+    names, solved = inputs.facts["dataset.materials"], inputs["solve"]
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(0, 4, "materials")
-    table, lobes = _in_gauge(inputs["solve"], {light.illumination for light in lights.values()})
-    exposures = read_exposures(inputs["solve"] / "exposures.json")
+    table, exposures = read_materials(solved / "materials.json"), read_exposures(solved / "exposures.json")
+    factor = headroom_factor(table.materials)
+    table = table_in_gauge(table, factor)
+    materials = reflectances(table)
+    # the factor that leaves the materials enters the lights
+    lobes = {n: light.scaled(1 / factor) for n, light in _solved_lights(solved / "lobes.parquet", lights).items()}
     write_materials(out / "materials.json", table)
     write_exposures(out / "exposures.json", exposures)
     write_lobes(out / "lobes.parquet", lobes)
-    materials = reflectances(table)
     write_materialx(out / "materials.mtlx", materials)
     write_losses(out / "losses.json", materials)
     progress(1, 4, "lights")
-    _write_lights(out, lobes, params)
-    _write_coverage(out, inputs["solve"], lobes, params)
+    for folder in ("illumination", "coverage", "scenes/light", "scenes/meshes"):
+        (out / folder).mkdir(parents=True)
+    for name, light in lobes.items():
+        _write_light(out, name, light, solved / "coverage" / f"{name}.exr", params)
     progress(2, 4, "meshes")
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         write_glb(out / f"{name}.glb", files.read.mesh(name, mesh), names, materials)
     progress(3, 4, "scenes")
     write_script(out / "scenes")
-    poses, max_depth = (
-        read_poses(inputs["align"] / "poses.json"),
-        ALL_BOUNCES if table.model.interreflection else DIRECT,
-    )
+    poses = read_poses(inputs["align"] / "poses.json")
+    max_depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, light in lights.items():
-        view = _view(inputs["align"] / f"{photo}.exr", poses[photo].camera)
-        shapes = [
-            shape
-            for obj in objects[photo].objects
-            for shape in files.shapes(obj, objects[photo].meshes, poses[photo].objects)
-        ]
+        scene, slice_, camera = out / "scenes" / photo, objects[photo], poses[photo].camera
+        size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # of align's maps, by their header
+        view = View(size.width, size.height, camera.focal_px, camera.principal_point)
+        shapes = [s for own in slice_.objects for s in files.shapes(own, slice_.meshes, poses[photo].objects)]
         exposure = np.array(exposures.get(photo, [1.0] * 3))
         environment = _environment(out, photo, light, lobes[light.illumination], exposure, params)
-        write_scene(out / "scenes" / f"{photo}.xml", view, shapes, materials, environment, max_depth)
+        write_scene(scene.with_name(f"{photo}.xml"), view, shapes, materials, environment, max_depth)
         exposed = ExposedMap(f"../illumination/{light.illumination}.exr", exposure, environment.camera_from_light)
-        write_scene_json(out / "scenes" / f"{photo}.json", view, shapes, materials, exposed, max_depth)
-        write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", view, shapes, materials, exposed)
+        write_scene_json(scene.with_name(f"{photo}.json"), view, shapes, materials, exposed, max_depth)
+        write_usd_scene(scene.with_name(f"{photo}{SUFFIX}"), view, shapes, materials, exposed)
     progress(4, 4)
 
 
-def _in_gauge(solved: Path, illuminations: set[str]) -> tuple[MaterialTable, dict[str, Lobes]]:
-    """materials.json and the lobes of every illumination; the factor that leaves the one enters the other."""
-    table = read_materials(solved / "materials.json")
-    factor = headroom_factor(table.materials)
-    found = read_lobes(solved / "lobes.parquet")
-    for name in sorted(illuminations - set(found)):
-        log.warning(
-            "illumination '%s' was not solved for, because no pixel in it was observed: it is written as black", name
-        )
-    return table_in_gauge(table, factor), {
-        name: found.get(name, no_lobes()).scaled(1 / factor) for name in sorted(illuminations)
-    }
-
-
-def _write_lights(out: Path, lobes: dict[str, Lobes], params: Params) -> None:
-    for folder in ("illumination", "scenes/light", "scenes/meshes"):
-        (out / folder).mkdir(parents=True)
-    for name, light in lobes.items():
-        lat_long = lat_long_of_lobes(light, params.height, 2 * params.height)
-        write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long, LAT_LONG)
-        write_hdr(out / "illumination" / f"{name}.hdr", lat_long)
-        write_rgb_exr(out / "scenes" / "light" / f"{name}.exr", _mitsuba_map(light, params), LAT_LONG)
-
-
-def _write_coverage(out: Path, solved: Path, lobes: dict[str, Lobes], params: Params) -> None:
-    """Standard errors of the lights over their mean radiance, in the maps' layout; a light that was not solved has none."""
-    (out / "coverage").mkdir()
-    directions = lat_long_directions(params.height, 2 * params.height)
-    for name in lobes:
-        if (file := solved / "coverage" / f"{name}.exr").exists():
-            channels = read_exr(file)
-            write_rgb_exr(
-                out / "coverage" / f"{name}.exr",
-                sampled(np.stack([channels[c] for c in "RGB"], -1), directions),
-                LAT_LONG,
+def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:
+    """The lobes of every illumination, by name in order; none of one that was not solved for, with a warning."""
+    solved = read_lobes(file)
+    names = sorted({light.illumination for light in lights.values()})
+    for name in names:
+        if name not in solved:
+            log.warning(
+                "illumination '%s' was not solved for, because no pixel in it was observed: it is written as black",
+                name,
             )
+    return {name: solved.get(name, no_lobes()) for name in names}
+
+
+def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Params) -> None:
+    """The map of a light, for Mitsuba too, and the standard errors over its mean radiance, in the same layout, if there are any."""
+    lat_long = lat_long_of_lobes(light, params.height, 2 * params.height)
+    write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long, LAT_LONG)
+    write_hdr(out / "illumination" / f"{name}.hdr", lat_long)
+    write_rgb_exr(out / "scenes" / "light" / f"{name}.exr", _mitsuba_map(light, params), LAT_LONG)
+    if coverage.exists():
+        directions = lat_long_directions(params.height, 2 * params.height)
+        write_rgb_exr(out / "coverage" / f"{name}.exr", sampled(read_rgb_exr(coverage), directions), LAT_LONG)
 
 
 def _mitsuba_map(light: Lobes, params: Params) -> np.ndarray:
@@ -148,41 +136,27 @@ def _environment(
     return Environment(file, 1.0, camera_from_light)
 
 
-def _view(aligned: Path, camera: CameraEntry) -> View:
-    """The photo's camera; its size from the header of align's maps."""
-    spec = oiio.ImageInput.open(str(aligned)).spec()
-    return View(spec.width, spec.height, camera.focal_px, camera.principal_point)
-
-
 class MeshFiles:
     """Meshes read once and written once, split by material, per choice of materials for their parts."""
 
     def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
         self.scenes, self.materials = scenes, materials
         self.read = MeshesOnce(inputs.file, materials, crease_deg)
-        self._stems: dict[tuple, str] = {}
+        self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
 
     def shapes(
         self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry], poses: dict[str, ObjectEntry]
     ) -> list[Shape]:
-        """One per material of the object."""
-        mesh, stem = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), self._written(obj, meshes)
-        place = np.eye(4)
-        pose = poses[obj.name]
+        """One per material of the object; a second choice of materials is in files called <mesh>.2."""
+        mesh, pose, place = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), poses[obj.name], np.eye(4)
         place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
-        used = [self.materials[label - 1] for label in mesh.labels]
-        return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open) for m in used]
-
-    def _written(self, obj: schema.ObjectEntry, meshes: dict[str, MeshEntry]) -> str:
-        """What the files are called before the material, relative to the scenes; a second choice of materials is <mesh>.2."""
+        names = {label: self.materials[label - 1] for label in mesh.labels}
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
             number = 1 + sum(other[0] == obj.mesh for other in self._stems)
-            stem = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
-            mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
-            for label in mesh.labels:
-                part, file = submesh(mesh, label), self.scenes / f"{stem}.{self.materials[label - 1]}"
+            self._stems[key] = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
+            for label, name in names.items():
+                part, file = submesh(mesh, label), self.scenes / f"{self._stems[key]}.{name}"
                 write_ply(f"{file}.ply", part)
                 write_usd_mesh(f"{file}{SUFFIX}", part)
-            self._stems[key] = stem
-        return self._stems[key]
+        return [Shape(f"{obj.name}.{m}", f"{self._stems[key]}.{m}.ply", m, place, mesh.open) for m in names.values()]

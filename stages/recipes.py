@@ -6,6 +6,7 @@ Writes for each photo <photo>.png (8-bit sRGB) and <photo>.exr (linear), or <pho
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -39,15 +40,13 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Make the pictures of one recipe."""
-    recipe = recipe_of(inputs.facts["recipe"])
-    results = SolvedSet(inputs, params.crease_deg)
+    recipe, results = recipe_of(inputs.facts["recipe"]), SolvedSet(inputs, params.crease_deg)
     if isinstance(recipe, schema.Grid):
         return write_grid(recipe, results, out, progress)
     photos, refusals = recipe.photos or results.photos, []
-    draw = DRAWN[type(recipe)]
     for done, photo in enumerate(photos):
         try:
-            draw(recipe, results, photo, out, _part(progress, done, len(photos), photo))
+            DRAWN[type(recipe)](recipe, results, photo, out, partial(_report, progress, done, len(photos), photo))
         except InputError as error:
             if recipe.photos:
                 raise
@@ -58,9 +57,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(len(photos), len(photos))
 
 
-def _part(progress: Progress, done: int, total: int, photo: str) -> Callable[[float], None]:
-    """Says how much of one photo's pictures is done."""
-    return lambda share: progress(done + share, total, photo)
+def _report(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
+    """Say how much of one photo's pictures is done."""
+    progress(done + share, total, photo)
 
 
 Report = Callable[[float], None]
@@ -80,13 +79,9 @@ def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path,
     """The same with other materials."""
     report(0)
     known, scene = results.known(recipe.table), results.scene(photo)
-    materials = {
-        name: known[recipe.materials[name]] if name in recipe.materials else own
-        for name, own in scene.materials.items()
-    }
-    traced = Traced(
-        traced_photo(msgspec.structs.replace(scene, materials=materials), recipe.samples), results.tone(photo)
-    )
+    other = {name: known[recipe.materials[name]] for name in scene.materials if name in recipe.materials}
+    scene = msgspec.structs.replace(scene, materials=scene.materials | other)
+    traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
     _write(out / photo, traced.over(results.photo(photo)))
 
 
@@ -94,18 +89,14 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     """A further object on the ground of one that is there."""
     scene = results.scene(photo)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    polish = (
-        Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
-        if any(recipe.ground.specular)
-        else None
-    )
+    given, polish = recipe.ground, None
+    if any(given.specular):
+        polish = Reflectance((0.0,) * 3, given.specular, given.roughness)
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
     if not ground.plane.seen_from_above:
-        found = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
-        raise InputError(found, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
-    known = {
-        f"{NEW}{name}": material for name, material in results.known(recipe.table).items()
-    }  # the new object's alone
+        fault = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
+        raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
+    own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
         spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
@@ -114,7 +105,7 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
     new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
-    scene = msgspec.structs.replace(scene, materials={**scene.materials, **known})
+    scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
     backdrop = Backdrop(scene, results.straightened(photo), results.covered(photo))
     found = inserted(backdrop, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
     same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
@@ -135,23 +126,25 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
 
 def turntable(recipe: schema.Turntable, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Once around."""
-    scene, frames = resized(results.scene(photo), recipe.width), []
-    for k in range(recipe.frames):
-        report(k / recipe.frames)
-        camera = orbit(scene, 360 * k / recipe.frames)
-        traced = traced_photo(scene, recipe.samples, world_from_camera=camera, with_light=recipe.background == "light")
-        frames.append(Traced(traced, results.tone(photo)))
-    _write_animation(out, photo, frames, recipe.seconds)
+    scene, lit = resized(results.scene(photo), recipe.width), recipe.background == "light"
+
+    def frame(degrees: float) -> np.ndarray:
+        """From a camera that was carried around by so much."""
+        return traced_photo(scene, recipe.samples, world_from_camera=orbit(scene, degrees), with_light=lit)
+
+    _write_animation(recipe, results, photo, out, report, frame)
 
 
 def moving_light(recipe: schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """The light turns once."""
-    scene, frames = resized(results.scene(photo), recipe.width), []
-    for k in range(recipe.frames):
-        report(k / recipe.frames)
-        turned = msgspec.structs.replace(scene, light=turned_light(scene.light, 360 * k / recipe.frames))
-        frames.append(Traced(traced_photo(turned, recipe.samples), results.tone(photo)))
-    _write_animation(out, photo, frames, recipe.seconds)
+    scene = resized(results.scene(photo), recipe.width)
+
+    def frame(degrees: float) -> np.ndarray:
+        """In the light turned by so much."""
+        turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
+        return traced_photo(turned, recipe.samples)
+
+    _write_animation(recipe, results, photo, out, report, frame)
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -210,10 +203,23 @@ def _write_alone(stem: Path, traced: Traced) -> None:
     traced.to_png(stem.with_name(stem.name + ".png"))
 
 
-def _write_animation(out: Path, photo: str, frames: list[Traced], seconds: float) -> None:
-    """Every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
+def _write_animation(
+    recipe: schema.Turntable | schema.MovingLight,
+    results: SolvedSet,
+    photo: str,
+    out: Path,
+    report: Report,
+    frame: Callable[[float], np.ndarray],
+) -> None:
+    """Every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white.
+
+    frame: what is traced at so many degrees of a whole turn
+    """
+    pixels = []
+    for k in range(recipe.frames):
+        report(k / recipe.frames)
+        pixels.append(Traced(frame(360 * k / recipe.frames), results.tone(photo)).rgba())
     (out / photo).mkdir(parents=True)
-    pixels = [frame.rgba() for frame in frames]
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
-    write_gif(out / f"{photo}.gif", pixels, seconds)
+    write_gif(out / f"{photo}.gif", pixels, recipe.seconds)

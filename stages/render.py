@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from factorlib.dataset.schema import LightSlice
-from factorlib.images.exr import read_exr, write_exr, write_rgb_exr
+from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.model.interreflection import bounced_light
@@ -22,7 +22,7 @@ from factorlib.render.ball import ball, ball_normals, observed_cells
 from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised
-from factorlib.results.materials import Gauge, Model, Reflectance, in_order, read_materials
+from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 from factorlib.urm.observations import read_observations
@@ -47,31 +47,34 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render a photo again, and balls and reflectance maps of every material in its light."""
-    name, names = inputs.photo, inputs.facts["dataset.materials"]
-    file = inputs["export"] / "materials.json"
-    exported = read_materials(file)
-    materials = in_order(exported, names, file)
+    name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["export"] / "materials.json"
+    exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     light = light_of(inputs["export"], name, msgspec.convert(inputs.facts["dataset.light"], LightSlice))
     reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light, params.tail)
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
-    total = 10 + len(names)
+    total, materials = 10 + len(names), in_order(exported, names, file)
 
     def report(done: float, pixels: float) -> None:
         """Pixels of the re-synthesis."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
-    model = read_materials(inputs["solve"] / "materials.json").model
-    tone = model.tone.get(name)
-    again = resynthesised(reflector, materials, photo, geometry, report, surroundings(inputs, model, exported.gauge))
-    _write(out / "resynthesis" / name, shown(again, tone.exponent, tone.pivot) if tone else again, exposure)
-    seen = observed_pixels(photo, geometry)
+    around = surroundings(inputs, model, exported.gauge)
+    radiance = resynthesised(reflector, materials, photo, geometry, report, around)
+    if tone := model.tone.get(name):
+        radiance = shown(radiance, tone.exponent, tone.pivot)
+    _write(out / "resynthesis" / name, {}, radiance, picture(radiance, exposure))
+    observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
-        pixels = seen & (np.rint(photo["label"]) == k)
-        normals = np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1)
-        _write(out / "materials" / name / label, ball(reflector, material, params.ball_size), exposure, disc=True)
-        _write_map(out / "reflectance_maps" / name / label, reflector, material, normals, exposure, params.map_size)
+        radiance = ball(reflector, material, params.ball_size)
+        _write(out / "materials" / name / label, {}, radiance, _on_disc(picture(radiance, exposure)))
+        pixels = observed & (np.rint(photo["label"]) == k)
+        cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
+        radiance = ball(reflector, material, params.map_size)
+        ringed = picture(radiance, exposure)
+        ringed[cells & ~binary_erosion(cells)] = RING
+        _write(out / "reflectance_maps" / name / label, {"observed": cells}, radiance, _on_disc(ringed))
     progress(total, total, name)
 
 
@@ -87,24 +90,11 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
 
 
-def _write(stem: Path, radiance: np.ndarray, exposure: float, disc: bool = False) -> None:
+def _write(stem: Path, further: dict[str, np.ndarray], radiance: np.ndarray, pixels: np.ndarray) -> None:
+    """An EXR of the radiance and of further channels, and a PNG of the pixels."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
-    pixels = picture(radiance, exposure)
-    write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels) if disc else pixels)
-
-
-def _write_map(
-    stem: Path, reflector: Reflector, material: Reflectance, normals: np.ndarray, exposure: float, size: int
-) -> None:
-    """Radiance by normal, and which normals the photo shows: ringed in the PNG."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    radiance, observed = ball(reflector, material, size), observed_cells(normals, size)
-    channels = {c: radiance[..., k] for k, c in enumerate("RGB")}
-    write_exr(stem.with_name(stem.name + ".exr"), {**channels, "observed": observed})
-    pixels = picture(radiance, exposure)
-    pixels[observed & ~binary_erosion(observed)] = RING
-    write_png(stem.with_name(stem.name + ".png"), _on_disc(pixels))
+    write_exr(stem.with_name(stem.name + ".exr"), dict(zip("RGB", np.moveaxis(radiance, -1, 0))) | further)
+    write_png(stem.with_name(stem.name + ".png"), pixels)
 
 
 def _on_disc(pixels: np.ndarray) -> np.ndarray:

@@ -96,32 +96,32 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     earlier = _earlier(params, inputs, relative)
     problem = _problem(params, inputs, at_one_exposure(seen, relative))
     _warn(before_solving(names, seen.photos, problem.blocks))
-    answer = Answer(
-        names, problem, _solved(params, problem, earlier, inputs, progress), relative, params.solver, earlier
-    )
-    _write(out, answer, params)
-
-
-def operator_of(params: Params) -> str:
-    """The name of the operator that the solver takes."""
-    automatic = "paper_network" if params.solver == "paper" else "network"
-    return automatic if params.operator == "auto" else params.operator
+    solution = _solved(params, problem, earlier, inputs, progress)
+    answer = Answer(names, problem, solution, relative, params.solver, earlier)
+    errors, coverages = _uncertainty(answer, solution.shown(problem), params)
+    _warn(after_solving(answer, errors))
+    write_materials(out / "materials.json", answer.material_table(errors))
+    write_uncertainty(out / "uncertainty.json", answer.uncertainty(errors))
+    write_lobes(out / "lobes.parquet", answer.lights())
+    write_exposures(out / "exposures.json", answer.exposures())
+    write_rows(out / "convergence.parquet", Event, solution.history)
+    (out / "coverage").mkdir()
+    for name, coverage in coverages.items():
+        write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
 
 
 def _problem(params: Params, inputs: Inputs, seen: Observations) -> JointProblem:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    rotations = {
-        photo: np.array(light.world_from_camera)
-        for photo, light in lights.items()
-        if light.world_from_camera is not None
-    }
+    worlds = {photo: light.world_from_camera for photo, light in lights.items()}
+    rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     noise = Noise(params.noise_absolute, params.noise_relative)
     blocks = blocks_of_observations(
         seen, noise, held_out=params.held_out, world_from_camera=rotations, seed=params.seed
     )
-    return JointProblem(
-        blocks, reflection_operator(operator_of(params), weights=inputs["train"]), Loss(prior=params.prior), inputs.map
-    )
+    automatic = "paper_network" if params.solver == "paper" else "network"
+    operator = automatic if params.operator == "auto" else params.operator
+    reflection = reflection_operator(operator, weights=inputs["train"])
+    return JointProblem(blocks, reflection, Loss(prior=params.prior), inputs.map)
 
 
 def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earlier | None:
@@ -129,11 +129,8 @@ def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earl
     if "start" not in inputs.folders:
         return None
     if params.solver != "bundle":
-        raise InputError(
-            f"the solver {params.solver} starts from nothing",
-            key="solve.start",
-            cure="leave it out, or set solve.solver=bundle",
-        )
+        cure = "leave it out, or set solve.solver=bundle"
+        raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure=cure)
     return read_earlier(inputs["start"]).beside(relative)
 
 
@@ -159,21 +156,6 @@ def _own(params: Params, struct: type[msgspec.Struct]) -> dict[str, Any]:
     return {name: getattr(params, name) for name in struct.__struct_fields__}
 
 
-def _write(out: Path, answer: Answer, params: Params) -> None:
-    """All files of the stage, and what they leave open."""
-    problem = answer.solution.shown(answer.problem)
-    errors, coverages = _uncertainty(answer, problem, params)
-    _warn(after_solving(answer, errors))
-    write_materials(out / "materials.json", answer.material_table(errors))
-    write_uncertainty(out / "uncertainty.json", answer.uncertainty(errors))
-    write_lobes(out / "lobes.parquet", answer.lights())
-    write_exposures(out / "exposures.json", answer.exposures())
-    write_rows(out / "convergence.parquet", Event, answer.solution.history)
-    (out / "coverage").mkdir()
-    for name, coverage in coverages.items():
-        write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
-
-
 def _uncertainty(
     answer: Answer, problem: JointProblem, params: Params
 ) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
@@ -184,14 +166,12 @@ def _uncertainty(
             Posterior(of.sampled(params.observations, params.seed), fit, read_light_prior())
             for of, fit in ((sure_ones(problem), solution.materials), (problem, solution.lights))
         )
-        errors = in_gauge_of(
-            of_materials.standard_errors(), solution.materials.point.materials, solution.point.materials
-        )
-        return errors, of_lights.relative_standard_errors()
+        standard, fitted = of_materials.standard_errors(), solution.materials.point.materials
+        return in_gauge_of(standard, fitted, solution.point.materials), of_lights.relative_standard_errors()
     errors = standard_errors(problem, solution.point)
     of_light = partial(relative_standard_errors, loss=problem.loss, sigma=errors.deviation)
-    found = problem.spread(of_light, problem.illuminations(solution.point))
-    return errors, {block.name: error for block, error in zip(problem.blocks, found, strict=True)}
+    relative = problem.spread(of_light, problem.illuminations(solution.point))
+    return errors, {block.name: error for block, error in zip(problem.blocks, relative, strict=True)}
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -3,7 +3,6 @@
 Writes specular.safetensors and diffuse.safetensors, training.parquet (the curve) and accuracy.json (held-out errors).
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +14,9 @@ import torch
 from factorlib.checkpoint import Checkpoint
 from factorlib.jsonfile import write_json
 from factorlib.reflection.accuracy import diffuse_table, specular_table
-from factorlib.reflection.network import write_layers
+from factorlib.reflection.network import Layers, write_layers
 from factorlib.reflection.samples import diffuse_samples, specular_samples
-from factorlib.reflection.training import Schedule, Step, diffuse_problem, specular_problem, train
+from factorlib.reflection.training import Problem, Schedule, Step, diffuse_problem, specular_problem, train
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import writing
 
@@ -62,69 +61,53 @@ WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Train the diffuse and the specular network, and write weights, curves and accuracy."""
-    threads = torch.get_num_threads()
+    threads, accuracy, curves = torch.get_num_threads(), {}, {}
     torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
     try:
-        curves = {
-            "diffuse": _diffuse(params, inputs, out, progress),
-            "specular": _specular(params, inputs, out, progress),
-        }
+        for part, fit in (("diffuse", _diffuse), ("specular", _specular)):
+            layers, accuracy[part], curves[part] = fit(params, inputs, progress)
+            write_layers(
+                out / f"{part}.safetensors", layers, inputs=f"see factorlib.reflection.network.{part}_features"
+            )
     finally:
         torch.set_num_threads(threads)
-    write_json(out / "accuracy.json", {part: table for part, (table, _) in curves.items()})
-    _write_curves(out / "training.parquet", {part: curve for part, (_, curve) in curves.items()})
+    write_json(out / "accuracy.json", accuracy)
+    _write_curves(out / "training.parquet", curves)
 
 
-def _specular(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
+def _specular(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layers, dict, list[Step]]:
     progress(0, 1, "specular: samples of the reference")
-    seen = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
+    even = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
     grazing = specular_samples(params.samples // 2, params.seed + 1, tolerance=params.tolerance, grazing=True, **WIDER)
     held_out = specular_samples(params.held_out, params.seed + 1_000_003, tolerance=HELD_OUT_TOLERANCE)
+    problems = specular_problem(even.joined(grazing)), specular_problem(held_out)
     schedule = Schedule(params.steps, params.batch, params.rate, params.width, params.depth, params.seed)
-    problem = specular_problem(held_out)
-    layers, curve = train(
-        specular_problem(seen.joined(grazing)),
-        problem,
-        schedule,
-        _report(progress, "specular", params.steps),
-        _checkpoint(inputs, "specular"),
-    )
-    write_layers(out / "specular.safetensors", layers, inputs="see factorlib.reflection.network.specular_features")
-    return specular_table(problem.float().errors(layers), *held_out.inputs()), curve
+    layers, curve = _trained("specular", problems, schedule, inputs, progress)
+    return layers, specular_table(problems[1].float().errors(layers), *held_out.inputs()), curve
 
 
-def _diffuse(params: Params, inputs: Inputs, out: Path, progress: Progress) -> tuple[dict, list[Step]]:
-    seen = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
+def _diffuse(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layers, dict, list[Step]]:
+    samples = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
     held_out = diffuse_samples(params.held_out, params.seed + 1_000_003)
-    schedule = Schedule(
-        params.diffuse_steps, params.batch, params.rate, params.diffuse_width, params.diffuse_depth, params.seed
-    )
-    problem = diffuse_problem(held_out)
-    layers, curve = train(
-        diffuse_problem(seen),
-        problem,
-        schedule,
-        _report(progress, "diffuse", params.diffuse_steps),
-        _checkpoint(inputs, "diffuse"),
-    )
-    write_layers(out / "diffuse.safetensors", layers, inputs="see factorlib.reflection.network.diffuse_features")
-    return diffuse_table(problem.float().errors(layers), held_out.sharpness, held_out.nz), curve
+    problems = diffuse_problem(samples), diffuse_problem(held_out)
+    sizes = params.diffuse_width, params.diffuse_depth
+    schedule = Schedule(params.diffuse_steps, params.batch, params.rate, *sizes, params.seed)
+    layers, curve = _trained("diffuse", problems, schedule, inputs, progress)
+    return layers, diffuse_table(problems[1].float().errors(layers), held_out.sharpness, held_out.nz), curve
 
 
-def _checkpoint(inputs: Inputs, part: str) -> Checkpoint:
-    return Checkpoint(inputs.unfinished / f"{part}.pt" if inputs.unfinished else None)
+def _trained(
+    part: str, problems: tuple[Problem, Problem], schedule: Schedule, inputs: Inputs, progress: Progress
+) -> tuple[Layers, list[Step]]:
+    """problems: what is fitted, and what the error is measured on; it goes on where a killed run was."""
 
-
-def _report(progress: Progress, part: str, steps: int) -> Callable[[Step], None]:
     def report(point: Step) -> None:
         """Errors of held-out samples at a step."""
-        progress(
-            point.step,
-            steps,
-            f"{part}: held-out error {point.held_out_median_error:.2%} (median), {point.held_out_p95_error:.2%} (p95)",
-        )
+        median, p95 = point.held_out_median_error, point.held_out_p95_error
+        progress(point.step, schedule.steps, f"{part}: held-out error {median:.2%} (median), {p95:.2%} (p95)")
 
-    return report
+    checkpoint = Checkpoint(inputs.unfinished / f"{part}.pt" if inputs.unfinished else None)
+    return train(*problems, schedule, report, checkpoint)
 
 
 def _write_curves(path: Path, curves: dict[str, list[Step]]) -> None:

@@ -14,15 +14,14 @@ import numpy as np
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.visibility import Occluders, sight
 from factorlib.images.exr import read_exr
-from factorlib.meshes.limits import NO_LIMITS
 from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import read_mesh
+from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
-from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.observations import write_observations
 from factorlib.urm.sample import sample
 
 log = logging.getLogger("factorlib.urm")
@@ -45,41 +44,30 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the observations of one photo."""
-    name = inputs.photo
-    light = inputs.facts["dataset.light"]
+    name, facts = inputs.photo, inputs.facts
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
-    observations = observations_of_photo(
-        photo,
-        geometry,
-        Taken(name, light["illumination"], read_photo_facts(inputs["masks"] / f"{name}.json").exposure),
-        inputs.facts["dataset.materials"],
-        params.least_confidence,
-    )
-    if len(observations) == 0:
+    exposure = read_photo_facts(inputs["masks"] / f"{name}.json").exposure
+    taken = Taken(name, facts["dataset.light"]["illumination"], exposure)
+    seen = observations_of_photo(photo, geometry, taken, facts["dataset.materials"], params.least_confidence)
+    if len(seen) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
-    observations = sample(observations, params.most)
-    if params.directions and len(observations):
-        observations = with_visibility(observations, photo["label"].shape, inputs, params)
-    write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
-
-
-def with_visibility(seen: Observations, shape: tuple[int, int], inputs: Inputs, params: Params) -> Observations:
-    """The observations with what they see past the objects of their photo, of `shape` (height, width)."""
-    found = read_photo_poses(inputs["align"] / f"{inputs.photo}.json")
-    camera, occluders = found.camera.camera(shape[1], shape[0]), occluders_of(inputs, found.objects)
-    past = sight(
-        occluders, camera, np.column_stack([seen.x, seen.y]), seen.normal, params.directions, params.cast_points
-    )
-    return msgspec.structs.replace(seen, visibility=past.visibility, met=past.met) if past else seen
+    seen = sample(seen, params.most)
+    if params.directions and len(seen):
+        poses, (height, width) = read_photo_poses(inputs["align"] / f"{name}.json"), photo["label"].shape
+        occluders, pixels = occluders_of(inputs, poses.objects), np.column_stack([seen.x, seen.y])
+        camera = poses.camera.camera(width, height)
+        past = sight(occluders, camera, pixels, seen.normal, params.directions, params.cast_points)
+        if past:
+            seen = msgspec.structs.replace(seen, visibility=past.visibility, met=past.met)
+    write_observations(out / f"{name}.parquet", merge(seen, params.merge_degrees))
 
 
 def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Every object of the photo where `align` put it."""
-    slice_, meshes = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice), []
-    for thing in slice_.objects:
-        entry = slice_.meshes[thing.mesh]
-        mesh = read_mesh(
-            inputs.file(entry.file), inputs.facts["dataset.materials"], entry.made_of, thing.materials, limits=NO_LIMITS
-        )
-        meshes.append(scaled(mesh, poses[thing.name].scale))
-    return Occluders(meshes, [poses[thing.name].pose for thing in slice_.objects])
+    slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
+    read = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG)
+    meshes = [
+        scaled(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials), poses[own.name].scale)
+        for own in slice_.objects
+    ]
+    return Occluders(meshes, [poses[own.name].pose for own in slice_.objects])

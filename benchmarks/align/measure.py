@@ -9,11 +9,10 @@ import numpy as np
 
 from benchmarks.align.cases import Case, case
 from benchmarks.solve.clock import Clock
-from factorlib.align.doubts import doubts
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.search import Found, RunnerUp, Search
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
-from factorlib.align.trust import Trust, trust_in
+from factorlib.align.trust import Trust, doubts, trust_in
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Maps, rasterise
 

@@ -11,11 +11,11 @@ where frame or occluder cut the mask the areas do not say it, and several sizes 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.fft import irfft2, rfft2
 
@@ -34,30 +34,20 @@ CUT_SHARE = 0.03  # of the contour on the frame or on broad unknown areas: more,
 BROAD = 0.03  # of the mask's extent: narrower unknown bands, as along a contour, hide nothing
 
 
-class Candidate(msgspec.Struct, frozen=True):
-    """A guess and its wrong pixels as a share of the mask's."""
+class Guess(msgspec.Struct, frozen=True):
+    """A template laid on the photo: wrong pixels as a share of the mask's, the view, the photo's turn in radians, the shift
+    (x, y), and the focal length; the last two in grid pixels."""
 
-    state: State
     error: float
-
-
-class Density(msgspec.Struct, frozen=True):
-    """How densely rotations are tried, and which guesses are kept.
-
-    views      directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
-    keep       guesses at most, each turned by `apart_deg` at least against the others
-    """
-
-    views: int
-    rolls: int
-    keep: int
-    apart_deg: float
+    turn: Float[np.ndarray, "3 3"]
+    angle: float
+    shift: Int[np.ndarray, "2"]
+    focal: float
 
 
 def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """A rotation cam_from_object that looks along `direction` of the object's frame."""
-    side = np.eye(3)[np.argmin(np.abs(direction))]
-    x = np.cross(side, direction)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(direction, x), direction])
 
@@ -73,74 +63,81 @@ def is_cut(silhouette: Silhouette) -> bool:
     return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
 
 
-def candidates(caster: Caster, silhouette: Silhouette, camera: Camera, density: Density) -> list[Candidate]:
-    """The best guesses that differ in rotation, best first; the photo must show some pixel of the object."""
-    labels = caster.mesh.labels
+def candidates(
+    caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float
+) -> list[State]:
+    """The best guesses that differ in rotation, best first; the photo must show some pixel of the object.
+
+    views: directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
+    keep: guesses at most, each turned by `apart_deg` at least against the others
+    """
     low, high, extent = extent_of(silhouette)
     cut = is_cut(silhouette)
-    pixel = extent / (CUT if cut else WHOLE)
-    middle = (low + high) / 2
-    angles = np.arange(density.rolls) * 2 * np.pi / density.rolls
-    costs, area = _cost_images(silhouette, labels, middle, pixel, angles)
+    pixel, middle = extent / (CUT if cut else WHOLE), (low + high) / 2
+    angles = np.arange(rolls) * 2 * np.pi / rolls
+    area = np.count_nonzero(silhouette.inside) / pixel**2
+    labels = caster.mesh.labels
+    costs = _cost_images(silhouette, labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
-    found = []
+    guesses = []
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
-    for direction in fibonacci_directions(density.views):
+    for direction in fibonacci_directions(views):
         turn = looking_along(direction)
         for template, focal in _templates(caster, labels, turn, distance, area, cut):
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
-            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(
-                density.rolls, -1
-            )
+            errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(rolls, -1)
             best = errors.argmin(axis=1)
-            error = 1 + errors[np.arange(density.rolls), best] / area
-            shift = np.stack([best % GRID, best // GRID], axis=1)
-            shift = (shift + GRID // 2) % GRID - GRID // 2
-            found += [(error[k], turn, angles[k], shift[k], focal) for k in range(density.rolls)]
-    chosen = _apart(found, density.keep, density.apart_deg)
-    return [Candidate(_state(c, caster, camera, middle, pixel, distance), float(c[0])) for c in chosen]
+            error = 1 + errors[np.arange(rolls), best] / area
+            shift = (np.stack([best % GRID, best // GRID], axis=1) + GRID // 2) % GRID - GRID // 2
+            guesses += [Guess(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
+
+    def state(guess: Guess) -> State:
+        """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
+        (x, y), cos, sin = guess.shift, np.cos(guess.angle), np.sin(guess.angle)
+        place = middle + pixel * np.array([cos * x + sin * y, -sin * x + cos * y])
+        slope = (place - np.array(camera.centre)) / camera.focal
+        depth = camera.focal * distance / (guess.focal * pixel)
+        rotation = toward(slope) @ _roll(guess) @ guess.turn
+        return State(rotation, float(slope[0]), float(slope[1]), float(np.log(depth)), float(np.log(camera.focal)))
+
+    return [state(guess) for guess in _apart(guesses, keep, apart_deg)]
 
 
 def _cost_images(
     silhouette: Silhouette,
-    labels: Sequence[int],
+    labels: tuple[int, ...],
     middle: Float[np.ndarray, "2"],
     pixel: float,
     angles: Float[np.ndarray, " rolls"],
-) -> tuple[np.ndarray, float]:
-    """E_l of the photo turned by each angle about `middle`, [rolls, labels, GRID, GRID], and the mask's area in grid pixels."""
+) -> Float[np.ndarray, "rolls labels GRID GRID"]:
+    """E_l of the photo turned by each angle about `middle`."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
-    sums = [
-        _block_means(np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)), step)
-        for label in labels
-    ]
+    costs = (np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)) for label in labels)
+    means = [_block_means(cost, step) for cost in costs]
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
     for k, angle in enumerate(angles):
         cos, sin = np.cos(angle), np.sin(angle)
-        column, row = middle[0] + cos * x + sin * y, middle[1] - sin * x + cos * y
-        for n, image in enumerate(sums):
-            images[k, n] = ndimage.map_coordinates(image, [row / step - 0.5, column / step - 0.5], order=1, cval=0.0)
-    area = np.count_nonzero(silhouette.inside) / pixel**2
-    return images, area
+        place = [(middle[1] - sin * x + cos * y) / step - 0.5, (middle[0] + cos * x + sin * y) / step - 0.5]
+        for n, image in enumerate(means):
+            images[k, n] = ndimage.map_coordinates(image, place, order=1, cval=0.0)
+    return images
 
 
-def _block_means(image: np.ndarray, step: int) -> np.ndarray:
+def _block_means(image: Float[np.ndarray, "h w"], step: int) -> Float[np.ndarray, "i j"]:
     height, width = (-(-n // step) * step for n in image.shape)
-    padded = np.zeros((height, width))
-    padded[: image.shape[0], : image.shape[1]] = image
+    padded = np.pad(image, [(0, height - image.shape[0]), (0, width - image.shape[1])])
     return padded.reshape(height // step, step, width // step, step).mean(axis=(1, 3))
 
 
 def _templates(
-    caster: Caster, labels: Sequence[int], turn: np.ndarray, distance: float, area: float, cut: bool
-) -> Iterator[tuple[np.ndarray, float]]:
-    """Label images of the mesh at each size, [labels, GRID, GRID], and the focal length (grid pixels) that gives it."""
+    caster: Caster, labels: tuple[int, ...], turn: Float[np.ndarray, "3 3"], distance: float, area: float, cut: bool
+) -> Iterator[tuple[Float[np.ndarray, "labels GRID GRID"], float]]:
+    """Label images of the mesh at each size, and the focal length (grid pixels) that gives it."""
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
-    hits = caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose)
-    image = caster.labels(hits)
+    image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
     own = np.count_nonzero(image)
     for size in SIZES_OF_CUT if cut else SIZES_OF_WHOLE:
         zoom = np.sqrt(area / max(own, 1)) * size
@@ -149,7 +146,7 @@ def _templates(
             yield np.stack([sized == label for label in labels]).astype(np.float32), focal * zoom
 
 
-def _zoomed(image: np.ndarray, zoom: float) -> np.ndarray:
+def _zoomed(image: Int[np.ndarray, "n n"], zoom: float) -> Int[np.ndarray, "n n"]:
     """The image scaled about its middle, nearest pixel, in its own frame."""
     index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
     there = (index >= 0) & (index < GRID)
@@ -157,32 +154,22 @@ def _zoomed(image: np.ndarray, zoom: float) -> np.ndarray:
     return np.where(there[:, None] & there, image[np.ix_(index, index)], 0)
 
 
-def _apart(found: list, keep: int, apart_deg: float) -> list:
-    """The best of `found`, none within `apart_deg` of a better one."""
-    errors = np.array([f[0] for f in found])
-    order = np.argsort(errors, kind="stable")[: 60 * keep]
-    rotations = np.stack([rotation_of_vector(np.array([0, 0, -found[k][2]])) @ found[k][1] for k in order])
+def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
+    """The best of the guesses, none within `apart_deg` of a better one."""
+    order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
+    rotations = np.stack([_roll(guesses[k]) @ guesses[k].turn for k in order])
     chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:
         k = int(np.argmax(free))
-        chosen.append(found[order[k]])
+        chosen.append(guesses[order[k]])
         free &= np.einsum("nij,ij->n", rotations, rotations[k]) < closest
         free[k] = False
     return chosen
 
 
-def _state(
-    found: tuple, caster: Caster, camera: Camera, middle: Float[np.ndarray, "2"], pixel: float, distance: float
-) -> State:
-    """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
-    _, turn, angle, shift, focal = found
-    cos, sin = np.cos(angle), np.sin(angle)
-    place = middle + pixel * np.array([cos * shift[0] + sin * shift[1], -sin * shift[0] + cos * shift[1]])
-    slope = (place - np.array(camera.centre)) / camera.focal
-    depth = camera.focal * distance / (focal * pixel)
-    rotation = toward(slope) @ rotation_of_vector(np.array([0, 0, -angle])) @ turn
-    return State(rotation, float(slope[0]), float(slope[1]), float(np.log(depth)), float(np.log(camera.focal)))
+def _roll(guess: Guess) -> Float[np.ndarray, "3 3"]:
+    return rotation_of_vector(np.array([0, 0, -guess.angle]))
 
 
 def toward(slope: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:

@@ -12,7 +12,7 @@ over that, times what contours, depth jumps, slant and sides say.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from factorlib.align.silhouette import Silhouette
@@ -34,11 +34,10 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
 
     0 where the mask and the mesh name different materials, where there is no mesh, and where the normal was bent.
     """
-    agree = (maps.label > 0) & (silhouette.label == maps.label) & ~depth_jumps(maps)
+    agree = (maps.label > 0) & (silhouette.label == maps.label) & ~_depth_jumps(maps)
     if not agree.any():
         return np.zeros(agree.shape)
-    rows, columns = np.nonzero(agree)
-    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    extent = max(np.ptp(where) for where in np.nonzero(agree)) + 1
     distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
     result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
     unsure = (maps.facet / FACET) ** 2 + (turns(maps) / TURN) ** 2
@@ -47,38 +46,31 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
 
 def turns(maps: Maps) -> Float[np.ndarray, "h w"]:
     """turn of (1), in radians, over those of the 3 × 3 pixels that see a mesh."""
-    seen = (maps.label > 0).astype(float)
-    share = np.maximum(uniform_filter(seen, 3, mode="constant"), 1e-12)
-    mean = (
-        np.stack([uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)], axis=-1)
-        / share[..., None]
-    )
-    return np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=-1), 0)) * seen
+    mesh = (maps.label > 0).astype(float)
+    share = np.maximum(uniform_filter(mesh, 3, mode="constant"), 1e-12)
+    sums = [uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)]
+    mean = np.stack(sums, axis=-1) / share[..., None]
+    return np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=-1), 0)) * mesh
 
 
-def depth_jumps(maps: Maps) -> np.ndarray:
+def _depth_jumps(maps: Maps) -> Bool[np.ndarray, "h w"]:
     """Pixels whose depth, or object, changes abruptly to the pixel right of or below them (both of the two)."""
-    seen = maps.label > 0
-    if not seen.any():
-        return seen
-    limit = DEPTH_JUMP * max(float(np.ptp(maps.depth[seen])), 1e-12)
-    result = np.zeros(seen.shape, bool)
+    mesh = maps.label > 0
+    result = np.zeros(mesh.shape, bool)
+    limit = DEPTH_JUMP * max(float(np.ptp(maps.depth[mesh])), 1e-12) if mesh.any() else np.inf
     for axis in (0, 1):
         first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
-        both = seen[first] & seen[second]
+        both = mesh[first] & mesh[second]
         step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
-        jump = both & (
-            ((step > limit) & (step > STEEPER * _least_beside(step, axis)))
-            | (maps.object[first] != maps.object[second])
-        )
+        steep = step > STEEPER * _least_beside(step, axis)
+        jump = both & (((step > limit) & steep) | (maps.object[first] != maps.object[second]))
         result[first] |= jump
         result[second] |= jump
     return result
 
 
-def _least_beside(step: np.ndarray, axis: int) -> np.ndarray:
+def _least_beside(step: Float[np.ndarray, "i j"], axis: int) -> Float[np.ndarray, "i j"]:
     """The lesser of the steps before and after each along `axis`; infinite where there is neither."""
-    width = [(1, 1) if k == axis else (0, 0) for k in range(2)]
-    padded = np.pad(step, width, constant_values=np.inf)
+    padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
     size = step.shape[axis]
     return np.minimum(np.take(padded, range(size), axis), np.take(padded, range(2, size + 2), axis))

@@ -1,5 +1,5 @@
-"""Checks of what is given for a photo against the photo: a pose puts its object before the camera, a camera fits the picture, and
-every material of the mask is some object's."""
+"""What is given for a photo, checked against the photo: a pose puts its object before the camera, a camera fits the
+picture, also one of an external source (COLMAP, transforms.json, BOP), and every material of the mask is some object's."""
 
 from __future__ import annotations
 
@@ -9,32 +9,34 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.dataset.schema import ExternalCamera, Vec2
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.meshes.mesh import Mesh
 
 FIELD_DEG = 1.0, 150.0  # of view, across the longer side, that cameras have
+MOST_ROUNDED_PX = 1.0  # a side of a picture made smaller is a whole number: its middle is off by half of this
+INNER = 0.25, 0.75  # of a photo, in which its principal point lies
 log = logging.getLogger("factorlib.align")
 
 
 def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: str = "dataset") -> None:
-    """Of a pose that is used as it is: InputError where the object, or its middle, is not before the camera, z > 0; a warning
-    where it reaches behind the camera, which then stands inside it.
+    """Raise InputError where a given pose puts the object, or its middle, not before the camera, z > 0; warn where it
+    reaches behind the camera, which then stands inside it.
 
     source: dataset, or the source of cameras that gives the pose
     """
     depth = pose.apply(mesh.vertices)[:, 2]
     middle = float(pose.apply(mesh.centre[None])[0, 2])
-    key = f"photos[{photo}].objects[{name}].pose" if source == "dataset" else f"cameras.{source}: {photo}: {name}"
     if depth.max() <= 0 or middle <= 0:
         what = f"object {name!r}" if depth.max() <= 0 else f"the middle of object {name!r}"
         raise InputError(
-            f"{what} is not before the camera: z = {middle:.4g}", file="dataset.yaml", key=key,
+            f"{what} is not before the camera: z = {middle:.4g}", file="dataset.yaml",
+            key=f"photos[{photo}].objects[{name}].pose" if source == "dataset" else f"cameras.{source}: {photo}: {name}",
             cure="x_cam = R x_object + t with x right, y down, z forward (OpenGL's camera looks along −z: turn y and z over); "
             "take the object out of photos that do not show it",
         )  # fmt: skip
-    behind = int(np.count_nonzero(depth <= 0))
-    if behind:
+    if behind := int(np.count_nonzero(depth <= 0)):
         log.warning(
             "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, which then stands inside it: is it so, and in the "
             "mesh's units?", photo, name, source, behind, len(depth),
@@ -44,13 +46,13 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
 def warn_of_materials(
     label: Float[np.ndarray, "h w"], of_objects: Iterable[Sequence[int]], materials: Sequence[str], photo: str
 ) -> None:
-    """Of materials of the mask that no object of the photo has: their pixels get no normals and are not used.
+    """Warn of materials of the mask that no object of the photo has: their pixels get no normals and are not used.
 
     of_objects: labels of the materials of each object
     """
-    shown, counts = np.unique(np.round(label[label > 0.5]).astype(int), return_counts=True)
-    known = {int(k) for labels in of_objects for k in labels}
-    for k, count in zip(shown.tolist(), counts.tolist()):
+    labels, counts = np.unique(np.round(label[label > 0.5]).astype(int), return_counts=True)
+    known = {int(k) for labels_of_one in of_objects for k in labels_of_one}
+    for k, count in zip(labels.tolist(), counts.tolist()):
         if k not in known:
             log.warning(
                 "%s: material %r has %d pixels in the mask, but no object of the photo has it: they are not used; is a label wrong, or "
@@ -59,7 +61,10 @@ def warn_of_materials(
 
 
 def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple[int, int], photo: str) -> None:
-    """Of a principal point outside the photo and of a field of view that is no camera's.  All in pixels; size: width, height."""
+    """Warn of a principal point outside the photo and of a field of view that is no camera's, all in pixels.
+
+    focal: None where it is not known;  size: width, height
+    """
     width, height = size
     if not (0 <= centre[0] <= width and 0 <= centre[1] <= height):
         log.warning(
@@ -73,3 +78,50 @@ def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple
                 "%s: its focal length of %.6g px makes a field of view of %.4g°, which few cameras have: is it in pixels of the photo, "
                 "not in millimetres?", photo, focal, field,
             )  # fmt: skip
+
+
+def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, Vec2]:
+    """Focal length and principal point of an external source's image, in pixels of the photo of width × height, as displayed.
+
+    Raises InputError where the photo is not the image at another size: it was cropped, turned or squeezed.
+    """
+    across, down = _scale(external, width, height, photo)
+    point = external.principal_point
+    centre = (width / 2, height / 2) if point is None else (point[0] * across, point[1] * down)
+    inside = all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre))
+    if external.size is None and not inside:
+        where = f"({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels"
+        cure = "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose of its objects)"
+        raise _refused(external, photo, f"its principal point {where}", cure)
+    return external.focal_px * (across if width >= height else down), centre
+
+
+def _scale(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, float]:
+    """Photo pixels per image pixel, across and down: one number, but for the rounding of the photo's shorter side."""
+    size = external.size
+    if size is None:
+        return 1.0, 1.0
+    if size[1] is None:
+        return width / size[0], width / size[0]
+    if _is_resized(size, width, height):
+        return width / size[0], height / size[1]
+    sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{size[1]:g}"
+    if _is_resized(size[::-1], width, height):
+        fault = "it was made of the photo before its EXIF orientation was applied"
+        cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
+    else:
+        fault, cure = (
+            "it was cropped or squeezed",
+            "give the image itself, or the same at another size, and masks of it",
+        )
+    raise _refused(external, photo, f"{sizes}: {fault}", cure)
+
+
+def _is_resized(size: tuple[float, float], width: int, height: int) -> bool:
+    """By the longer side, to a pixel of the shorter one."""
+    (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
+    return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
+
+
+def _refused(external: ExternalCamera, photo: str, fault: str, cure: str) -> InputError:
+    return InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)

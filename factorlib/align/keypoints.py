@@ -35,31 +35,20 @@ def state_of_keypoints(
 
     camera: its focal length is the prior's; it is replaced only where nothing was known and LEAST_FOR_FOCAL are given.
     """
-    side = max(camera.width, camera.height)
+    side, points = max(camera.width, camera.height), (keypoints.point - caster.centre) / caster.radius
+    estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
+    estimation.ransac.max_error, estimation.ransac.random_seed = MOST_ERROR * side, 0
     sought = prior.sigma > 0 and len(keypoints.pixel) >= LEAST_FOR_FOCAL
     for free in (True, False) if sought else (False,):
-        found, colmap = _absolute_pose(keypoints, caster, camera, free, MOST_ERROR * side)
+        estimation.estimate_focal_length = refinement.refine_focal_length = free
+        colmap = camera.colmap()  # gets the focal length
+        found = pycolmap.estimate_and_refine_absolute_pose(keypoints.pixel, points, colmap, estimation, refinement)
         agreeing = found["num_inliers"] if found else 0
         if agreeing >= LEAST_AGREEING and FOCALS[0] * side <= colmap.focal_length <= FOCALS[1] * side:
-            rigid = found["cam_from_world"]
-            rotation = rigid.rotation.matrix()
-            translation = caster.radius * rigid.translation - rotation @ caster.centre
-            return state_of(
-                Pose(rotation, translation), msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster
-            )
+            rotation = found["cam_from_world"].rotation.matrix()
+            pose = Pose(rotation, caster.radius * found["cam_from_world"].translation - rotation @ caster.centre)
+            return state_of(pose, msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster)
     raise InputError(
         f"only {agreeing} of the {len(keypoints.pixel)} keypoints of '{name}' agree on a pose", file="dataset.yaml", key=f"{photo}.{name}.keypoints",
         cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: is each pixel (x, y) beside its own point?",
     )  # fmt: skip
-
-
-def _absolute_pose(
-    keypoints: Keypoints, caster: Caster, camera: Camera, free: bool, most_error: float
-) -> tuple[dict | None, pycolmap.Camera]:
-    """COLMAP's answer for the mesh about its centre, its radius the unit, and the camera with the focal length it found."""
-    estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
-    estimation.estimate_focal_length = refinement.refine_focal_length = free
-    estimation.ransac.max_error, estimation.ransac.random_seed = most_error, 0
-    colmap = camera.colmap()
-    points = (keypoints.point - caster.centre) / caster.radius
-    return pycolmap.estimate_and_refine_absolute_pose(keypoints.pixel, points, colmap, estimation, refinement), colmap

@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import binary_dilation
 
 from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.raster import Maps
-from factorlib.images.picture import picture as shown_picture
+from factorlib.images.picture import picture as sdr_picture
 
 MESH, MASK = np.array([1.0, 0.15, 0.75]), np.array([0.2, 1.0, 0.2])  # contour colours
 
 
 def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhouette) -> UInt8[np.ndarray, "h w 3"]:
     """sRGB picture; magenta: contour of the mesh and of its parts, green: of the mask; grey-blue: left out."""
-    picture = 0.55 / 255 * shown_picture(radiance).astype(float)
-    seen = maps.label > 0
+    picture = 0.55 / 255 * sdr_picture(radiance).astype(float)
+    mesh, unknown = maps.label > 0, ~silhouette.known
     tint = (maps.normal * (1, -1, -1) + 1) / 2  # the usual colours: x red right, y green up, z blue to the viewer
-    picture[seen] = 0.6 * picture[seen] + 0.4 * tint[seen]
-    picture[~silhouette.known] = 0.7 * picture[~silhouette.known] + 0.3 * np.array([0.4, 0.5, 0.7])
-    width = max(1, round(max(seen.shape) / 600))
-    for contour, colour in (
-        (outline(np.maximum(silhouette.label, 0)), MASK),
-        (outline(maps.label + 1000 * maps.object), MESH),
-    ):
+    picture[mesh] = 0.6 * picture[mesh] + 0.4 * tint[mesh]
+    picture[unknown] = 0.7 * picture[unknown] + 0.3 * np.array([0.4, 0.5, 0.7])
+    width = max(1, round(max(mesh.shape) / 600))
+    for label, colour in ((np.maximum(silhouette.label, 0), MASK), (maps.label + 1000 * maps.object, MESH)):
+        contour = _outline(label)
         picture[binary_dilation(contour, iterations=width) if width > 1 else contour] = colour
     return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
-def outline(label: np.ndarray) -> np.ndarray:
+def _outline(label: Int[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels whose label differs from the one right of or below them."""
     result = np.zeros(label.shape, bool)
     result[:, :-1] |= label[:, :-1] != label[:, 1:]

@@ -13,42 +13,24 @@ from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.refine import FocalPrior
 from factorlib.align.search import (
     CLEARLY_BETTER,
-    UNKNOWN_FOCAL,
     WELL_FOUND,
     Found,
     RunnerUp,
     Search,
     find,
     focal_prior,
-    found_before,
     found_near,
-    with_focal_free,
-)  # fmt: skip
+    refined_finest,
+)
 from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
+from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectEntry
 
 log = logging.getLogger("factorlib.align")
-
-
-class Earlier(msgspec.Struct, frozen=True):
-    """A pose that an earlier result found, and its runner-up where that is still to be reckoned with."""
-
-    pose: Pose
-    runner_up: Pose | None = None
-    runner_up_score: float = 0.0
-    runner_up_difference_deg: float = 0.0
-
-
-class EarlierFocal(msgspec.Struct, frozen=True):
-    """The focal length that goes with earlier poses, photo pixels; where it was from, and its standard error (log)."""
-
-    focal: float
-    source: str
-    log_sigma: float
 
 
 class KnownFocal(msgspec.Struct, frozen=True):
@@ -69,8 +51,8 @@ class ObjectToPlace(msgspec.Struct, frozen=True):
     silhouette: Silhouette
     pose: Pose | None = None
     keypoints: Keypoints | None = None
-    earlier: Earlier | None = None
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the caster's mesh, against the file's
+    earlier: ObjectEntry | None = None
+    scale: tuple[float, float, float] = AS_IT_IS  # of the caster's mesh, against the file's
 
 
 class Placed(msgspec.Struct, frozen=True):
@@ -90,19 +72,18 @@ def placed(
     known: KnownFocal,
     photo: str,
     search: Search = Search(),
-    before: EarlierFocal | None = None,
+    before: CameraEntry | None = None,
 ) -> Placed:
     """Poses of all objects.  The focal length, where neither known nor found `before`, is found with the object that shows most.
 
-    camera: of the photo; its focal length is not used.  Raises InputError for an object to search whose mask has no pixel.
+    camera: of the photo; its focal length is not used.  before: the camera of an earlier result, in pixels of this photo.
+    Raises InputError for an object to search whose mask has no pixel.
     """
-    source = known.source
+    source, sigma, found = known.source, 0.0, {}
     prior = beforehand = focal_prior(known.focal, source, camera.width, camera.height)
-    camera = msgspec.structs.replace(camera, focal=prior.focal)
-    sigma, found = 0.0, {}
     if before is not None:
-        prior, source, sigma = FocalPrior(before.focal, 0.0), before.source, before.log_sigma
-        camera = msgspec.structs.replace(camera, focal=before.focal)
+        prior, source, sigma = FocalPrior(before.focal_px, 0.0), before.focal_source, before.focal_relative_stderr
+    camera = msgspec.structs.replace(camera, focal=prior.focal)
     if prior.sigma > 0 and any(each.pose is not None for each in objects):
         camera, source = _focal_of_given(objects, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
@@ -111,10 +92,10 @@ def placed(
         if obj.pose is not None:
             continue
         if not obj.silhouette.inside.any():
+            cure = "remove the object from this photo, or check its mask and materials"
             raise InputError(
-                f"no pixel of the mask shows object {obj.name!r}", file="dataset.yaml", key=photo,
-                cure="remove the object from this photo, or check its mask and materials",
-            )  # fmt: skip
+                f"no pixel of the mask shows object {obj.name!r}", file="dataset.yaml", key=photo, cure=cure
+            )
         if obj.earlier is not None:
             found[k] = _found_before(obj, camera, sigma, search)
         elif obj.keypoints is None:
@@ -124,28 +105,23 @@ def placed(
             found[k] = found_near(obj.caster, obj.silhouette, camera, start, prior, search)
         if prior.sigma > 0:
             found[k], source = _judged(obj, camera, found[k], source, photo, search)
-            sigma = found[k].log_focal_sigma
-            camera = found[k].state.camera(camera)
+            sigma, camera = found[k].log_focal_sigma, found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [_pose(each, found.get(k)) for k, each in enumerate(objects)]
+    poses = [  # what was said or found before is used to the last digit
+        obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster))
+        for k, obj in enumerate(objects)
+    ]
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
 
 
-def _pose(obj: ObjectToPlace, found: Found | None) -> Pose:
-    """What was said or found before is used to the last digit."""
-    if obj.pose is None and obj.earlier is None:
-        return found.state.pose(obj.caster)
-    return obj.pose or obj.earlier.pose
-
-
 def _found_before(obj: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
-    earlier = obj.earlier
-    found = found_before(obj.caster, obj.silhouette, camera, state_of(earlier.pose, camera, obj.caster), sigma, search)
-    if earlier.runner_up is None:
-        return found
-    state = state_of(earlier.runner_up, camera, obj.caster)
-    other = RunnerUp(state, earlier.runner_up_score, earlier.runner_up_difference_deg)
-    return msgspec.structs.replace(found, runner_up=other)
+    """An earlier answer as it is, scored anew at the finest resolution, with its runner-up where that still counts."""
+    state, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
+    prior = FocalPrior(camera.focal, 0.0)
+    score = refined_finest(obj.caster, obj.silhouette, camera, state, prior, search, 0).score
+    if other is not None:
+        other = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
+    return Found(state, score, sigma, other, earlier=True)
 
 
 def _judged(
@@ -154,9 +130,11 @@ def _judged(
     """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
     if source != "exif":
         return found, "estimated"
-    broad = FocalPrior(UNKNOWN_FOCAL.focal * max(camera.width, camera.height), UNKNOWN_FOCAL.sigma)
+    broad = focal_prior(None, None, camera.width, camera.height)
     if found.score >= WELL_FOUND:
-        free = with_focal_free(obj.caster, obj.silhouette, camera, found, broad, search)
+        steps = 2 * search.steps[-1]
+        free = refined_finest(obj.caster, obj.silhouette, camera, found.state, broad, search, steps)
+        free = Found(free.state, free.score, free.log_focal_sigma(), found.runner_up, found.by_keypoints)
     else:
         free = find(obj.caster, obj.silhouette, camera, broad, search)
     if free.score < found.score + CLEARLY_BETTER:
@@ -176,15 +154,15 @@ def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
         if t.pose and t.silhouette.inside.any()
     ]
 
+    def at(log_focal: float) -> Camera:
+        """The camera with the focal length exp(log_focal)."""
+        return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
+
     def misfit(log_focal: float) -> float:
         """Minus the sum of overlaps (IoU) with the focal length exp(log_focal)."""
-        trial = msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
-        return -sum(
-            labelled_iou(target.silhouette, rasterise(caster, target.camera(trial), pose).label)
-            for caster, pose, target in fixed
-        )
+        seen = ((t, rasterise(caster, t.camera(at(log_focal)), pose)) for caster, pose, t in fixed)
+        return -sum(labelled_iou(target.silhouette, maps.label) for target, maps in seen)
 
     grid = np.log(camera.focal) + np.linspace(-1.6, 1.6, 33)
     best = grid[int(np.argmin([misfit(g) for g in grid]))]
-    fit = minimize_scalar(misfit, bounds=(best - 0.1, best + 0.1), method="bounded", options={"xatol": 1e-4})
-    return msgspec.structs.replace(camera, focal=float(np.exp(fit.x)))
+    return at(minimize_scalar(misfit, bounds=(best - 0.1, best + 0.1), method="bounded", options={"xatol": 1e-4}).x)

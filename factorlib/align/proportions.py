@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.align.refine import DAMPING as OF_POSES
 from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined, rendered
-from factorlib.align.silhouette import labelled_iou
 from factorlib.align.state import State
 from factorlib.align.target import Target
 from factorlib.geometry.camera import Camera
@@ -28,7 +28,7 @@ from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh, scaled
 
 SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d
-DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3, 0.1, 0.1]) ** -2.0  # as of `refine`, and of d
+DAMPING = np.append(OF_POSES, np.array([0.1, 0.1]) ** -2.0)  # of d, too
 LARGEST_STEP = 0.15  # of the logarithms d; of other unknowns twice as much
 STILL = 1e-4  # a step of d that ends the descent
 PARTS = 4  # that are left out in turn, at most
@@ -113,14 +113,16 @@ def fitted(sightings: Sequence[Sighting], steps: int) -> Fitted:
     """Factors and states together, by Gauss-Newton from the mesh as it is; the best met."""
     shape, states, best, most = np.zeros(2), [one.state for one in sightings], None, -np.inf
     for k in range(steps + 1):
-        casters = [Caster(scaled(one.mesh, factors_of(shape))) for one in sightings]
-        met = [_equations(*each) for each in zip(sightings, casters, states, strict=True)]
-        score = float(np.mean([score for _, score in met]))
-        if score > most:
+        equations, scores = [], []
+        for one, state in zip(sightings, states, strict=True):
+            seen = rendered(Caster(scaled(one.mesh, factors_of(shape))), one.target, one.camera, state)
+            equations.append(normal_equations(seen, one.target, one.prior, jacobian_with_shape))
+            scores.append(seen.score(one.target))
+        if (score := float(np.mean(scores))) > most:
             best, most = Fitted(factors_of(shape), states), score
         if k == steps:
             break
-        by_shape, moves = joint_step([(one, equations) for one, (equations, _) in zip(sightings, met, strict=True)])
+        by_shape, moves = _joint_step(equations, [one.prior.free for one in sightings])
         shape, states = shape + by_shape, [state.moved(move) for state, move in zip(states, moves, strict=True)]
         if np.abs(by_shape).max() < STILL:
             break
@@ -136,41 +138,28 @@ def factors_of(shape: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
     return np.exp(SHAPES @ shape)
 
 
-def _equations(one: Sighting, caster: Caster, state: State) -> tuple[Equations, float]:
-    seen = rendered(caster, one.target, one.camera, state)
-    equations = normal_equations(seen, one.target, one.prior, jacobian_with_shape)
-    return equations, labelled_iou(one.target.silhouette, caster.labels(seen.hits))
-
-
 def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
     """∂ image point / ∂ (the seven unknowns of `State.moved`, d), photo pixels."""
     along = arms @ state.rotation  # the arm in the object's axes, as it is scaled
     moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, SHAPES)
     point = arms + state.middle()
-    slope = point[:, :2] / point[:, 2:]
-    by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (np.exp(state.log_focal) / point[:, 2])[
-        :, None, None
-    ]
+    slope, scale = point[:, :2] / point[:, 2:], (np.exp(state.log_focal) / point[:, 2])[:, None, None]
+    by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * scale
     return np.concatenate([state.jacobian(arms), by_shape], axis=-1)
 
 
-def joint_step(
-    each: Sequence[tuple[Sighting, Equations]],
+def _joint_step(
+    equations: Sequence[Equations], free: Sequence[int]
 ) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
-    """The damped step of d, and the sightings' own steps."""
+    """The damped step of d, and the sightings' own steps, in which the first `free` unknowns move."""
     shared, pull, own = np.diag(DAMPING[7:]), np.zeros(2), []
-    for one, equations in each:
-        free = 7 if one.prior.sigma > 0 else 6
-        matrix = equations.information + np.diag(DAMPING * (np.arange(9) < 7))
-        cross = matrix[:free, 7:]
-        away = np.linalg.solve(matrix[:free, :free], np.column_stack([cross, equations.gradient[:free]]))
-        shared = shared + equations.information[7:, 7:] - cross.T @ away[:, :2]
-        pull = pull + equations.gradient[7:] - cross.T @ away[:, 2]
-        own.append((free, away))
+    for one, k in zip(equations, free, strict=True):
+        matrix = one.information + np.diag(DAMPING * (np.arange(9) < 7))
+        cross = matrix[:k, 7:]
+        away = np.linalg.solve(matrix[:k, :k], np.column_stack([cross, one.gradient[:k]]))
+        shared = shared + one.information[7:, 7:] - cross.T @ away[:, :2]
+        pull = pull + one.gradient[7:] - cross.T @ away[:, 2]
+        own.append(away)
     by_shape = np.clip(-np.linalg.solve(shared, pull), -LARGEST_STEP, LARGEST_STEP)
-    moves = []
-    for free, away in own:
-        move = np.zeros(7)
-        move[:free] = np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP)
-        moves.append(move)
-    return by_shape, moves
+    steps = [np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP) for away in own]
+    return by_shape, [np.append(step, np.zeros(7 - len(step))) for step in steps]

@@ -35,6 +35,9 @@ CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
 LEAST_SPREAD = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
 HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
 MOST_SCALE = 0.05  # of the mask's extent
+DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
+LARGEST_STEP = 0.3  # of each unknown, in its own unit
+Points, Jacobian = Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 k"]
 
 
 class FocalPrior(msgspec.Struct, frozen=True):
@@ -43,13 +46,17 @@ class FocalPrior(msgspec.Struct, frozen=True):
     focal: float
     sigma: float
 
+    @property
+    def free(self) -> int:
+        """The number of unknowns of `State.moved` that may move: the last is the focal length."""
+        return 7 if self.sigma > 0 else 6
+
 
 class Refined(msgspec.Struct, frozen=True):
-    """A state, its labelled IoU in the window, the residuals' scale (window pixels) and the normal equations there."""
+    """A state, its labelled IoU in the window, and the information of the normal equations there."""
 
     state: State
     score: float
-    scale: float
     information: Float[np.ndarray, "7 7"]
 
     def log_focal_sigma(self) -> float:
@@ -65,6 +72,10 @@ class Rendered(msgspec.Struct, frozen=True):
     window: Camera
     hits: Hits
 
+    def score(self, target: Target) -> float:
+        """Labelled IoU with the target's mask."""
+        return labelled_iou(target.silhouette, self.caster.labels(self.hits))
+
 
 def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Rendered:
     """The mesh in `state`, cast in the target's window of the photo with camera `camera`."""
@@ -74,19 +85,20 @@ def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Re
 
 def refined(caster: Caster, target: Target, camera: Camera, start: State, prior: FocalPrior, steps: int) -> Refined:
     """The best-scoring state met in `steps` steps from `start`."""
-    state, best = start, None
-    failures = 0
+    state, best, failures = start, None, 0
     for k in range(steps + 1):
         seen = rendered(caster, target, camera, state)
-        score = labelled_iou(target.silhouette, caster.labels(seen.hits))
-        equations = normal_equations(seen, target, prior)
+        score, equations = seen.score(target), normal_equations(seen, target, prior)
         if best is None or score > best.score:
-            best, failures = Refined(state, score, equations.scale, equations.information), 0
+            best, failures = Refined(state, score, equations.information), 0
         else:
             failures += 1
         if k == steps or failures > 4:
             break
-        step = equations.step(prior.sigma > 0)
+        step = np.zeros(7)
+        matrix, free = equations.information + np.diag(DAMPING), prior.free
+        step[:free] = -np.linalg.solve(matrix[:free, :free], equations.gradient[:free])
+        step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         state = state.moved(step)
         if np.abs(step).max() < 2e-5:
             break
@@ -94,19 +106,10 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
 
 
 class Equations(msgspec.Struct, frozen=True):
-    """k unknowns, the first seven those of `State.moved`."""
+    """Normal equations of k unknowns, the first seven those of `State.moved`."""
 
     information: Float[np.ndarray, "k k"]
     gradient: Float[np.ndarray, " k"]
-    scale: float
-
-    def step(self, move_focal: bool) -> Float[np.ndarray, "7"]:
-        """Damped Gauss-Newton step: as if each number had a standard deviation of its own about where it is."""
-        free = 7 if move_focal else 6
-        damping = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0
-        step = np.zeros(7)
-        step[:free] = -np.linalg.solve((self.information + np.diag(damping))[:free, :free], self.gradient[:free])
-        return np.clip(step, -0.3, 0.3)
 
 
 def normal_equations(
@@ -136,12 +139,13 @@ def normal_equations(
     if prior.sigma > 0:
         information[6, 6] += prior.sigma**-2
         gradient[6] += (seen.state.log_focal - np.log(prior.focal)) / prior.sigma**2
-    return Equations(information, gradient, scale)
+    return Equations(information, gradient)
 
 
-def contour_of(seen: Rendered, name: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
-    """Points (x, y) of the contour of the mesh's part of label `name`, window pixels, and the arms from the mesh's centre to the
-    surface points that move them (camera axes, mesh units): where another part covers it, the contour moves with the nearer surface.
+def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 3"]]:
+    """Points (x, y) of the contour of the mesh's part of label `name`, window pixels, and the arms from the mesh's centre
+    to the surface points that move them (camera axes, mesh units): where another part covers it, the contour moves with
+    the nearer surface.
     """
     caster, window, hits = seen.caster, seen.window, seen.hits
     inside = caster.labels(hits) == name
@@ -150,23 +154,23 @@ def contour_of(seen: Rendered, name: int) -> tuple[Float[np.ndarray, "n 2"], Flo
     near, far, pose = pixel_in[:, ::-1] + 0.5, pixel_out[:, ::-1] + 0.5, seen.state.pose(caster)
     for _ in range(HALVINGS):
         middle = (near + far) / 2
-        there = caster.cast_along(window.rays_through(middle), pose)
-        within = caster.labels(there) == name
-        near, far = np.where(within[:, None], middle, near), np.where(within[:, None], far, middle)
+        within = (caster.labels(caster.cast_along(window.rays_through(middle), pose)) == name)[:, None]
+        near, far = np.where(within, middle, near), np.where(within, far, middle)
     points = (near + far) / 2
     return points, window.rays_through(points) * depth[:, None] - seen.state.middle()
 
 
-def _mesh_to_mask(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    place = points.T[::-1] - 0.5
-    distance, slope_x, slope_y = (
-        map_coordinates(image, place, order=1, mode="nearest")
-        for image in (region.distance, region.slope[..., 0], region.slope[..., 1])
-    )
-    return distance, slope_x[:, None] * jacobian[:, 0] + slope_y[:, None] * jacobian[:, 1]
+def at_points(image: Float[np.ndarray, "h w"], points: Points) -> Float[np.ndarray, " n"]:
+    """An image's values at points (x, y), pixel centres at 0.5, linear between pixels."""
+    return map_coordinates(image, points.T[::-1] - 0.5, order=1, mode="nearest")
 
 
-def _mask_to_mesh(region: Region, points: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mesh_to_mask(region: Region, points: Points, jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
+    slope_x, slope_y = (at_points(region.slope[..., k], points)[:, None] for k in (0, 1))
+    return at_points(region.distance, points), slope_x * jacobian[:, 0] + slope_y * jacobian[:, 1]
+
+
+def _mask_to_mesh(region: Region, points: Points, jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
     if len(region.contour) == 0:
         return np.zeros(0), np.zeros((0, jacobian.shape[-1]))
     nearest = cKDTree(points).query(region.contour)[1]

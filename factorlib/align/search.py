@@ -7,13 +7,13 @@ and is the runner-up: how near its score comes, and how different its normals ar
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
-from factorlib.align.coarse import Density, candidates, is_cut
+from factorlib.align.coarse import candidates, is_cut
 from factorlib.align.refine import FocalPrior, Refined, refined
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
@@ -84,8 +84,7 @@ def focal_prior(camera_focal: float | None, source: str | None, width: int, heig
 
 def prior_before(found: float, source: str, exif: float | None, width: int, height: int) -> FocalPrior:
     """What was known before a focal length was found: EXIF's where it stood, nothing where it was estimated, else all."""
-    known = {"exif": exif, "estimated": None}.get(source, found)
-    return focal_prior(known, source, width, height)
+    return focal_prior({"exif": exif, "estimated": None}.get(source, found), source, width, height)
 
 
 def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
@@ -95,28 +94,27 @@ def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPri
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     effort = search.cut_effort if is_cut(silhouette) else 1
-    density = Density(effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg)
-    guesses = candidates(caster, silhouette, camera, density)
-    states = [guess.state for guess in guesses]
-    others: list[Refined] = []
+    density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
+    states, others = candidates(caster, silhouette, camera, *density), []
     for keep, steps, resolution, margin in zip(search.keep, search.steps, search.resolution, search.margin):
-        kept = states[: keep if others else effort * keep]
+        states = states[: keep if others else effort * keep]
         target = target_of(silhouette, caster.mesh.labels, resolution, margin)
-        ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in kept], prior)
-        states = [
-            result.state
-            for result in ranked
-            if 1 - result.score <= max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
-        ]
+        ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in states], prior)
+        most = max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
+        states = [result.state for result in ranked if 1 - result.score <= most]
         others = ranked + others
-    rivals = _rivals(
-        ranked[0], others[len(ranked) :], search.rivals
-    )  # refined anew: scores of different resolutions do not compare
-    ranked = _distinct(
-        ranked + [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals], prior
-    )
-    best = ranked[0]
-    return Found(best.state, best.score, best.log_focal_sigma(), _runner_up(caster, target, camera, best, ranked[1:]))
+    rivals: list[Refined] = []
+    for other in others[len(ranked) :]:
+        if len(rivals) < search.rivals and _is_apart(other, (ranked[0], *rivals), DISTINCT_DEG):
+            rivals.append(other)
+    # refined anew: scores of different resolutions do not compare
+    again = [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
+    best, *others = _distinct(ranked + again, prior)
+    second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None)
+    if second is not None:
+        away = normal_difference(caster, target, camera, best.state, second.state)
+        second = RunnerUp(second.state, second.score, away)
+    return Found(best.state, best.score, best.log_focal_sigma(), second)
 
 
 def found_near(
@@ -133,71 +131,40 @@ def found_near(
     return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
 
 
-def found_before(
-    caster: Caster, silhouette: Silhouette, camera: Camera, state: State, log_focal_sigma: float, search: Search
-) -> Found:
-    """An earlier answer as it is, without a runner-up, scored anew at the finest resolution."""
+def refined_finest(
+    caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search, steps: int
+) -> Refined:
+    """Refined from `start` at the finest resolution of the search; in no steps, `start` with its score."""
     target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
-    score = refined(caster, target, camera, state, FocalPrior(camera.focal, 0.0), 0).score
-    return Found(state, score, log_focal_sigma, None, earlier=True)
-
-
-def with_focal_free(
-    caster: Caster, silhouette: Silhouette, camera: Camera, found: Found, prior: FocalPrior, search: Search
-) -> Found:
-    """The pose found, refined once more under another `prior` of the focal length."""
-    target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
-    result = refined(caster, target, camera, found.state, prior, 2 * search.steps[-1])
-    return Found(result.state, result.score, result.log_focal_sigma(), found.runner_up, found.by_keypoints)
-
-
-def value(result: Refined, prior: FocalPrior) -> float:
-    """The score, less a little for an unlikely focal length."""
-    if prior.sigma == 0:
-        return result.score
-    return result.score - UNLIKELY_FOCAL * ((result.state.log_focal - np.log(prior.focal)) / prior.sigma) ** 2
+    return refined(caster, target, camera, start, prior, steps)
 
 
 def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
     """Best first, without those that ended where a better one did."""
-    kept: list[Refined] = []
-    for result in sorted(results, key=lambda r: -value(r, prior)):
-        if all(angle_between(result.state.rotation, other.state.rotation) > SAME_DEG for other in kept):
-            kept.append(result)
-    return kept
+
+    def value(result: Refined) -> float:
+        """The score, less a little for an unlikely focal length."""
+        if prior.sigma == 0:
+            return result.score
+        return result.score - UNLIKELY_FOCAL * ((result.state.log_focal - np.log(prior.focal)) / prior.sigma) ** 2
+
+    distinct: list[Refined] = []
+    for result in sorted(results, key=lambda result: -value(result)):
+        if _is_apart(result, distinct, SAME_DEG):
+            distinct.append(result)
+    return distinct
 
 
-def _rivals(best: Refined, others: list[Refined], count: int) -> list[Refined]:
-    """The first `count` of `others` that are turned by more than DISTINCT_DEG against the best and each other."""
-    rivals: list[Refined] = []
-    for other in others:
-        distinct = all(
-            angle_between(other.state.rotation, kept.state.rotation) > DISTINCT_DEG for kept in (best, *rivals)
-        )
-        if distinct and len(rivals) < count:
-            rivals.append(other)
-    return rivals
-
-
-def _runner_up(caster: Caster, target: Target, camera: Camera, best: Refined, others: list[Refined]) -> RunnerUp | None:
-    for other in others:
-        if angle_between(other.state.rotation, best.state.rotation) > DISTINCT_DEG:
-            return RunnerUp(
-                other.state, other.score, normal_difference(caster, target, camera, best.state, other.state)
-            )
-    return None
+def _is_apart(one: Refined, others: Iterable[Refined], degrees: float) -> bool:
+    """Whether it is turned by more than `degrees` against each of the others."""
+    return all(angle_between(one.state.rotation, other.state.rotation) > degrees for other in others)
 
 
 def normal_difference(caster: Caster, target: Target, camera: Camera, first: State, second: State) -> float:
     """Median angle in degrees between the normals of two states where both see the mesh; 180 if they share no pixel."""
-    normals: list[Float[np.ndarray, "h w 3"]] = []
-    seen = []
-    for state in (first, second):
-        maps = rasterise(caster, target.camera(state.camera(camera)), state.pose(caster))
-        normals.append(maps.normal)
-        seen.append(maps.label > 0)
-    both = seen[0] & seen[1]
+    a, b = (rasterise(caster, target.camera(s.camera(camera)), s.pose(caster)) for s in (first, second))
+    both = (a.label > 0) & (b.label > 0)
     if not both.any():
         return 180.0
-    cosine = np.clip(np.sum(normals[0][both] * normals[1][both], axis=1), -1, 1)
+    cosine = np.clip(np.sum(a.normal[both] * b.normal[both], axis=1), -1, 1)
     return float(np.rad2deg(np.median(np.arccos(cosine))))

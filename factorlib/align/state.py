@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
-
-
-class Centred(Protocol):
-    """What has a centre in its own frame: a mesh, or its caster."""
-
-    centre: Float[np.ndarray, "3"]
+from factorlib.geometry.raster import Caster
+from factorlib.meshes.mesh import Mesh
 
 
 class State(msgspec.Struct, frozen=True):
     """Where the middle of a mesh is and how it is turned.
 
-    rotation          cam_from_object
-    a, b              slopes of the ray to the mesh's centre: x/z, y/z
-    log_depth         of the centre, mesh units
-    log_focal         photo pixels
+    rotation   cam_from_object             a, b       slopes of the ray to the mesh's centre: x/z, y/z
+    log_depth  of the centre, mesh units   log_focal  photo pixels
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -36,25 +28,21 @@ class State(msgspec.Struct, frozen=True):
         """The mesh's centre in camera coordinates, mesh units."""
         return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
 
-    def pose(self, mesh: Centred) -> Pose:
-        """cam_from_object of a mesh (or caster) with this centre."""
+    def pose(self, mesh: Mesh | Caster) -> Pose:
+        """cam_from_object of a mesh with this centre."""
         return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
 
     def camera(self, like: Camera) -> Camera:
         """`like` with this state's focal length."""
         return msgspec.structs.replace(like, focal=float(np.exp(self.log_focal)))
 
-    def moved(self, step: Float[np.ndarray, "7"]) -> "State":
+    def moved(self, step: Float[np.ndarray, "7"]) -> State:
         """By (turn about camera axes 3, a, b, log depth, log focal); the focal length takes the depth along, so that
         the size and place in the image stay."""
-        zoom = step[6]
-        return State(
-            rotation_of_vector(step[:3]) @ self.rotation,
-            float((self.a + step[3]) * np.exp(-zoom)),
-            float((self.b + step[4]) * np.exp(-zoom)),
-            float(self.log_depth + step[5] + zoom),
-            float(self.log_focal + zoom),
-        )
+        zoom, (a, b) = step[6], (self.a + step[3], self.b + step[4])
+        slopes = float(a * np.exp(-zoom)), float(b * np.exp(-zoom))
+        logs = float(self.log_depth + step[5] + zoom), float(self.log_focal + zoom)
+        return State(rotation_of_vector(step[:3]) @ self.rotation, *slopes, *logs)
 
     def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
         """Derivative of the image points (photo pixels) of points at `arms` from the centre (camera axes), by `moved`."""
@@ -72,8 +60,7 @@ class State(msgspec.Struct, frozen=True):
         return result
 
 
-def state_of(pose: Pose, camera: Camera, mesh: Centred) -> State:
-    """The state of a pose of a mesh (or caster).  `State.pose` undoes it."""
-    middle = pose.apply(mesh.centre[None])[0]
-    slope = middle[:2] / middle[2]
-    return State(pose.rotation, float(slope[0]), float(slope[1]), float(np.log(middle[2])), float(np.log(camera.focal)))
+def state_of(pose: Pose, camera: Camera, mesh: Mesh | Caster) -> State:
+    """The state of a pose of a mesh.  `State.pose` undoes it."""
+    x, y, z = pose.apply(mesh.centre[None])[0]
+    return State(pose.rotation, float(x / z), float(y / z), float(np.log(z)), float(np.log(camera.focal)))

@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.silhouette import UNKNOWN, Silhouette
+from factorlib.align.silhouette import UNKNOWN, Labels, Silhouette
 from factorlib.geometry.camera import Camera
+
+Mask = Bool[np.ndarray, "h w"]
 
 
 class Region(msgspec.Struct, frozen=True):
@@ -54,8 +56,7 @@ class Target(msgspec.Struct, frozen=True):
 def extent_of(silhouette: Silhouette) -> tuple[np.ndarray, np.ndarray, float]:
     """Lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
     rows, columns = np.nonzero(silhouette.inside)
-    low = np.array([columns.min(), rows.min()], float)
-    high = np.array([columns.max(), rows.max()], float) + 1
+    low, high = np.array([columns.min(), rows.min()], float), np.array([columns.max(), rows.max()], float) + 1
     return low, high, float((high - low).max())
 
 
@@ -72,50 +73,41 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
     columns, rows = (np.arange(int(np.ceil((high[k] - low[k]) / pixel))) for k in (0, 1))
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
-    window = Silhouette(silhouette.label[np.ix_(y, x)])
-    at_frame = tuple(bool(x) for x in (low[1] == 0, high[1] == height, low[0] == 0, high[0] == width))
-    regions = {label: region_of(window.label, label, at_frame) for label in labels}
-    return Target(float(low[0]), float(low[1]), pixel, window, regions)
+    window = silhouette.label[np.ix_(y, x)]
+    at_frame = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
+    regions = {label: _region(window, label, at_frame) for label in labels}
+    return Target(float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
 
 
-def region_of(labels: Int[np.ndarray, "h w"], label: int, at_frame: tuple[bool, bool, bool, bool]) -> Region:
-    """The region of one label; beyond the photo's frame (where the window touches it) nothing is known."""
-    (top, bottom, left, right), padded = at_frame, np.pad(labels, 1, mode="edge")
-    for touches, edge in ((top, np.s_[0, :]), (bottom, np.s_[-1, :]), (left, np.s_[:, 0]), (right, np.s_[:, -1])):
+def _region(labels: Labels, label: int, at_frame: tuple[bool, bool, bool, bool]) -> Region:
+    """The region of one label; beyond the photo's frame, where the window's (top, bottom, left, right) touches it,
+    nothing is known."""
+    padded = np.pad(labels, 1, mode="edge")
+    for touches, edge in zip(at_frame, (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]), strict=True):
         if touches:
             padded[edge] = UNKNOWN
     inside, known = padded == label, padded != UNKNOWN
     distance = np.where(inside, 0.5 - _distance_to(~inside), _distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
     slope = np.stack(np.gradient(distance)[::-1], axis=-1)
-    contour, outward = _border(inside, known & ~inside, slope)
+    a, b = border_pairs(inside, known & ~inside)
+    normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
+    length = np.linalg.norm(normal, axis=1)
+    good = length > 0.4  # where it vanishes it says no direction
+    contour, outward = ((a + b) / 2 + 0.5)[good][:, ::-1], normal[good] / length[good, None]
     return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour - 1.0, outward)
 
 
-def border_pairs(
-    inside: Bool[np.ndarray, "h w"], outside: Bool[np.ndarray, "h w"]
-) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
+def border_pairs(inside: Mask, outside: Mask) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
     """(row, column) of each pixel in `inside` with a right, left, lower or upper neighbour in `outside`, and of that."""
     pairs = []
     for axis in (0, 1):
         low, high = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
         step = np.eye(2, dtype=int)[axis]
-        first = np.argwhere(inside[low] & outside[high])
-        second = np.argwhere(outside[low] & inside[high])
+        first, second = np.argwhere(inside[low] & outside[high]), np.argwhere(outside[low] & inside[high])
         pairs += [(first, first + step), (second + step, second)]
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
 
 
-def _border(inside: np.ndarray, outside: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points halfway across the border, and the unit slope of the distance there; without those where it vanishes."""
-    a, b = border_pairs(inside, outside)
-    normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
-    length = np.linalg.norm(normal, axis=1)
-    good = length > 0.4
-    return ((a + b) / 2 + 0.5)[good][:, ::-1], normal[good] / length[good, None]
-
-
-def _distance_to(where: np.ndarray) -> np.ndarray:
-    if not where.any():
-        return np.full(where.shape, float(sum(where.shape)))
-    return distance_transform_edt(~where)
+def _distance_to(where: Mask) -> Float[np.ndarray, "h w"]:
+    return distance_transform_edt(~where) if where.any() else np.full(where.shape, float(sum(where.shape)))

@@ -1,4 +1,4 @@
-"""How far a pose is to be believed, from the mask alone.
+"""How far a pose is to be believed, from the mask alone, and in words why it is not.
 
 contour_error      overlap says little of a big round object and much of a thin one; distance between contours is fair to both.
                    The median over all contour points, of mesh and mask, so that parts that one of the two lacks do not count.
@@ -11,15 +11,15 @@ mirrored_score     seen from far away, a body and its mirror image have one outl
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import msgspec
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from factorlib.align.place import ObjectToPlace, Placed
-from factorlib.align.refine import FocalPrior, contour_of, normal_equations, rendered
-from factorlib.align.search import Search, find, normal_difference
+from factorlib.align.refine import FocalPrior, at_points, contour_of, normal_equations, rendered
+from factorlib.align.search import Found, Search, find, normal_difference
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of
@@ -30,6 +30,9 @@ RESOLUTION, MARGIN = 200, 0.2
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing
 FITS_TO_A_PIXEL = 0.995  # score from which no other pose fits clearly better
 QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 8, 6), rivals=0)
+LEAST_SCORE_LEAD = 0.001  # of the mask's pixels: a lead of less is their noise, however little is left unexplained
+DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another answer
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Trust(msgspec.Struct, frozen=True):
@@ -40,22 +43,59 @@ class Trust(msgspec.Struct, frozen=True):
     mirrored_score: float | None = None
 
 
+class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a pose must reach to be believed."""
+
+    least_iou: Share = 0.7
+    """Overlap (intersection over union) of mesh and mask below which a pose is doubtful."""
+    least_agreement: Share = 0.8
+    """Share of the pixels both cover on which the materials of mesh and mask agree; below, the pose is doubtful."""
+    most_contour_error: Share = 0.009
+    """Median distance of the contours of mesh and mask, as a share of the mask's extent; above, the pose is doubtful."""
+    most_normal_stderr_deg: Annotated[float, msgspec.Meta(gt=0)] = 10.0
+    """Standard error of normals, in degrees, that the mask leaves; above, the pose is doubtful."""
+    least_lead: Share = 0.1
+    """Share of what the runner-up leaves unexplained that the pose found must explain; below, the pose is doubtful."""
+
+
+def doubts(
+    iou: float, agreement: float, trust: Trust, found: Found | None, standards: Standards = Standards()
+) -> list[str]:
+    """One sentence per standard missed; `found` is None for a pose that was given."""
+    reasons = []
+    if iou < standards.least_iou:
+        reasons.append(f"mesh and mask overlap by {iou:.2f} only")
+    if agreement < standards.least_agreement:
+        reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
+    if trust.contour_error > standards.most_contour_error:
+        far = f"{trust.contour_error:.1%} of the mask's extent"
+        reasons.append(f"half of the contours of mesh and mask lie {far} apart, or more")
+    if trust.normal_stderr_deg is not None and trust.normal_stderr_deg > standards.most_normal_stderr_deg:
+        reasons.append(f"the mask tells normals to {trust.normal_stderr_deg:.1f}° only")
+    if found and trust.mirrored_score is not None and 1 - trust.mirrored_score < (1 - found.score) / 2:
+        scores = f"{trust.mirrored_score:.3f}, {found.score:.3f}"
+        reasons.append(f"the mirror image of the mask fits better ({scores}): was it mirrored?")
+    if found and (other := found.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
+        lead = max(standards.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
+        if found.score - other.score < lead:
+            away, scores = f"{other.normal_difference_deg:.0f}° away", f"{other.score:.3f}, {found.score:.3f}"
+            reasons.append(f"another pose, its normals {away}, fits as well ({scores})")
+    return reasons
+
+
 def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
     """Of the pose of `obj`, the photo's `number`-th; of a pose that was given only the contours are compared."""
-    found, caster, silhouette = placed.found[number], obj.caster, obj.silhouette
+    found, caster, silhouette, camera = placed.found[number], obj.caster, obj.silhouette, placed.camera
     if not silhouette.inside.any():
         return Trust(1.0)
     target = target_of(silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
     if found is None:
-        return Trust(
-            contour_error(caster, target, placed.camera, state_of(placed.poses[number], placed.camera, caster))
-        )
+        return Trust(contour_error(caster, target, camera, state_of(placed.poses[number], camera, caster)))
+    may_be_mirrored = found.score < FITS_TO_A_PIXEL and not found.by_keypoints
     return Trust(
-        contour_error(caster, target, placed.camera, found.state),
-        normal_stderr_deg(caster, target, placed.camera, found.state, placed.prior),
-        mirrored_score(caster, silhouette, placed.camera, placed.prior)
-        if found.score < FITS_TO_A_PIXEL and not found.by_keypoints
-        else None,
+        contour_error(caster, target, camera, found.state),
+        normal_stderr_deg(caster, target, camera, found.state, placed.prior),
+        mirrored_score(caster, silhouette, camera, placed.prior) if may_be_mirrored else None,
     )
 
 
@@ -63,12 +103,12 @@ def contour_error(caster: Caster, target: Target, camera: Camera, state: State) 
     """Median distance from the contours of mesh and mask, of every material, to the other's, as a share of the mask's extent."""
     seen, distances = rendered(caster, target, camera, state), [np.zeros(0)]
     for name, region in target.regions.items():
-        points = contour_of(seen, name)[0]
-        distances.append(np.abs(map_coordinates(region.distance, points.T[::-1] - 0.5, order=1, mode="nearest")))
-        if len(region.contour):
-            distances.append(
-                cKDTree(points).query(region.contour)[0] if len(points) else np.full(len(region.contour), target.extent)
-            )
+        points, _ = contour_of(seen, name)
+        distances.append(np.abs(at_points(region.distance, points)))
+        if len(points) and len(region.contour):
+            distances.append(cKDTree(points).query(region.contour)[0])
+        else:
+            distances.append(np.full(len(region.contour), target.extent))
     every = np.concatenate(distances)
     return float(np.median(every) / target.extent) if len(every) else 1.0
 
@@ -76,26 +116,18 @@ def contour_error(caster: Caster, target: Target, camera: Camera, state: State) 
 def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: State, prior: FocalPrior) -> float:
     """Root of the summed squares, over the independent directions of the unknowns, of the normals' median turn by one
     standard error."""
-    equations = normal_equations(rendered(caster, target, camera, state), target, prior)
-    free = 7 if prior.sigma > 0 else 6
-    precision, directions = np.linalg.eigh(equations.information[:free, :free])
-    turns = [
-        normal_difference(caster, target, camera, state, state.moved(_move(direction, value)))
-        for value, direction in zip(precision, directions.T)
-    ]
+    equations, free = normal_equations(rendered(caster, target, camera, state), target, prior), prior.free
+    turns = []
+    precisions, directions = np.linalg.eigh(equations.information[:free, :free])
+    for precision, direction in zip(precisions, directions.T, strict=True):
+        length = min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
+        move = np.append(length * direction, np.zeros(7 - free))
+        turns.append(normal_difference(caster, target, camera, state, state.moved(move)))
     return float(np.sqrt(np.sum(np.square(turns))))
 
 
-def _move(direction: Float[np.ndarray, " n"], precision: float) -> Float[np.ndarray, "7"]:
-    """One standard error along a unit direction, all of LARGEST_MOVE at most."""
-    length = min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
-    return np.append(length * direction, np.zeros(7 - len(direction)))
-
-
-def mirrored_score(
-    caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = QUICK
-) -> float:
+def mirrored_score(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior) -> float:
     """The best score for the photo with left and right exchanged."""
-    centre = (camera.width - camera.centre[0], camera.centre[1])
+    camera = msgspec.structs.replace(camera, centre=(camera.width - camera.centre[0], camera.centre[1]))
     mirror = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
-    return find(caster, mirror, msgspec.structs.replace(camera, centre=centre), prior, search).score
+    return find(caster, mirror, camera, prior, QUICK).score

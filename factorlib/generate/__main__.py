@@ -61,22 +61,23 @@ def eames(
 
 def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, parameters: msgspec.Struct) -> None:
     """Generate beside `out`, then put it in its place."""
+    fresh = out.with_name(out.name + ".new")
     try:
         maps = sorted(path for path in lights.iterdir() if path.suffix.lower() in (".hdr", ".exr")) if lights else []
         if lights and not maps:
             raise InputError("no .hdr or .exr in this folder", file=lights, cure="name a folder of lat-long maps")
-        _check_replaceable(out)
-        fresh = out.with_name(out.name + ".new")
+        if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
+            cure = "name an empty folder, or a data set to replace"
+            raise InputError("this folder holds something else than a data set", file=out, cure=cure)
         rmtree(fresh, ignore_errors=True)
         with Progress() as bar:
             task = bar.add_task(f"{out}", total=1)
-            set_.generate(
-                fresh,
-                seed,
-                maps,
-                parameters,
-                lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
-            )
+
+            def report(done: float, total: float, text: str) -> None:
+                """The bar of this data set."""
+                bar.update(task, completed=done, total=total, description=text)
+
+            set_.generate(fresh, seed, maps, parameters, report)
         sync_tree(fresh)
     except (InputError, OSError) as error:
         known = error if isinstance(error, InputError) else disk_error(error, fresh)
@@ -87,12 +88,6 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
     rmtree(out, ignore_errors=True)
     fresh.rename(out)
     typer.echo(f"{out}: {sum(path.stat().st_size for path in out.rglob('*') if path.is_file()) / 1e6:.1f} MB")
-
-
-def _check_replaceable(out: Path) -> None:
-    if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
-        fault = "this folder holds something else than a data set"
-        raise InputError(fault, file=out, cure="name an empty folder, or a data set to replace")
 
 
 if __name__ == "__main__":

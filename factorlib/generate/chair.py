@@ -7,6 +7,7 @@ chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -20,7 +21,7 @@ from factorlib.yamlfile import read_yaml
 
 Part = tuple[np.ndarray, np.ndarray]  # vertices [V, 3], faces [F, 3]
 
-Pair = tuple[float, float]
+Pair, Radii = tuple[float, float], tuple[float, float, float]
 
 
 class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -34,8 +35,8 @@ class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tops: list[Pair]
     feet: list[Pair]
     seat_y: float
-    leg_radii: tuple[float, float, float]
-    rough_leg_radii: tuple[float, float, float]
+    leg_radii: Radii
+    rough_leg_radii: Radii
     struts: list[tuple[int, float, int, float]]
     strut_radius: float
 
@@ -64,13 +65,16 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
 def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
     """One mesh of all parts, smooth within each, with their material labels."""
     meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
-    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    return Mesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        faces=np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first)]).astype(np.int32),
-        normals=np.concatenate([mesh.normals for mesh in meshes]),
-        face_label=np.concatenate([mesh.face_label for mesh in meshes]),
-    )
+    vertices, faces = joined([(mesh.vertices, mesh.faces) for mesh in meshes])
+    normals, label = (np.concatenate([getattr(mesh, of) for mesh in meshes]) for of in ("normals", "face_label"))
+    return Mesh(vertices, faces.astype(np.int32), normals, label)
+
+
+def joined(parts: Sequence[Part]) -> Part:
+    """All parts as one."""
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    faces = [faces + offset for (_, faces), offset in zip(parts, first)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 def shell(across: int, along: int) -> Part:
@@ -78,16 +82,22 @@ def shell(across: int, along: int) -> Part:
     s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
     u, v = s * np.sqrt(1 - SHAPE.corners * t**2 / 2), t * np.sqrt(1 - SHAPE.corners * s**2 / 2)
     middle, step = middle_surface(u, v), 1e-4
-    normal = np.cross(
-        middle_surface(u + step, v) - middle_surface(u - step, v),
-        middle_surface(u, v - step) - middle_surface(u, v + step),
-    )
+    by_u = middle_surface(u + step, v) - middle_surface(u - step, v)
+    normal = np.cross(by_u, middle_surface(u, v - step) - middle_surface(u, v + step))
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
     upper, lower = middle + normal * SHAPE.thickness / 2, middle - normal * SHAPE.thickness / 2
-    border = ring(*u.shape)
-    outward = rim_outward(middle.reshape(-1, 3)[border], normal.reshape(-1, 3)[border])
-    edge = middle.reshape(-1, 3)[border] + outward * SHAPE.thickness / 2
-    return stitched(upper, lower, edge, border)
+    rows, columns = u.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    border = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])  # once around
+    middle, normal = middle.reshape(-1, 3)[border], normal.reshape(-1, 3)[border]
+    out = np.cross(np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0), normal)  # of the border, in the surface
+    out *= np.sign(np.sum(out * (middle - middle.mean(axis=0)), axis=1).sum())
+    edge = middle + out / np.linalg.norm(out, axis=1, keepdims=True) * SHAPE.thickness / 2
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+    rim, count = 2 * rows * columns + np.arange(len(border)), rows * columns
+    faces = [top, top[:, ::-1] + count, band(border, rim), band(rim, border + count)]
+    return np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3), edge]), np.concatenate(faces)
 
 
 def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
@@ -103,40 +113,13 @@ def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Fl
     return np.stack([u * (width - 0.35 * lift), y - lift * dz / speed, z + lift * dy / speed], axis=-1)
 
 
-def ring(rows: int, columns: int) -> np.ndarray:
-    """Indices of the border of a grid, once around."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    return np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
-
-
-def rim_outward(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit directions out of a closed border, in the surface."""
-    along = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
-    out = np.cross(along, normal)
-    out *= np.sign(np.sum(out * (points - points.mean(axis=0)), axis=1).sum())
-    return out / np.linalg.norm(out, axis=1, keepdims=True)
-
-
-def stitched(upper: np.ndarray, lower: np.ndarray, edge: np.ndarray, border: np.ndarray) -> Part:
-    """Two grids of points and the edge between their borders as one closed surface, wound outward."""
-    rows, columns = upper.shape[:2]
-    count = rows * columns
-    index = np.arange(count).reshape(rows, columns)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    rim = 2 * count + np.arange(len(border))
-    bands = [band(border, rim), band(rim, border + count)]
-    vertices = np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3), edge])
-    return vertices, np.concatenate([top, top[:, ::-1] + count, *bands])
-
-
 def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Triangles between two closed rings of as many points."""
     a, b, c, d = first, np.roll(first, -1), second, np.roll(second, -1)
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
-def legs(sides: int, rings: int, radii: tuple[float, float, float] = SHAPE.leg_radii) -> Part:
+def legs(sides: int, rings: int, radii: Radii = SHAPE.leg_radii) -> Part:
     """Four legs and the struts between neighbours."""
     top = [np.array([x, SHAPE.seat_y, z]) for x, z in SHAPE.tops]
     foot = [np.array([x, 0.0, z]) for x, z in SHAPE.feet]
@@ -144,17 +127,10 @@ def legs(sides: int, rings: int, radii: tuple[float, float, float] = SHAPE.leg_r
     for one, low, other, high in SHAPE.struts:
         ends = top[one] + low * (foot[one] - top[one]), top[other] + high * (foot[other] - top[other])
         dowels.append(dowel(*ends, (SHAPE.strut_radius,) * 3, max(5, sides // 2), 2))
-    first = np.cumsum([0] + [len(vertices) for vertices, _ in dowels])
-    return np.concatenate([d[0] for d in dowels]), np.concatenate([d[1] + offset for d, offset in zip(dowels, first)])
+    return joined(dowels)
 
 
-def dowel(
-    start: Float[np.ndarray, "3"],
-    end: Float[np.ndarray, "3"],
-    radii: tuple[float, float, float],
-    sides: int,
-    rings: int,
-) -> Part:
+def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Radii, sides: int, rings: int) -> Part:
     """A closed round rod of radius `radii` at its start, middle and end."""
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(axis, [0.3, 0.2, 1.0])
@@ -166,10 +142,7 @@ def dowel(
     points = start + at[:, None, None] * (end - start) + radius[:, None, None] * circle
     index = np.arange(rings * sides).reshape(rings, sides)
     tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
-    last = rings * sides
-    right = np.roll(index, -1, axis=1)
-    caps = [
-        np.stack([np.full(sides, last), index[0], right[0]], -1),
-        np.stack([np.full(sides, last + 1), right[-1], index[-1]], -1),
-    ]
+    (first, last), (right, right_last) = index[[0, -1]], np.roll(index, -1, axis=1)[[0, -1]]
+    middles = np.full(sides, rings * sides), np.full(sides, rings * sides + 1)  # of the caps
+    caps = [np.stack([middles[0], first, right], -1), np.stack([middles[1], right_last, last], -1)]
     return np.concatenate([points.reshape(-1, 3), [start, end]]), np.concatenate([tube, *caps])[:, ::-1]

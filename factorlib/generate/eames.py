@@ -14,17 +14,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, lights
-from factorlib.generate.chair import Part, chair, labelled, rough_chair
-from factorlib.generate.drawn import drawn_materials
-from factorlib.generate.lights import EYE, SceneDict
+from factorlib.generate.chair import chair, labelled, rough_chair
+from factorlib.generate.lights import EYE, SceneDict, random_materials
 from factorlib.generate.shapes import smooth
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
@@ -48,11 +47,6 @@ class Parameters(msgspec.Struct, frozen=True):
     exact: bool = False
     distant: bool = False
     direct: bool = False
-
-    @property
-    def options(self) -> str:
-        """What is made easier, as options of the command."""
-        return "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(self, name))
 
 
 class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,25 +94,23 @@ def generate(
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
-    rng = np.random.default_rng([11, seed])
-    materials = drawn_materials(rng, 0.0 if seed == 0 else 0.2, SET.materials)
-    write_mesh(out / "meshes/chair.obj", rough_chair(rng), parameters)
+    rng, spread = np.random.default_rng([11, seed]), 0.0 if seed == 0 else 1.0
+    materials, rough = random_materials(rng, 0.2 * spread, SET.materials), rough_chair(rng)
+    if parameters.exact:
+        folder.write_exact_obj(out / "meshes/chair.obj", {name: smooth(*part) for name, part in chair().items()})
+    else:
+        folder.write_obj(out / "meshes/chair.obj", rough)
     photos, poses = [], {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
-        scene = laid_out(shot, number, lat_longs, rng, 0.0 if seed == 0 else 1.0, parameters)
-        poses[shot.name] = scene.poses()
+        scene = laid_out(shot, number, lat_longs, rng, spread, parameters)
+        poses[shot.name] = scene.poses
         photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
-    write_records(out, materials, photos, poses, parameters)
+    meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
+    easier = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
+    comment = f"Generated (rendered, not photographed): python -m factorlib.generate eames{easier}"
+    folder.write_records(out, comment, materials, meshes, photos, poses)
     progress(len(shots), len(shots), "done")
-
-
-def write_mesh(path: Path, rough: dict[str, Part], parameters: Parameters) -> None:
-    """The mesh given: the rough one, or the one that is photographed."""
-    if parameters.exact:
-        folder.write_exact_obj(path, {name: smooth(*part) for name, part in chair().items()})
-    else:
-        folder.write_obj(path, rough)
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -130,6 +122,7 @@ class Scene(msgspec.Struct, frozen=True):
     world_from_camera: Float[np.ndarray, "4 4"]
     chairs: dict[str, Float[np.ndarray, "4 4"]]  # world_from_object
 
+    @property
     def poses(self) -> dict[str, Pose]:
         """cam_from_object of each chair."""
         matrices = {name: np.linalg.inv(self.world_from_camera) @ chair for name, chair in self.chairs.items()}
@@ -140,11 +133,9 @@ def laid_out(
     shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, spread: float, parameters: Parameters
 ) -> Scene:
     """Camera, chairs and surroundings of a shot; a spread turns the chairs and moves the camera."""
-    yaw = rng.uniform(0, 360)
-    distance, eye = (
-        shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1)),
-        shot.eye + 0.15 * spread * rng.uniform(-1, 1),
-    )
+    yaw, width, height = rng.uniform(0, 360), parameters.width, parameters.height
+    distance = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1))
+    eye = shot.eye + 0.15 * spread * rng.uniform(-1, 1)
     facing = shot.facing_deg + 40 * spread * rng.uniform(-1, 1)
     level = look(0, yaw)
     down = np.degrees(np.arctan2(eye - SET.middle, distance))
@@ -154,8 +145,7 @@ def laid_out(
     for k, (colour, aside) in enumerate(zip(shot.chairs, sideways)):
         turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])  # the chair's +z toward the camera
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
-    focal = folder.focal_px_of_35mm(shot.focal_35mm, parameters.width, parameters.height)
-    camera = Camera(parameters.width, parameters.height, focal, (parameters.width / 2, parameters.height / 2))
+    camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
     around = surroundings(shot, yaw, number, lat_longs, rng, parameters)
     return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
@@ -165,130 +155,57 @@ def surroundings(
 ) -> SceneDict:
     """A sky, a room, or a user's map over a grey ground (without it where light is `distant`); nothing stands between camera and chairs."""
     if lat_longs:
-        light = lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows)
-        ground = {} if parameters.distant else {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
-        return {"light": envmap(light), **ground}
+        light = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
+        ground = {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
+        return light if parameters.distant else light | ground
     if shot.sun:
-        return lights.daylight(
-            rng, shot.sun[0], yaw_deg + 180 + shot.sun[1], shot.turbidity, rows=2 * parameters.light_rows
-        )
+        up, aside = shot.sun
+        return lights.daylight(rng, up, yaw_deg + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
     return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
 
 
 def write_shot(
     out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int
 ) -> dict[str, Any]:
-    """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry."""
-    shot, order, poses = scene.shot, list(materials), list(scene.poses().values())
-    meshes = [
-        labelled(chair(), {"shell": order.index(colour) + 1, "legs": order.index("wood") + 1}) for colour in shot.chairs
-    ]
-    labels = folder.labels_of(meshes, scene.camera, poses)
-    light = light_at_chairs(scene, parameters, seed)
-    around = distant(light, scene) if parameters.distant else scene.surroundings
-    depth = 2 if parameters.direct else -1
-    radiance = traced(
-        around | solids(scene, meshes, materials), scene.camera, scene.world_from_camera, parameters.spp, seed, depth
-    )
-    exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT))
-    folder.write_photo(
-        out / f"photos/{shot.name}.jpg",
-        radiance * exposure,
-        shot.focal_35mm if shot.focal_known_from == "exif" else None,
-    )
-    folder.write_labels(out / f"masks/{shot.name}.png", labels)
-    for name, mask in own_masks(scene, meshes, poses).items():
-        folder.write_labels(out / name, np.where(mask, 255, 0))
-    folder.write_light(out / f"truth/{shot.name}_light.exr", light * exposure)
-    folder.write_normals(out / f"truth/{shot.name}_normal.exr", rasterise(meshes, scene.camera, poses).normal)
-    return entry(scene, parameters.exact)
+    """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry.
 
-
-def world_from_light(scene: Scene) -> Float[np.ndarray, "3 3"]:
-    """The light's frame is the camera's, turned y-up."""
-    return scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
-
-
-def distant(light: Float[np.ndarray, "h w 3"], scene: Scene) -> SceneDict:
-    """The map alone, infinitely far away."""
-    return {"light": envmap(light) | {"to_world": transform(rigid(world_from_light(scene), (0, 0, 0)))}}
-
-
-def light_at_chairs(scene: Scene, parameters: Parameters, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """The surroundings' light at the chairs' middle, without the chairs; where light is direct but not distant, what shines by itself."""
+    The entry has poses only if `exact`, the focal length only then and where the user is to give it there.
+    """
+    shot, camera, names, poses = scene.shot, scene.camera, list(materials), list(scene.poses.values())
+    wood = names.index("wood") + 1
+    meshes = [labelled(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
+    labels = folder.labels_of(meshes, camera, poses)
+    # the light at the chairs' middle, without the chairs; where it is direct but not distant, what shines by itself
+    turn = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA  # world_from_light
     depth = 1 if parameters.direct and not parameters.distant else -1
-    place = (0, SET.middle - EYE, 0)
-    return light_seen(
-        scene.surroundings,
-        rigid(world_from_light(scene), place),
-        parameters.light_rows,
-        parameters.light_spp,
-        seed,
-        depth,
-    )
-
-
-def solids(scene: Scene, meshes: Sequence[Mesh], materials: dict[str, Material]) -> dict[str, Any]:
-    """The chairs as Mitsuba shapes, one for each material of each."""
-    names = list(materials)
-    return {
+    place, rows, spp = rigid(turn, (0, SET.middle - EYE, 0)), parameters.light_rows, parameters.light_spp
+    light = light_seen(scene.surroundings, place, rows, spp, seed, depth)
+    around = scene.surroundings
+    if parameters.distant:
+        around = {"light": envmap(light) | {"to_world": transform(rigid(turn, (0, 0, 0)))}}
+    solids = {
         f"{name}_{label}": shape(submesh(mesh, label), bsdf(materials[names[label - 1]]), world_from_object)
         for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
         for label in mesh.labels
     }
-
-
-def exposure_of(radiance: Float[np.ndarray, "h w 3"], on_chair: Bool[np.ndarray, "h w"]) -> float:
-    """The factor that clips `clipped` of the chairs' pixels."""
-    return float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))
-
-
-def own_masks(scene: Scene, meshes: Sequence[Mesh], poses: Sequence[Pose]) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Path -> silhouette of each chair where there are two."""
-    if len(meshes) == 1:
-        return {}
-    masks = folder.object_masks(meshes, scene.camera, poses)
-    return {own_mask(scene.shot, name): mask for name, mask in zip(scene.chairs, masks, strict=True)}
-
-
-def own_mask(shot: Shot, name: str) -> str:
-    """Path of the silhouette of chair `name`, relative to the data set."""
-    return f"masks/{shot.name}_{name}.png"
-
-
-def entry(scene: Scene, exact: bool) -> dict[str, Any]:
-    """The photo in dataset.yaml; poses only if `exact`, the focal length only then and where the user is to give it there."""
-    shot, objects = scene.shot, []
-    for colour, (name, pose) in zip(shot.chairs, scene.poses().items(), strict=True):
-        mask = {"mask": own_mask(shot, name)} if len(shot.chairs) > 1 else {}
-        posed = {"pose": folder.pose_entry(pose)} if exact else {}
-        objects.append({"name": name, "mesh": "chair", "materials": {"shell": colour}, **mask, **posed})
-    camera = {"camera": {"focal_px": round(scene.camera.focal, 2)}} if exact or shot.focal_known_from == "given" else {}
-    return {
-        "name": shot.name,
-        "image": f"photos/{shot.name}.jpg",
-        "masks": f"masks/{shot.name}.png",
-        **camera,
-        "objects": objects,
-    }
-
-
-def write_records(
-    out: Path,
-    materials: dict[str, Material],
-    photos: list[dict],
-    poses: dict[str, dict[str, Pose]],
-    parameters: Parameters,
-) -> None:
-    """dataset.yaml and truth/truth.yaml."""
-    meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
-    record = {
-        "format": 1,
-        "materials": list(materials),
-        "meshes": meshes,
-        "photos": photos,
-        "truth": "truth/truth.yaml",
-    }
-    command = f"python -m factorlib.generate eames{parameters.options}"
-    folder.write_yaml(out / "dataset.yaml", record, f"Generated (rendered, not photographed): {command}")
-    folder.write_truth(out, materials, poses)
+    depth = 2 if parameters.direct else -1
+    radiance = traced(around | solids, camera, scene.world_from_camera, parameters.spp, seed, depth)
+    on_chair = (labels > 0) & (labels < LEFT_OUT)
+    exposure = float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))  # clips `clipped` of them
+    exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
+    folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
+    folder.write_shot(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
+    objects = [
+        {"name": name, "mesh": "chair", "materials": {"shell": colour}}
+        for name, colour in zip(scene.chairs, shot.chairs, strict=True)
+    ]
+    if len(meshes) > 1:  # each chair's silhouette
+        for own, mask in zip(objects, folder.object_masks(meshes, camera, poses), strict=True):
+            own["mask"] = f"masks/{shot.name}_{own['name']}.png"
+            folder.write_labels(out / own["mask"], np.where(mask, 255, 0))
+    if parameters.exact:
+        objects = [own | {"pose": folder.pose_entry(pose)} for own, pose in zip(objects, poses, strict=True)]
+    entry = {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png"}
+    if parameters.exact or shot.focal_known_from == "given":
+        entry["camera"] = {"focal_px": round(camera.focal, 2)}
+    return entry | {"objects": objects}

@@ -69,6 +69,15 @@ def write_normals(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
     write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
 
 
+def write_shot(
+    out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Float[np.ndarray, "h w 3"], maps: Maps
+) -> None:
+    """The mask of one photo, and its truth: the light in the photo's units, and the normals."""
+    write_labels(out / f"masks/{name}.png", labels)
+    write_light(out / f"truth/{name}_light.exr", light)
+    write_normals(out / f"truth/{name}_normal.exr", maps.normal)
+
+
 def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Parts (name -> vertices [V, 3], faces [F, 3]) as groups of a Wavefront OBJ without normals."""
     lines, first = [], 1
@@ -83,11 +92,8 @@ def write_exact_obj(path: Path, parts: dict[str, Mesh]) -> None:
     """Parts as groups of a Wavefront OBJ, with their vertex normals, to nine digits."""
     lines, first = [], 1
     for name, mesh in parts.items():
-        lines += [
-            f"g {name}",
-            *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices),
-            *(f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals),
-        ]
+        lines += [f"g {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices)]
+        lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals]
         lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in mesh.faces + first]
         first += len(mesh.vertices)
     write_text(path, "\n".join(lines) + "\n")
@@ -101,9 +107,8 @@ def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[
 def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
     """Where each object fills at least half of the pixel."""
     number = _subpixels(meshes, camera, poses).object
-    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS].reshape(
-        camera.height, SUBPIXELS, camera.width, SUBPIXELS
-    )
+    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS]
+    inside = inside.reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
@@ -116,9 +121,8 @@ def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Map
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
     """Of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
     reach = SUBPIXELS + 2
-    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))[
-        SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS
-    ]
+    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))
+    windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
     windows = windows[:height, :width].reshape(height, width, -1)
     low, high = windows.min(axis=-1), windows.max(axis=-1)
@@ -131,7 +135,8 @@ def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
 
 
 def yaml_text(value: dict[str, Any], indent: int = 0) -> str:
-    """
+    """Nested mappings as YAML, numbers to six digits, those below 1e-4 as 0.
+
     >>> print(yaml_text({"a": [1, 0.5], "b": [{"c": "x", "d": {"e": 1e-7}}]}), end="")
     a: [1, 0.5]
     b:
@@ -154,21 +159,33 @@ def yaml_text(value: dict[str, Any], indent: int = 0) -> str:
 def _flow(item: Any) -> str:
     if isinstance(item, (list, tuple)):
         return "[" + ", ".join(map(_flow, item)) + "]"
-    return (
-        str(round(item, 6))
-        if isinstance(item, float) and abs(item) >= 1e-4
-        else "0.0"
-        if isinstance(item, float)
-        else str(item)
-    )
+    return str(round(item, 6) if abs(item) >= 1e-4 else 0.0) if isinstance(item, float) else str(item)
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
     """cam_from_object as dataset.yaml and truth.yaml write it."""
-    return {
-        "rotation": [[round(float(v), 6) for v in row] for row in pose.rotation],
-        "translation": [float(v) for v in pose.translation],
+    rotation = [[round(float(v), 6) for v in row] for row in pose.rotation]
+    return {"rotation": rotation, "translation": [float(v) for v in pose.translation]}
+
+
+def write_records(
+    out: Path,
+    comment: str,
+    materials: Mapping[str, Any],
+    meshes: dict[str, dict[str, Any]],
+    photos: list[dict[str, Any]],
+    poses: Mapping[str, Mapping[str, Pose]],
+) -> None:
+    """dataset.yaml, whose first line is the comment, and truth/truth.yaml; poses: by photo and object."""
+    record = {
+        "format": 1,
+        "materials": list(materials),
+        "meshes": meshes,
+        "photos": photos,
+        "truth": "truth/truth.yaml",
     }
+    write_yaml(out / "dataset.yaml", record, comment)
+    write_truth(out, materials, poses)
 
 
 def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Mapping[str, Pose]]) -> None:
@@ -179,8 +196,5 @@ def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Map
         "normals": {name: f"truth/{name}_normal.exr" for name in poses},
         "poses": {photo: {name: pose_entry(pose) for name, pose in each.items()} for photo, each in poses.items()},
     }
-    write_yaml(
-        out / "truth/truth.yaml",
-        truth,
-        "What the photos were made of; lights in the units of their photos, seen from the objects",
-    )
+    comment = "What the photos were made of; lights in the units of their photos, seen from the objects"
+    write_yaml(out / "truth/truth.yaml", truth, comment)

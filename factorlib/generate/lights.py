@@ -2,7 +2,7 @@
 
 Every surrounding is a dictionary of Mitsuba objects in a world with y up, its ground or floor at y = −EYE and nothing
 within a metre of the origin, so that the light which arrives at the origin, or at a chair on the floor, can be traced.
-Radiance is in arbitrary units: a data set scales each light by its photo's exposure.
+Radiance is in arbitrary units: a data set scales each light by its photo's exposure.  Random materials are here, too.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.photo import read_photo
-from factorlib.tracing.scene import envmap, light_seen, rgb, transform
+from factorlib.tracing.scene import Material, envmap, light_seen, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin over the ground
@@ -26,14 +27,46 @@ SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real 
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
-TURNS = {
-    "+x": (0, 90),
-    "-x": (0, -90),
-    "+z": (0, 0),
-    "-z": (0, 180),
-    "+y": (-90, 0),
-    "-y": (90, 0),
-}  # about x, about y, of +z
+# about x, about y, of +z
+TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
+
+
+def random_materials(rng: np.random.Generator, spread: float, about: dict[str, Material]) -> dict[str, Material]:
+    """The materials of `about`, each number times exp(spread · normal), within k_d + k_s ≤ 0.95, to four digits."""
+    result = {}
+    for name, material in about.items():
+        factor = np.exp(spread * rng.standard_normal(5))
+        colours = np.array([np.array(material.diffuse) * factor[:3], np.array(material.specular) * factor[3]])
+        colours *= min(1.0, 0.95 / (colours[0].max() + colours[1].max()))
+        roughness = float(np.clip(material.roughness * factor[4], 0.15, 0.8))
+        rounded = (tuple(round(float(v), 4) for v in colour) for colour in colours)
+        result[name] = Material(*rounded, round(roughness, 4))
+    return result
+
+
+def random_light(
+    number: int,
+    world_from_camera: Float[np.ndarray, "3 3"],
+    lat_longs: Sequence[Path],
+    rng: np.random.Generator,
+    rows: int,
+    spp: int,
+) -> Float[np.ndarray, "h w 3"]:
+    """The light of photo `number`, in the camera's y-up frame: daylight for photo 0, the sun behind the camera to its left
+    or right, and for the others rooms with as many lamps as their number.
+
+    lat_longs: maps that replace them;  rows, spp: of the map, and samples a pixel
+    """
+    if lat_longs:
+        return captured(lat_longs[number % len(lat_longs)], rows)
+    seed = int(rng.integers(1 << 24))
+    if number:
+        scene = room(rng, windows=2, lamps=number)
+    else:
+        forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
+        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
+        scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
+    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
 def daylight(
@@ -61,7 +94,7 @@ def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> SceneDict:
     angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
     size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
     place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
-    return block(place, size, np.degrees(angle), vivid(rng))
+    return block(place, size, np.degrees(angle), _vivid(rng))
 
 
 def room(
@@ -77,43 +110,34 @@ def room(
     sides = ["+x", "-x", "+z", "-z"]
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
-        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), wall_colour(rng), (0, 0.25))
-        scene[f"picture{side}"] = wall(
-            side, distance - 0.02, rng.uniform(0.3, 0.6, 2), vivid(rng), (rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5))
-        )
+        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), _wall_colour(rng), (0, 0.25))
+        size, colour = rng.uniform(0.3, 0.6, 2), _vivid(rng)
+        shift = rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
+        scene[f"picture{side}"] = wall(side, distance - 0.02, size, colour, shift)
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        scene[f"window_{k}"] = wall(
-            side, distance, (rng.uniform(0.5, 0.9), 0.7), 0, (rng.uniform(-1, 1), 0.45), glow=day
-        )
+        size, shift = (rng.uniform(0.5, 0.9), 0.7), (rng.uniform(-1, 1), 0.45)
+        scene[f"window_{k}"] = wall(side, distance, size, 0, shift, glow=day)
     for k in range(lamps):
-        place = [
-            rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1]),
-            rng.uniform(0.4, 1.2),
-            rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1]),
-        ]
-        warm = rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55])
-        scene[f"lamp_{k}"] = {
-            "type": "sphere",
-            "center": place,
-            "radius": rng.uniform(0.12, 0.18),
-            "emitter": {"type": "area", "radiance": rgb(warm)},
-        }
+        across = rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1])
+        place = [across, rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1])]
+        warm = {"type": "area", "radiance": rgb(rng.uniform(40, 70) * np.array([1.25, 0.95, 0.55]))}
+        scene[f"lamp_{k}"] = {"type": "sphere", "center": place, "radius": rng.uniform(0.12, 0.18), "emitter": warm}
     for k in range(4):
         angle = np.radians(clear_deg + clear_half_deg + rng.uniform(0, 1) * (360 - 2 * clear_half_deg))
         size = rng.uniform([0.25, 0.2, 0.25], [0.5, 0.6, 0.5])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(1.9, 2.3) + [0, size[1] - EYE, 0]
-        scene[f"block_{k}"] = block(place, size, np.degrees(angle), vivid(rng))
+        scene[f"block_{k}"] = block(place, size, np.degrees(angle), _vivid(rng))
     return scene
 
 
-def wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A light paint."""
     return np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
 
 
-def vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A strong colour."""
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
@@ -139,13 +163,8 @@ def wall(
 
 def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour) -> SceneDict:
     """A box of half sizes `half` about `place`, turned about y."""
-    to_world = (
-        mitsuba()
-        .ScalarTransform4f()
-        .translate([*map(float, place)])
-        .rotate([0, 1, 0], float(turn_deg))
-        .scale([*map(float, half)])
-    )
+    to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg))
+    to_world = to_world.scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
@@ -154,13 +173,11 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     radiance = read_photo(path, "linear").radiance.astype(float)
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows:
-        raise InputError(
-            f"{columns} × {rows} pixels is no lat-long map", file=path, cure="its width must be twice its height"
-        )
-    finer = max(1, rows // height)
+        fault, cure = f"{columns} × {rows} pixels is no lat-long map", "its width must be twice its height"
+        raise InputError(fault, file=path, cure=cure)
     if rows % height:
-        raise InputError(
-            f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows"
-        )
+        fault, cure = f"{rows} rows do not divide into {height}", f"resize it to a multiple of {height} rows"
+        raise InputError(fault, file=path, cure=cure)
+    finer = max(1, rows // height)
     radiance = radiance.reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

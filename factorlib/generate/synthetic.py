@@ -12,12 +12,13 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
-from factorlib.generate.drawn import MATERIALS, drawn_light, drawn_materials
+from factorlib.generate.lights import random_light, random_materials
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
@@ -27,6 +28,11 @@ from factorlib.tracing.scene import Material, bsdf, envmap, look, rendered, rigi
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
+MATERIALS = {
+    "red": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+    "green": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+    "blue": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+}
 
 
 class Parameters(msgspec.Struct, frozen=True):
@@ -49,6 +55,11 @@ class Placed(msgspec.Struct, frozen=True):
     turn: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
     posed: bool = True
+
+    @property
+    def name(self) -> str:
+        """Of the object: its material and its shape."""
+        return f"{self.material}_{self.shape}"
 
 
 class Shot(msgspec.Struct, frozen=True):
@@ -90,8 +101,8 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
-    rng = np.random.default_rng([7, seed])
-    materials = drawn_materials(rng, 0.0 if seed == 0 else 0.25, MATERIALS)
+    rng, spread = np.random.default_rng([7, seed]), 0.0 if seed == 0 else 1.0
+    materials = random_materials(rng, 0.25 * spread, MATERIALS)
     meshes = {name: make() for name, make in SHAPES.items()}
     for name, mesh in meshes.items():
         write_ply(out / f"meshes/{name}.ply", mesh)
@@ -99,11 +110,14 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = drawn_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
+        light = random_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
-        poses[shot.name] = placements(shot, world_from_camera, rng, spread=0.0 if seed == 0 else 1.0)
+        poses[shot.name] = placements(shot, world_from_camera, rng, spread)
         photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
-    write_records(out, materials, photos, poses)
+    used = {placed.name: placed for shot in SHOTS for placed in shot.placed}
+    entries = {name: {"file": f"meshes/{p.shape}.ply", "material": p.material} for name, p in used.items()}
+    comment = "Generated: python -m factorlib.generate synthetic"
+    folder.write_records(out, comment, materials, entries, photos, poses)
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
@@ -114,101 +128,53 @@ def placements(
     poses = {}
     for placed in shot.placed:
         turn = rotation_of_vector(np.array([0, placed.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
-        tilt = rotation_of_vector(
-            np.array([placed.tilt[0], 0, placed.tilt[1]]) + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3)
-        )
-        poses[name_of(placed)] = Pose(world_from_camera.T @ tilt @ turn, np.array([placed.x, 0.02, DISTANCE]))
+        tilt = np.array([placed.tilt[0], 0, placed.tilt[1]])
+        tilt = rotation_of_vector(tilt + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3))
+        poses[placed.name] = Pose(world_from_camera.T @ tilt @ turn, np.array([placed.x, 0.02, DISTANCE]))
     return poses
-
-
-def name_of(placed: Placed) -> str:
-    """Name of an object: its material and its shape."""
-    return f"{placed.material}_{placed.shape}"
 
 
 def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> dict:
     """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry of dataset.yaml."""
-    shot, meshes, poses = scene.shot, scene.meshes, scene.poses
-    camera = Camera(
-        parameters.width, parameters.height, parameters.focal_px, (parameters.width / 2, parameters.height / 2)
-    )
-    order = list(scene.materials)
-    labelled = [
-        msgspec.structs.replace(
-            meshes[p.shape], face_label=np.full(len(meshes[p.shape].faces), order.index(p.material) + 1, np.int16)
-        )
-        for p in shot.placed
-    ]
-    labels = folder.labels_of(labelled, camera, list(poses.values()))
+    shot, poses, order = scene.shot, list(scene.poses.values()), list(scene.materials)
+    width, height = parameters.width, parameters.height
+    camera = Camera(width, height, parameters.focal_px, (width / 2, height / 2))
+    labelled = []
+    for placed in shot.placed:
+        mesh = scene.meshes[placed.shape]
+        label = np.full(len(mesh.faces), order.index(placed.material) + 1, np.int16)
+        labelled.append(msgspec.structs.replace(mesh, face_label=label))
+    labels = folder.labels_of(labelled, camera, poses)
     radiance = composed(scene, camera, parameters.spp, seed)
-    exposure = exposure_of(radiance, (labels > 0) & (labels < folder.LEFT_OUT), shot)
-    folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
-    folder.write_labels(out / f"masks/{shot.name}.png", labels)
-    folder.write_light(out / f"truth/{shot.name}_light.exr", scene.light * exposure)
-    folder.write_normals(
-        out / f"truth/{shot.name}_normal.exr", rasterise(labelled, camera, list(poses.values())).normal
-    )
-    return entry(shot, poses, parameters)
-
-
-def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
-    shot, meshes, poses = scene.shot, scene.meshes, list(scene.poses.values())
-    radiance = np.zeros((camera.height, camera.width, 3))
-    world = rigid(YUP_FROM_CAMERA, np.zeros(3))
-    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
-    nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
-    for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
-        entry = shape(
-            meshes[placed.shape], bsdf(scene.materials[placed.material]), world @ rigid(pose.rotation, pose.translation)
-        )
-        own = nearest == number
-        columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
-        alone = rendered(
-            {"shape": entry, "light": envmap(scene.light)},
-            sensor(camera, world, columns),
-            spp,
-            100 * seed + number,
-            max_depth=2,
-        )
-        radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
-    return radiance
-
-
-def exposure_of(radiance: Float[np.ndarray, "h w 3"], on_object: Bool[np.ndarray, "h w"], shot: Shot) -> float:
-    """The factor that clips the wanted fraction of object pixels; for none, the brightest just not; floats have mean ¼."""
-    brightest = radiance[on_object].max(axis=-1)
+    # clips the wanted fraction of object pixels; for none, the brightest just not; floats have mean ¼
+    brightest = radiance[(labels > 0) & (labels < LEFT_OUT)].max(axis=-1)
+    exposure = float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
     if shot.suffix == ".exr":
-        return float(0.25 / brightest.mean())
-    return float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
-
-
-def entry(shot: Shot, poses: dict[str, Pose], parameters: Parameters) -> dict:
-    """The photo in dataset.yaml."""
+        exposure = float(0.25 / brightest.mean())
+    folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
+    folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
     objects = []
     for placed in shot.placed:
-        pose = {"pose": folder.pose_entry(poses[name_of(placed)])} if placed.posed else {}
-        objects.append({"name": name_of(placed), "mesh": name_of(placed), **pose})
+        pose = {"pose": folder.pose_entry(scene.poses[placed.name])} if placed.posed else {}
+        objects.append({"name": placed.name, "mesh": placed.name, **pose})
     return {
         "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
         "camera": {"focal_px": parameters.focal_px}, "objects": objects,
     }  # fmt: skip
 
 
-def write_records(
-    out: Path, materials: dict[str, Material], photos: list[dict], poses: dict[str, dict[str, Pose]]
-) -> None:
-    """dataset.yaml and truth/truth.yaml."""
-    used = {name_of(placed): placed for shot in SHOTS for placed in shot.placed}
-    meshes = {
-        name: {"file": f"meshes/{placed.shape}.ply", "material": placed.material} for name, placed in used.items()
-    }
-    record = {
-        "format": 1,
-        "materials": list(materials),
-        "meshes": meshes,
-        "photos": photos,
-        "truth": "truth/truth.yaml",
-    }
-    folder.write_yaml(out / "dataset.yaml", record, "Generated: python -m factorlib.generate synthetic")
-    folder.write_truth(out, materials, poses)
+def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
+    """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
+    shot, meshes, poses = scene.shot, scene.meshes, list(scene.poses.values())
+    radiance, world = np.zeros((camera.height, camera.width, 3)), rigid(YUP_FROM_CAMERA, np.zeros(3))
+    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
+    nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
+    for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
+        place = world @ rigid(pose.rotation, pose.translation)
+        solid = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), place)
+        own = nearest == number
+        columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
+        entries, view = {"shape": solid, "light": envmap(scene.light)}, sensor(camera, world, columns)
+        alone = rendered(entries, view, spp, 100 * seed + number, max_depth=2)
+        radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
+    return radiance

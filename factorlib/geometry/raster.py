@@ -108,12 +108,9 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
 def _fill(maps: Maps, wins: Bool[np.ndarray, "h w"], hits: Hits, mesh: Mesh, pose: Pose) -> None:
     """What the surface of `mesh` adds to `maps` where it `wins`: normals, labels, sides; views are there already."""
     corners = mesh.faces[hits.face[wins]]  # [n, 3]
-    u, v = hits.uv[wins].T
-    weight = np.stack([1 - u - v, u, v], axis=1)
-    smooth = np.einsum("nk,nkd->nd", weight, mesh.normals[corners]) @ pose.rotation.T
-    own = face_normals(mesh, hits.face[wins])
+    smooth = smooth_normals(mesh, hits.face[wins], hits.uv[wins]) @ pose.rotation.T
+    own, view = face_normals(mesh, hits.face[wins]), maps.view[wins]
     flat = own @ pose.rotation.T
-    view = maps.view[wins]
     facing = np.sum(flat * view, axis=1)
     side = np.where(facing < 0, -1.0, 1.0)
     maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
@@ -141,6 +138,12 @@ def toward_viewer(
     across = unit(normal - cosine[:, None] * view)
     limit = np.sqrt(1 - MIN_COSINE**2) * across + MIN_COSINE * view
     return np.where(bent[:, None], limit, normal), bent
+
+
+def smooth_normals(mesh: Mesh, face: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """The corners' normals of the triangles `face`, interpolated at barycentric uv; object frame, not of unit length."""
+    u, v = uv.T
+    return np.einsum("nk,nkd->nd", np.stack([1 - u - v, u, v], axis=1), mesh.normals[mesh.faces[face]])
 
 
 def face_normals(mesh: Mesh, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

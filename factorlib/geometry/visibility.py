@@ -51,10 +51,6 @@ class Sight(msgspec.Struct, frozen=True):
     visibility: UInt8[np.ndarray, "n k"]
     met: UInt16[np.ndarray, "n k"]
 
-    def take(self, rows: Int[np.ndarray, " m"]) -> Sight:
-        """Of the points `rows`."""
-        return Sight(self.visibility[rows], self.met[rows])
-
 
 class Occluders:
     """The posed objects of one photo as one scene."""
@@ -79,14 +75,10 @@ class Occluders:
     def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
         """What the rays through the centres of pixels (x, y) meet first."""
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
-        hits = self.scene.cast_rays(self._rays(np.zeros_like(along), along), nthreads=1)
-        depth = hits["t_hit"].numpy().astype(float) * self.radius
-        found = np.isfinite(depth)
-        face = np.where(found, hits["primitive_ids"].numpy(), 0).astype(np.int64)
-        normal = self.normal[face]
-        normal = np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
-        place = np.where(found, depth, 0.0)[:, None] * along + self.lift[face][:, None] * normal
-        return Points(place, normal, found)
+        distance, face, normal = self._first(np.zeros_like(along), along)
+        found = np.isfinite(distance)
+        depth = np.where(found, distance * self.radius, 0.0)
+        return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
 
     def seen_from(
         self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]
@@ -106,12 +98,17 @@ class Occluders:
 
     def _codes(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
         """Of what rays meet first."""
+        distance, face, normal = self._first(start, along)
+        return met_codes(np.where(np.isfinite(distance), self.material[face], -1), normal)
+
+    def _first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
+        """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and the face's normal
+        [n, 3], turned against the ray."""
         hits = self.scene.cast_rays(self._rays(start, along), nthreads=1)
-        found = np.isfinite(hits["t_hit"].numpy())
-        face = np.where(found, hits["primitive_ids"].numpy(), 0).astype(np.int64)
+        distance = hits["t_hit"].numpy().astype(float)
+        face = np.where(np.isfinite(distance), hits["primitive_ids"].numpy(), 0).astype(np.int64)
         normal = self.normal[face]
-        toward = np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
-        return met_codes(np.where(found, self.material[face], -1), toward)
+        return distance, face, np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
 
     def _rays(self, start: np.ndarray, along: np.ndarray) -> o3d.core.Tensor:
         """In the scene's frame, where `along` keeps its length: distances come back in units of the radius."""
@@ -136,7 +133,8 @@ def sight(
         return None
     if len(cast) == len(x):
         return seen
-    return seen.take(nearest(points.place[cast], shading_normal[cast], points.place, shading_normal))
+    near = nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)
+    return Sight(seen.visibility[near], seen.met[near])
 
 
 def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:

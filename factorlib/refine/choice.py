@@ -85,7 +85,14 @@ def settled(
 
     cell: number of each pixel's cell
     """
-    verdicts = judged(moving, candidates(moving, found, runner_up, standards), cell)
+    candidates = {"found": found}  # as it is; the others move, first by contours, then by shading too
+    for name, start in (("moved", found), ("runner_up", runner_up)):
+        if start is not None:
+            start = refined(moving.caster, moving.target, moving.camera, start, moving.prior, standards.steps).state
+            candidates[name] = descended(moving, start, standards.steps, standards.most_lost)
+    if runner_up is not None and moving.score(candidates["runner_up"]) < moving.score(found) - standards.rival:
+        del candidates["runner_up"]
+    verdicts = judged(moving, candidates, cell)
     return choice_of(verdicts, standards) if verdicts else None
 
 
@@ -95,37 +102,23 @@ def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
     for one in sorted(verdicts[1:], key=lambda one: one.held_out_loss, reverse=True):
         best = one if is_better(one, found, standards) else best
     named = {one.name: one for one in verdicts}
-    other, own = (
-        named.get("runner_up"),
-        min((one for one in verdicts if one.name != "runner_up"), key=lambda one: one.held_out_loss),
-    )
+    other = named.get("runner_up")
+    own = min((one for one in verdicts if one is not other), key=lambda one: one.held_out_loss)
     ruled_out = None if other is None or best is other else is_better(own, other, standards)
     return Settled(best.name, named, ruled_out)
 
 
-def candidates(moving: Moving, found: State, runner_up: State | None, standards: Standards) -> dict[str, State]:
-    """`found` stays as it is; the others move, first by contours, then by shading too."""
-    result = {"found": found}
-    for name, start in (("moved", found), ("runner_up", runner_up)):
-        if start is not None:
-            start = refined(moving.caster, moving.target, moving.camera, start, moving.prior, standards.steps).state
-            result[name] = descended(moving, start, standards.steps, standards.most_lost)
-    if runner_up is not None and moving.score(result["runner_up"]) < moving.score(found) - standards.rival:
-        del result["runner_up"]
-    return result
-
-
 def judged(moving: Moving, states: dict[str, State], cell: Int[np.ndarray, " n"]) -> list[Judged]:
     """Every candidate, in the order of `states`; an empty list where too few pixels are shown by all of them."""
-    seen = {name: moving.block(state, None) for name, state in states.items()}
-    common = np.logical_and.reduce([agrees for _, agrees in seen.values()])
-    held_out = next(iter(seen.values()))[0].held_out
+    blocks = {name: moving.block(state, None) for name, state in states.items()}
+    common = np.logical_and.reduce([agrees for _, agrees in blocks.values()])
+    held_out = next(iter(blocks.values()))[0].held_out
     if min((common & held_out).sum(), (common & ~held_out).sum()) < LEAST_SHOWN:
         return []
     surfaces, residual = moving.surfaces, {}
-    fitted = {name: block.take(agrees & ~held_out) for name, (block, agrees) in seen.items()}
+    fitted = {name: block.take(agrees & ~held_out) for name, (block, agrees) in blocks.items()}
     lobes = together([pursued_light(block, surfaces, ROUNDS) for block in fitted.values()])
-    for name, (block, _) in seen.items():
+    for name, (block, _) in blocks.items():
         light = with_weights(surfaces.under(lobes, fitted[name]))
         residual[name] = surfaces.under(light, block.take(common & held_out)).residuals()
     loss = Loss(min(robust_scale(r) for r in residual.values()))

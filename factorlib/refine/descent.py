@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.align.refine import CORRELATION, FocalPrior, normal_equations, rendered
-from factorlib.align.silhouette import Silhouette, labelled_iou
+from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, Pose
@@ -35,6 +35,7 @@ RESOLUTION, MARGIN = 300, 0.1  # of the window that contours are compared in, as
 ASIDE = np.array([0.008, 0.008, 0.008, 0.002, 0.002, 0.008, 0.02])  # steps of the differences: radians, slopes, logs
 EDGE_TURN = 0.97  # cosine: normals that differ more on the two sides belong to two surfaces
 DAMPING = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.1, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
+Rows = Bool[np.ndarray, " m"]
 LARGEST_STEP = 0.1  # of each unknown, in its own unit
 
 
@@ -49,48 +50,44 @@ class Moving(msgspec.Struct, frozen=True):
     camera: Camera
     prior: FocalPrior
     surfaces: Surfaces
-    block: Callable[[State, Block | None], tuple[Block, Bool[np.ndarray, " n"]]]
+    block: Callable[[State, Block | None], tuple[Block, Rows]]
 
     def score(self, state: State) -> float:
         """Labelled IoU."""
-        hits = self.caster.cast(self.target.camera(state.camera(self.camera)), state.pose(self.caster))
-        return labelled_iou(self.target.silhouette, self.caster.labels(hits))
+        return rendered(self.caster, self.target, self.camera, state).score(self.target)
 
 
-class Photographed(msgspec.Struct, frozen=True):
-    """One object of a photo: the meshes over the pixels, the object's number, the camera, the masks, what is known of the focal length."""
-
-    view: View
-    number: int
-    camera: Camera
-    silhouette: Silhouette
-    prior: FocalPrior
-
-
-def moving_object(photographed: Photographed, poses: Sequence[Pose], surfaces: Surfaces) -> Moving:
-    """The object, the others of the photo staying at their `poses`."""
-    view, number, camera = photographed.view, photographed.number, photographed.camera
+def moving_object(
+    view: View,
+    number: int,
+    camera: Camera,
+    silhouette: Silhouette,
+    prior: FocalPrior,
+    poses: Sequence[Pose],
+    surfaces: Surfaces,
+) -> Moving:
+    """Object `number` of a photo, its others staying at their `poses`; prior: what is known of the focal length."""
     caster = view.casters[number]
 
-    def block(state: State, like: Block | None) -> tuple[Block, Bool[np.ndarray, " n"]]:
+    def block(state: State, like: Block | None) -> tuple[Block, Rows]:
         """All pixels with the object in a state, visibility as in `like`; which of them show what the mask does."""
         own, posed = state.camera(camera), [*poses[:number], state.pose(caster), *poses[number + 1 :]]
         seen = view.seen(own, posed)
         return view.block(own, seen, like, posed), seen.agrees
 
-    target = target_of(photographed.silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
-    return Moving(caster, target, camera, photographed.prior, surfaces, block)
+    target = target_of(silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
+    return Moving(caster, target, camera, prior, surfaces, block)
 
 
 def descended(moving: Moving, start: State, steps: int, most_lost: float) -> State:
     """The state, of those met in `steps` steps from `start`, whose fitted pixels are explained best while the labelled
     IoU is at most `most_lost` below that of the start."""
     state, best, least, floor = start, start, np.inf, moving.score(start) - most_lost
-    shadows, light, surfaces = None, None, moving.surfaces
+    every, light, surfaces = None, None, moving.surfaces
     for k in range(steps + 1):
-        every, agrees = moving.block(state, shadows)
-        shadows = every  # visibility hardly changes on the way
-        fit = every.take(agrees & ~every.held_out)
+        every, agrees = moving.block(state, every)  # visibility hardly changes on the way
+        rows = agrees & ~every.held_out
+        fit = every.take(rows)
         if len(fit) == 0:
             break
         light = pursued_light(fit, surfaces) if k in (0, steps // 2) else with_weights(surfaces.under(light, fit))
@@ -102,26 +99,21 @@ def descended(moving: Moving, start: State, steps: int, most_lost: float) -> Sta
         if loss < least and moving.score(state) >= floor:
             best, least = state, loss
         if k < steps:
-            state = state.moved(_step(moving, state, Seen(every, agrees & ~every.held_out), lit, residual))
+            state = state.moved(_step(moving, state, every, rows, lit, residual))
     return best
 
 
-class Seen(msgspec.Struct, frozen=True):
-    """All pixels of a photo with the object in a state, and which of them are fitted."""
-
-    every: Block
-    fitted: Bool[np.ndarray, " m"]
-
-
 def _step(
-    moving: Moving, state: State, seen: Seen, lit: Illumination, residual: Float[np.ndarray, "n 3"]
+    moving: Moving, state: State, every: Block, rows: Rows, lit: Illumination, residual: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "7"]:
-    """The step of a state; lit: the fitted pixels in their light, whose whitened residual is `residual`."""
-    contours = normal_equations(
-        rendered(moving.caster, moving.target, moving.camera, state), moving.target, moving.prior
-    )
-    free = 7 if moving.prior.sigma > 0 else 6
-    jacobian = photometric_jacobian(moving, state, seen, lit.light, free)
+    """The step of a state.
+
+    every: all pixels with the object in the state;  rows: which of them are fitted
+    lit:   the fitted pixels in their light, whose whitened residual is `residual`
+    """
+    seen = rendered(moving.caster, moving.target, moving.camera, state)
+    contours, free = normal_equations(seen, moving.target, moving.prior), moving.prior.free
+    jacobian = photometric_jacobian(moving, state, every, rows, lit.light, free)
     information, gradient = projected_equations(jacobian, residual, lit)
     hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
     step = np.zeros(7)
@@ -130,19 +122,17 @@ def _step(
 
 
 def photometric_jacobian(
-    moving: Moving, state: State, seen: Seen, light: Light, free: int
+    moving: Moving, state: State, every: Block, rows: Rows, light: Light, free: int
 ) -> Float[np.ndarray, "n 3 k"]:
     """∂r/∂θ at the n pixels that are fitted, by the first `free` of θ, by central differences; 0 where the two sides show
     different surfaces."""
-    rows, surfaces = seen.fitted, moving.surfaces
-    result = np.zeros((int(rows.sum()), 3, free))
+    result, surfaces = np.zeros((int(rows.sum()), 3, free)), moving.surfaces
     for k in range(free):
-        sides = []
-        for sign in (-1, 1):
-            block, agrees = moving.block(state.moved(sign * ASIDE[k] * np.eye(7)[k]), seen.every)
-            sides.append((block.take(rows), agrees[rows]))
-        (low, low_agrees), (high, high_agrees) = sides
-        smooth = low_agrees & high_agrees & (np.sum(low.normal * high.normal, axis=1) > EDGE_TURN)
+        (low, low_agrees), (high, high_agrees) = (
+            moving.block(state.moved(sign * ASIDE[k] * np.eye(7)[k]), every) for sign in (-1, 1)
+        )
+        low, high = low.take(rows), high.take(rows)
+        smooth = (low_agrees & high_agrees)[rows] & (np.sum(low.normal * high.normal, axis=1) > EDGE_TURN)
         difference = surfaces.under(light, high).radiance() - surfaces.under(light, low).radiance()
         result[..., k] = np.where(smooth[:, None], difference * low.precision / (2 * ASIDE[k]), 0.0)
     return result

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -18,6 +18,7 @@ from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
+from factorlib.results.materials import Solved
 from factorlib.robust import robust_deviation
 from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
 from factorlib.solve.few_lobes.normal_equations import nonnegative_minimum
@@ -27,6 +28,7 @@ ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves
 SAMPLE = 1400  # observations that vote about lobes, the same in every round
 REWEIGHTED = 3  # times, for outliers
 RIDGE = 1e-4  # of the squared response of each lobe
+UNKNOWN = 0.7  # standard error of a diffuse reflectance, in its range of 1: one that no photo shows has at least this
 
 
 class Surfaces(msgspec.Struct, frozen=True):
@@ -62,6 +64,7 @@ def with_weights(illumination: Illumination) -> Light:
     block, light = illumination.block, illumination.light
     rows = np.flatnonzero(~block.held_out)
     atoms = illumination.atoms(rows, light.unit_lobes)
+    ridge = [RIDGE * np.diag(np.sum(of_channel**2, axis=0)) for of_channel in atoms]  # similar lobes, determined
     target = block.radiance[rows] * block.precision[rows]
     weight = light.weight.copy()
     for _ in range(REWEIGHTED):
@@ -69,13 +72,8 @@ def with_weights(illumination: Illumination) -> Light:
         trust = robust_loss(residual).trust(residual)
         for c in range(3):
             weighted = atoms[c] * trust[:, c, None]
-            weight[:, c] = nonnegative_minimum(weighted.T @ atoms[c] + _ridge(atoms[c]), weighted.T @ target[:, c])
+            weight[:, c] = nonnegative_minimum(weighted.T @ atoms[c] + ridge[c], weighted.T @ target[:, c])
     return Light(light.axis, light.log_sharpness, weight, light.log_exposure)
-
-
-def _ridge(atoms: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
-    """A small ridge, so that the weights of lobes with similar responses are determined."""
-    return RIDGE * np.diag(np.sum(atoms**2, axis=0))
 
 
 def robust_scale(residual: Float[np.ndarray, "n 3"]) -> float:
@@ -87,3 +85,10 @@ def robust_scale(residual: Float[np.ndarray, "n 3"]) -> float:
 def robust_loss(residual: Float[np.ndarray, "n 3"]) -> Loss:
     """The loss whose scale is `robust_scale`, without priors."""
     return Loss(robust_scale(residual), prior=0.0)
+
+
+def known_materials(solved: Sequence[Solved]) -> tuple[Materials, Bool[np.ndarray, " m"]]:
+    """The materials that a solve found as arrays, in order, and which of them are known well enough."""
+    rows = [[*one.diffuse, *one.specular, one.roughness] for one in solved]
+    known = [min(one.stderr.diffuse) < UNKNOWN for one in solved]
+    return Materials.of_vector(np.array(rows, dtype=float).reshape(-1)), np.array(known, dtype=bool)

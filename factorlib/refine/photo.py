@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 
@@ -12,7 +12,7 @@ from factorlib.align.state import State, state_of
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
 from factorlib.refine.choice import Settled, Standards, settled
-from factorlib.refine.descent import Photographed, moving_object
+from factorlib.refine.descent import moving_object
 from factorlib.refine.light import Surfaces
 from factorlib.refine.pixels import Pixels, View
 
@@ -68,18 +68,15 @@ def refined_photo(
     before = [state_of(one.pose, camera, one.caster) for one in objects]
     results = [Refined(state, state, None) for state in before]
     prior = scene.prior if len(objects) == 1 else FocalPrior(camera.focal, 0.0)
-    for done, k in enumerate(by_pixels(objects)):
+    by_pixels = sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))
+    for done, k in enumerate(by_pixels):
         report(done, len(objects))
         own = objects[k]
         if pixels is None or not own.moves or not own.silhouette.inside.any():
             continue
-        view = View(
-            pixels,
-            [one.caster for one in objects],
-            [j == k or one.trusted for j, one in enumerate(objects)],
-            scene.shadows,
-        )
-        moving = moving_object(Photographed(view, k, camera, own.silhouette, prior), poses, surfaces)
+        trusted = [j == k or one.trusted for j, one in enumerate(objects)]
+        view = View(pixels, [one.caster for one in objects], trusted, scene.shadows)
+        moving = moving_object(view, k, camera, own.silhouette, prior, poses, surfaces)
         rival = state_of(own.runner_up, camera, own.caster) if own.runner_up else None
         verdict = settled(moving, before[k], rival, pixels.cell, standards)
         if verdict is not None:
@@ -87,8 +84,3 @@ def refined_photo(
         if results[k].moved:
             poses[k] = results[k].after.pose(own.caster)
     return results
-
-
-def by_pixels(objects: Sequence[PosedObject]) -> list[int]:
-    """Numbers of the objects, the one with most pixels in its mask first."""
-    return sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))

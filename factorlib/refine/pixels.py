@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.raster import Caster, face_normals, unit
+from factorlib.geometry.raster import Caster, face_normals, smooth_normals, unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.geometry.visibility import Occluders, sight
 from factorlib.model.blocks import Block
@@ -77,16 +77,8 @@ def pixels_of(
     out = random.permutation(len(names)) < HELD_OUT * len(names)
     if not 2 <= out.sum() < len(names):
         return None
-    return Pixels(
-        x,
-        y,
-        radiance / mean,
-        mean,
-        np.where(clipped, 0.0, 1 / sigma),
-        label[y, x] - 1,
-        cell.reshape(-1),
-        out[cell.reshape(-1)],
-    )
+    cell, precision = cell.reshape(-1), np.where(clipped, 0.0, 1 / sigma)
+    return Pixels(x, y, radiance / mean, mean, precision, label[y, x] - 1, cell, out[cell])
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -106,21 +98,13 @@ class View:
     def seen(self, camera: Camera, poses: Sequence[Pose]) -> Seen:
         """What the nearest mesh shows under each pixel."""
         along = camera.rays_through(np.column_stack([self.pixels.x, self.pixels.y]) + 0.5)
-        n = len(self.pixels)
-        normal, label, nearest, view = (
-            np.tile([0.0, 0.0, -1.0], (n, 1)),
-            np.zeros(n, int),
-            np.full(n, np.inf),
-            -unit(along),
-        )
+        n, view = len(self.pixels), -unit(along)
+        normal, label, nearest = np.tile([0.0, 0.0, -1.0], (n, 1)), np.zeros(n, int), np.full(n, np.inf)
         for caster, pose, trusted in zip(self.casters, poses, self.trusted, strict=True):
             hits = caster.cast_along(along, pose)
             wins = (hits.face >= 0) & (hits.depth < nearest)
-            face, (u, v) = hits.face[wins], hits.uv[wins].T
-            corner = np.stack([1 - u - v, u, v], axis=1)
-            smooth = unit(
-                np.einsum("nk,nkd->nd", corner, caster.mesh.normals[caster.mesh.faces[face]]) @ pose.rotation.T
-            )
+            face = hits.face[wins]
+            smooth = unit(smooth_normals(caster.mesh, face, hits.uv[wins]) @ pose.rotation.T)
             behind = np.sum(face_normals(caster.mesh, face) @ pose.rotation.T * view[wins], axis=1) < 0
             nearest[wins], normal[wins] = hits.depth[wins], np.where(behind[:, None], -smooth, smooth)
             label[wins] = caster.mesh.face_label[face] if trusted else 0
@@ -139,14 +123,9 @@ class View:
         )  # fmt: skip
         if like is not None:
             return msgspec.structs.replace(block, visibility=like.visibility, directions=like.directions)
-        return self._shadowed(block, camera, seen, poses) if self.shadows and poses else block
-
-    def _shadowed(self, block: Block, camera: Camera, seen: Seen, poses: Sequence[Pose]) -> Block:
-        meshes, directions = [caster.mesh for caster in self.casters], fibonacci_sphere(self.shadows)
-        pixels = np.column_stack([self.pixels.x, self.pixels.y])
-        found = sight(Occluders(meshes, poses), camera, pixels, seen.normal, self.shadows, len(pixels))
-        return (
-            block
-            if found is None
-            else msgspec.structs.replace(block, visibility=found.visibility, directions=directions[None])
-        )
+        if not (self.shadows and poses):
+            return block
+        occluders, where = Occluders([c.mesh for c in self.casters], poses), np.column_stack([pixels.x, pixels.y])
+        past = sight(occluders, camera, where, seen.normal, self.shadows, n)
+        directions = fibonacci_sphere(self.shadows)[None]
+        return msgspec.structs.replace(block, visibility=past.visibility, directions=directions) if past else block

@@ -18,6 +18,38 @@ One lobe from straight above, on a white Lambertian surface that faces the viewe
 [0.02, 0.02, 0.02]
 """
 
-from factorlib.reflection.operator import Operator, Response, reflection_operator
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.reflection.operator import NAMES, Name, Operator, Response
 
 __all__ = ["Operator", "Response", "reflection_operator"]
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype: str | None = None) -> Operator:
+    """The operator `name`; each is imported when it is asked for.
+
+    weights: folder with diffuse.safetensors and specular.safetensors, for the networks; None takes the shipped ones
+    dtype:   float32 or float64; None takes the operator's own (float64 for the reference, float32 for the others)
+    """
+    if name not in NAMES:
+        raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, NAMES))
+    if dtype is not None and dtype not in DTYPES:
+        raise InputError(f"no dtype '{dtype}'", cure=did_you_mean(dtype, DTYPES))
+    options = {"dtype": DTYPES[dtype]} if dtype else {}
+    if name == "reference":
+        from factorlib.reflection.reference import Reference as Kind
+    elif name == "closed_form":
+        from factorlib.reflection.closed_form import ClosedForm as Kind
+    elif name == "network":
+        from factorlib.reflection.network import Network as Kind
+
+        options |= {"weights": weights} if weights is not None else {}
+    else:
+        from factorlib.reflection.paper_network import PaperNetwork as Kind
+    return Kind(**options)

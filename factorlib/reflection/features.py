@@ -30,12 +30,13 @@ class Layers(msgspec.Struct, frozen=True):
 
     def to(self, dtype: torch.dtype) -> Layers:
         """The same network in another floating-point type."""
-        return Layers(
-            self.mean.to(dtype),
-            self.scale.to(dtype),
-            [w.to(dtype) for w in self.weights],
-            [b.to(dtype) for b in self.biases],
-        )
+        weights, biases = ([t.to(dtype) for t in tensors] for tensors in (self.weights, self.biases))
+        return Layers(self.mean.to(dtype), self.scale.to(dtype), weights, biases)
+
+    def copy(self) -> Layers:
+        """The same weights, apart from the network's own and off torch's graph."""
+        weights, biases = ([t.detach().clone() for t in tensors] for tensors in (self.weights, self.biases))
+        return Layers(self.mean, self.scale, weights, biases)
 
 
 def fading(sharpness: Tensor) -> Tensor:

@@ -45,9 +45,7 @@ LEAST_HN, LARGEST_P = 1e-3, 0.998  # (n·h)² and |p|² where h is perpendicular
 SHARE = 2.0  # curvature of −log D at its peak over k, as the blend takes it
 WIDE = 0.03  # a lobe's V is no wider than 1/WIDE: p ends at the unit circle
 RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
-PEAK = (
-    3.0  # −∂²/∂p² of the logarithm of D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
-)
+PEAK = 3.0  # −∂²/∂p² of log D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
 
 
 class Filtered(msgspec.Struct):

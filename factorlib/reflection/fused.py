@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from factorlib.errors import InputError
-from factorlib.reflection.diffuse import diffuse_of_moments
+from factorlib.reflection.closed_form import diffuse_of_moments
 from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
 from factorlib.reflection.filtering import Width, filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
@@ -36,9 +36,7 @@ from factorlib.reflection.tape import Tape, Value
 from factorlib.wholefile import sync
 
 log = logging.getLogger("factorlib.reflection")
-ENVIRONMENT = (
-    "FACTORLIB_FUSED",
-)  # "0": in torch; it computes the same up to rounding, so which form ran is in the keys of steps
+ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch, the same up to rounding: which form ran is in the keys of steps
 PROGRAMS = {"CC": "cc"}
 # Every flag leaves the bits as they are: no operation is contracted, reordered or replaced, errno and traps are nobody's.
 FLAGS = "-std=gnu11 -O3 -march=native -ffp-contract=off -ffinite-math-only -fno-signed-zeros -fno-math-errno -fno-trapping-math -fPIC -shared"
@@ -55,7 +53,8 @@ class Fused:
         self.function = compiled(part, layers.weights[0].shape[1], layers.weights[0].shape[0], len(layers.weights) - 1)
         first = layers.weights[0] * layers.scale
         weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
-        self.tables = [_flat(weights), _flat(biases), _flat([w.T for w in weights[:-1]])]
+        tables = weights, biases, [w.T for w in weights[:-1]]
+        self.tables = [torch.cat([t.detach().float().reshape(-1) for t in table]).contiguous() for table in tables]
 
     def __reduce__(self) -> tuple:
         """A copy in another process compiles, or finds in the user's cache, its own."""
@@ -71,29 +70,19 @@ class Fused:
         """The value alone, in about a third of the time."""
         return self._filled(1, roughness, sharpness, no, nz, oz)[0]
 
-    def _filled(
-        self, count: int, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-    ) -> list[Tensor]:
-        no, nz, oz = (t.detach().float().contiguous() for t in (no, nz, oz))
+    def _filled(self, count: int, roughness: float, sharpness: Tensor, *cosines: Tensor) -> list[Tensor]:
+        no, nz, oz = (t.detach().float().contiguous() for t in cosines)
         out = [torch.empty_like(nz) for _ in range(count)]
         pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # the rest are null
-        lobes = _lobe_table(sharpness)
+        lobes = _lobe_table_of(sharpness.detach().double().numpy().tobytes())
         arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
         self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
         return out
 
 
-def _flat(tensors: list[Tensor]) -> Tensor:
-    return torch.cat([t.detach().float().reshape(-1) for t in tensors]).contiguous()
-
-
-def _lobe_table(sharpness: Tensor) -> Tensor:
-    """MOMENTS and their derivatives by log λ, [10, p].  The same lobes are asked for again for every material."""
-    return _lobe_table_of(sharpness.detach().double().numpy().tobytes())
-
-
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=256)  # the same lobes are asked for again for every material
 def _lobe_table_of(sharpness: bytes) -> Tensor:
+    """MOMENTS and their derivatives by log λ, [10, p], of float64 λ."""
     with torch.enable_grad():
         log_sharpness = torch.from_numpy(np.frombuffer(sharpness).copy()).log().requires_grad_()
         sharpness = log_sharpness.exp()
@@ -144,14 +133,11 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     before, after = text.split("      FORWARD\n")
     middle, after = after.split("        BACKWARD\n")
     between, end = after.split("        VALUE\n")
-    sizes = (
-        f"#define FEATURES {features}\n#define WIDTH {width}\n#define DEPTH {depth}\n#define MOMENTS {len(MOMENTS)}\n"
-    )
-    for name in ("expf", "logf", "log1pf", "erfcf"):
-        forward, backward, value = (
-            [line.replace(f"{name}(", f"{name[:-1]}_(") for line in lines] for lines in (forward, backward, value)
-        )
+    sizes = {"FEATURES": features, "WIDTH": width, "DEPTH": depth, "MOMENTS": len(MOMENTS)}
+    sizes = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
     forward, backward, value = ("\n".join(lines) + "\n" for lines in (forward, backward, value))
+    for name in ("expf", "logf", "log1pf", "erfcf"):  # kernel.c has its own
+        forward, backward, value = (t.replace(f"{name}(", f"{name[:-1]}_(") for t in (forward, backward, value))
     return sizes + before + forward + middle + backward + between + value + end
 
 
@@ -162,17 +148,14 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
     text = source(part, features, width, depth)
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
     key = hashlib.sha256(f"{text}\0{FLAGS}\0{version}\0{_machine()}".encode()).hexdigest()[:24]
-    library = _cache() / f"{part}-{key}.so"
+    library = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "factorlib" / f"{part}-{key}.so"
+    library.parent.mkdir(parents=True, exist_ok=True)
     if not library.exists():
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            made = Path(folder) / "kernel.so"
-            (Path(folder) / "kernel.c").write_text(text)
-            subprocess.run(
-                [*compiler, *FLAGS.split(), "-o", made, Path(folder) / "kernel.c", "-lm"],
-                check=True,
-                capture_output=True,
-                text=True,
-            )
+            made, code = Path(folder) / "kernel.so", Path(folder) / "kernel.c"
+            code.write_text(text)
+            command = [*compiler, *FLAGS.split(), "-o", made, code, "-lm"]
+            subprocess.run(command, check=True, capture_output=True, text=True)
             sync(made)
             os.replace(made, library)
     function = ctypes.CDLL(str(library)).response
@@ -184,17 +167,10 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
 def _machine() -> str:
     """What -march=native depends on."""
     try:
-        return next(
-            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
-        )
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line for line in lines if line.startswith(("flags", "Features")))
     except (OSError, StopIteration):
         return platform.machine() + platform.processor()
-
-
-def _cache() -> Path:
-    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "factorlib"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def fused(part: str, layers: Layers) -> Fused | None:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.reflection import diffuse as diffuse_form
+from factorlib.reflection import closed_form
 from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
 from factorlib.reflection.filtering import Filtered, filtered_specular
 from factorlib.reflection.fused import fused
@@ -30,6 +30,7 @@ from factorlib.wholefile import write_bytes
 
 SHIPPED = Path(__file__).parent / "weights"
 FEATURES = {"diffuse": 8, "specular": 24}
+Features = Float[Tensor, "*b features"]
 
 
 def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
@@ -37,14 +38,12 @@ def correction(layers: Layers, features: Tensor, sharpness: Tensor) -> Tensor:
     return fading(sharpness) * LARGEST * torch.tanh(layers(features) / LARGEST)
 
 
-def specular_features(
-    alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered
-) -> Float[Tensor, "*b features"]:
+def specular_features(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> Features:
     """The inputs of the specular network, from tensors that broadcast; `form` is `filtered_specular` of the same."""
     return torch.stack(torch.broadcast_tensors(*specular_columns(alpha, no, nz, oz, form)), -1)
 
 
-def diffuse_features(sharpness: Tensor, nz: Tensor) -> Float[Tensor, "*b features"]:
+def diffuse_features(sharpness: Tensor, nz: Tensor) -> Features:
     """The inputs of the diffuse network, from tensors that broadcast."""
     columns = diffuse_columns(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)
     return torch.stack(torch.broadcast_tensors(*columns), -1)
@@ -57,9 +56,8 @@ class Network(Operator):
         super().__init__(dtype)
         folder = Path(weights) if weights is not None else SHIPPED
         self.layers = {part: read_layers(folder / f"{part}.safetensors", FEATURES[part]).to(dtype) for part in FEATURES}
-        self.fused = (
-            {part: fused(part, layers) for part, layers in self.layers.items()} if dtype == torch.float32 else {}
-        )
+        compiled = self.layers if dtype == torch.float32 else {}
+        self.fused = {part: fused(part, layers) for part, layers in compiled.items()}
 
     def _compiled(self, sharpness: Tensor, *others: Tensor) -> bool:
         """Whether compiled code can answer: it is there, a lobe a column, on the CPU, finite, and autograd does not listen.
@@ -75,26 +73,19 @@ class Network(Operator):
         """As of every operator; in float32 by compiled code, where there is a compiler."""
         if not self._compiled(*(t.detach() for t in (sharpness, roughness, no, nz, oz))):
             return super().response(roughness, sharpness, no, nz, oz)
-        diffuse, _, diffuse_by_log_sharpness, _, diffuse_by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
-        return Response(
-            diffuse,
-            diffuse_by_log_sharpness,
-            diffuse_by_nz,
-            *self.fused["specular"](float(roughness), sharpness, no, nz, oz),
-        )
+        diffuse, _, by_log_sharpness, _, by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
+        specular = self.fused["specular"](float(roughness), sharpness, no, nz, oz)
+        return Response(diffuse, by_log_sharpness, by_nz, *specular)
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         """As of `Operator`; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if self._compiled(sharpness, nz):
             return self.fused["diffuse"].value(0.0, sharpness, nz.new_ones(len(nz)), nz, nz)
         nz = nz.clamp(-1, 1)
-        return diffuse_form.diffuse(sharpness, nz) * torch.exp(
-            correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness)
-        )
+        formula = closed_form.diffuse(sharpness, nz)
+        return formula * torch.exp(correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness))
 
-    def specular(
-        self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-    ) -> Float[Tensor, "n p"]:
+    def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
         """As of `Operator`, at most MOST; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if roughness.ndim == 0 and no.ndim == 1 and self._compiled(sharpness, no, nz, oz, roughness):
             return self.fused["specular"].value(float(roughness), sharpness, no, nz, oz)
@@ -118,17 +109,13 @@ def write_layers(path: Path, layers: Layers, dtype: torch.dtype = torch.float32,
 def read_layers(path: Path, features: int) -> Layers:
     """The network of `features` inputs in the file `path`."""
     if not path.exists():
-        raise InputError(
-            "no weights of the reflection network here",
-            file=path,
-            cure="make them by `make train`, or leave `weights` out",
-        )
+        cure = "make them by `make train`, or leave `weights` out"
+        raise InputError("no weights of the reflection network here", file=path, cure=cure)
     with safe_open(path, framework="pt") as file:
         count = sum(name.endswith(".bias") for name in file.keys())  # noqa: SIM118
         weights, biases = ([file.get_tensor(f"layer.{k}.{kind}") for k in range(count)] for kind in ("weight", "bias"))
         layers = Layers(file.get_tensor("feature.mean"), file.get_tensor("feature.scale"), weights, biases)
     if len(layers.mean) != features:
-        raise InputError(
-            f"a network of {len(layers.mean)} features, not {features}", file=path, cure="make it again by `make train`"
-        )
+        fault = f"a network of {len(layers.mean)} features, not {features}"
+        raise InputError(fault, file=path, cure="make it again by `make train`")
     return layers

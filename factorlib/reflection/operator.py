@@ -1,8 +1,7 @@
-"""The interface of every reflection operator, and the choice among them by name."""
+"""The interface of every reflection operator."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import msgspec
@@ -10,12 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.errors import InputError, did_you_mean
-
 Name = Literal["reference", "closed_form", "network", "paper_network"]
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
 NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
+PerLobe, PerPoint, PerPair = Float[Tensor, "*p"], Float[Tensor, "*n"], Float[Tensor, "n p"]
 CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
 
 
@@ -61,29 +58,15 @@ class Operator:
     def __init__(self, dtype: torch.dtype = torch.float32):
         self.dtype = dtype
 
-    def diffuse(self, sharpness: Float[Tensor, " p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+    def diffuse(self, sharpness: PerLobe, nz: PerPair) -> PerPair:
         """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
         raise NotImplementedError
 
-    def specular(
-        self,
-        roughness: Tensor,
-        sharpness: Float[Tensor, " p"],
-        no: Float[Tensor, " n"],
-        nz: Float[Tensor, "n p"],
-        oz: Float[Tensor, "n p"],
-    ) -> Float[Tensor, "n p"]:
+    def specular(self, roughness: Tensor, sharpness: PerLobe, no: PerPoint, nz: PerPair, oz: PerPair) -> PerPair:
         """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²; every input may be [n, p] as well."""
         raise NotImplementedError
 
-    def response(
-        self,
-        roughness: Tensor,
-        sharpness: Float[Tensor, " p"],
-        no: Float[Tensor, " n"],
-        nz: Float[Tensor, "n p"],
-        oz: Float[Tensor, "n p"],
-    ) -> Response:
+    def response(self, roughness: Tensor, sharpness: PerLobe, no: PerPoint, nz: PerPair, oz: PerPair) -> Response:
         """Values and derivatives together; nothing is left on torch's graph."""
         rows = max(1, CHUNK // max(nz.shape[1], 1))
         parts = [
@@ -96,10 +79,8 @@ class Operator:
 
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
         with torch.enable_grad():
-            r, log_sharpness = (
-                t.detach().expand(nz.shape).clone().requires_grad_() for t in (roughness, sharpness.log())
-            )
-            views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in (columns(no), nz, oz))
+            given = (roughness, sharpness.log(), columns(no), nz, oz)
+            r, log_sharpness, views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in given)
             diffuse = self.diffuse(log_sharpness.exp(), nz)
             specular = self.specular(r, log_sharpness.exp(), views, nz, oz)
             by_diffuse = torch.autograd.grad(diffuse.sum(), [log_sharpness, nz])
@@ -111,52 +92,17 @@ class Operator:
     ) -> Float[Tensor, "n 3"]:
         """Radiance toward the viewer, in the units of the lobes' weights; differentiable in everything.
 
-
         normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
         """
-        axis, sharpness, weight = (
-            torch.as_tensor(t).to(self.dtype) for t in (lobes.axis, lobes.sharpness, lobes.weight)
-        )
-        kd, ks, roughness = (
-            torch.as_tensor(t).to(self.dtype) for t in (material.diffuse, material.specular, material.roughness)
-        )
-        normals, views = (torch.as_tensor(t).to(self.dtype) for t in (normals, views))
+        given = lobes.axis, lobes.sharpness, lobes.weight, material.diffuse, material.specular, material.roughness
+        given = (torch.as_tensor(t).to(self.dtype) for t in (*given, normals, views))
+        axis, sharpness, weight, kd, ks, roughness, normals, views = given
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
-        radiance = kd * (self.diffuse(sharpness, nz) @ weight) + ks * (
-            self.specular(roughness, sharpness, no, nz, oz) @ weight
-        )
+        diffuse, specular = self.diffuse(sharpness, nz), self.specular(roughness, sharpness, no, nz, oz)
+        radiance = kd * (diffuse @ weight) + ks * (specular @ weight)
         return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # so that NaN is not zero
 
 
 def columns(no: Tensor) -> Tensor:
     """n·o as it meets the lobes: [n, 1], or [n, p] as it is."""
     return no if no.ndim == 2 else no[:, None]
-
-
-def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype: str | None = None) -> Operator:
-    """The operator `name`.
-
-    weights: folder with diffuse.safetensors and specular.safetensors, for the networks; None takes the shipped ones
-    dtype:   float32 or float64; None takes the operator's own (float64 for the reference, float32 for the others)
-    """
-    if name not in NAMES:
-        raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, NAMES))
-    if dtype is not None and dtype not in DTYPES:
-        raise InputError(f"no dtype '{dtype}'", cure=did_you_mean(dtype, DTYPES))
-    options = {"dtype": DTYPES[dtype]} if dtype else {}
-    if name == "network" and weights is not None:
-        options["weights"] = weights
-    return _kind(name)(**options)
-
-
-def _kind(name: Name) -> type[Operator]:
-    """Each is imported when it is asked for, and by a statement: what a step runs is found by reading the imports."""
-    if name == "reference":
-        from factorlib.reflection.reference import Reference as Kind
-    elif name == "closed_form":
-        from factorlib.reflection.closed_form import ClosedForm as Kind
-    elif name == "network":
-        from factorlib.reflection.network import Network as Kind
-    else:
-        from factorlib.reflection.paper_network import PaperNetwork as Kind
-    return Kind

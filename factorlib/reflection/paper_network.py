@@ -42,6 +42,7 @@ from factorlib.reflection.operator import Operator, columns
 
 INPUTS = {"diffuse": 7, "specular": 11}  # and k · w
 SHARPNESS, ROUGHNESS = (0.05, 1e4), (0.09, 1.0)  # of `factorlib.generate.lobe_spheres`
+Vector = tuple[Tensor, ...]  # three components
 SOFTENED = 1e-5  # added under roots, whose derivatives have no bound without it
 
 
@@ -50,9 +51,8 @@ class PaperNetwork(Operator):
 
     def __init__(self, dtype: torch.dtype = torch.float32):
         super().__init__(dtype)
-        self.layers = {
-            part: read_layers(SHIPPED / f"paper_{part}.safetensors", INPUTS[part]).to(dtype) for part in INPUTS
-        }
+        read = {part: read_layers(SHIPPED / f"paper_{part}.safetensors", count) for part, count in INPUTS.items()}
+        self.layers = {part: layers.to(dtype) for part, layers in read.items()}
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
         """As of `Operator`; λ is clamped to SHARPNESS."""
@@ -61,9 +61,7 @@ class PaperNetwork(Operator):
         normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
-    def specular(
-        self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-    ) -> Float[Tensor, "n p"]:
+    def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
         """As of `Operator`; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
         roughness, sharpness, no, nz, oz = torch.broadcast_tensors(roughness, sharpness, columns(no), nz, oz)
         normal, half, axis = frame_of_cosines(no, nz, oz)
@@ -73,7 +71,7 @@ class PaperNetwork(Operator):
         return lobe_integral(sharpness) * torch.exp(correction(self.layers[part], inputs, sharpness.clamp(*SHARPNESS)))
 
 
-def frame_of_cosines(no: Tensor, nz: Tensor, oz: Tensor) -> tuple[tuple[Tensor, ...], ...]:
+def frame_of_cosines(no: Tensor, nz: Tensor, oz: Tensor) -> tuple[Vector, ...]:
     """Components of normal, half vector and axis where the view is (0, 0, −1), the normal at y = 0 and the axis at y > 0."""
     no, nz, oz = (t.clamp(-1, 1) for t in (no, nz, oz))
     zero, across = torch.zeros_like(no), soft_root(1 - no * no)
@@ -87,13 +85,13 @@ def soft_root(square: Tensor) -> Tensor:
     return torch.sqrt(square.clamp_min(0) + SOFTENED)
 
 
-def diffuse_inputs(normal: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor) -> Float[Tensor, "*b 7"]:
+def diffuse_inputs(normal: Vector, axis: Vector, sharpness: Tensor) -> Float[Tensor, "*b 7"]:
     """Inputs of the diffuse network: normal, axis (three components each, camera frame), log σ."""
     return torch.stack([*normal, *axis, log_precision(sharpness)], -1)
 
 
 def specular_inputs(
-    normal: tuple[Tensor, ...], half: tuple[Tensor, ...], axis: tuple[Tensor, ...], sharpness: Tensor, roughness: Tensor
+    normal: Vector, half: Vector, axis: Vector, sharpness: Tensor, roughness: Tensor
 ) -> Float[Tensor, "*b 11"]:
     """Inputs of the specular network: normal, half vector, axis (three components each, camera frame), log σ, roughness."""
     return torch.stack([*normal, *half, *axis, log_precision(sharpness), roughness.clamp(*ROUGHNESS)], -1)

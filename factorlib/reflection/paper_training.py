@@ -6,7 +6,6 @@ equally often, in random order, with a step that warms up and falls to zero by a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import msgspec
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import Layers, correction
-from factorlib.reflection.training import Schedule, initial_layers
+from factorlib.reflection.training import Schedule, initial_layers, share_of_rate
 
 
 class Examples(msgspec.Struct, frozen=True):
@@ -34,14 +33,14 @@ def trained(examples: Examples, schedule: Schedule, report: Callable[[int, float
     energy = lobe_integral(sharpness)
     layers = initial_layers(inputs, schedule, generator)
     optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-    slope = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, schedule.steps))
+    slope = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: share_of_rate(step, schedule.steps))
     every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
     for step in range(1, schedule.steps + 1):
         if len(order) < schedule.batch:
             order = torch.randperm(len(radiance), generator=generator)
         rows, order = order[: schedule.batch], order[schedule.batch :]
-        found = energy[rows] * torch.exp(correction(layers, inputs[rows], sharpness[rows]))
-        error = (found - radiance[rows]) / (radiance[rows] + energy[rows] / 100)
+        radiated = energy[rows] * torch.exp(correction(layers, inputs[rows], sharpness[rows]))
+        error = (radiated - radiance[rows]) / (radiance[rows] + energy[rows] / 100)
         loss = torch.sqrt(error * error + 1e-6).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -52,8 +51,3 @@ def trained(examples: Examples, schedule: Schedule, report: Callable[[int, float
             report(step, total / every)
             total = 0.0
     return layers
-
-
-def _rate(step: int, steps: int) -> float:
-    warm = min(1.0, (step + 1) / max(1, steps // 30))
-    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))

@@ -46,17 +46,13 @@ class Reference(Operator):
         """As of `Operator`, by quadrature."""
         return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
-    def specular(
-        self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-    ) -> Float[Tensor, "n p"]:
+    def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
         """As of `Operator`, by quadrature, converged to the tolerance."""
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 
 
-def converged(
-    alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, *, tolerance: float
-) -> Float[Tensor, " b"]:
+def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor, *, tolerance: float) -> Tensor:
     """The specular part of every element at the first level that agrees with the one before it."""
     scalars = alpha, sharpness, no, nz, oz
     value, level = torch.zeros_like(alpha), torch.zeros(alpha.shape, dtype=torch.long)
@@ -74,8 +70,8 @@ def converged(
             todo = todo[~agrees] if k > first else todo
     if not any(t.requires_grad for t in scalars):
         return value
-    pieces = [(torch.nonzero(level == k)[:, 0], LEVELS[k]) for k in range(len(LEVELS))]
-    for where, nodes in pieces:
+    for k, nodes in enumerate(LEVELS):
+        where = torch.nonzero(level == k)[:, 0]
         if len(where):
             value = value.index_put((where,), in_chunks(nodes, *(t[where] for t in scalars)))
     return value
@@ -84,14 +80,11 @@ def converged(
 def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, " b"]:
     """`specular_quadrature`, of so many elements at a time that memory stays small; scalars [b]."""
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
-    return torch.cat(
-        [specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in range(0, len(scalars[0]), rows)]
-    )
+    firsts = range(0, len(scalars[0]), rows)
+    return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in firsts])
 
 
-def specular_quadrature(
-    nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-) -> Float[Tensor, " b"]:
+def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
     """∫ SG D G / (4 n·o) di with `nodes` nodes in each direction of each piece, about the sharper factor."""
     no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
     about_normal = sharper_is_the_normal(alpha, sharpness, no, nz, oz)
@@ -137,22 +130,18 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
         cos, sin = torch.cos(theta), torch.sin(theta)
         ni, oi = nz * cos + sz * sin * cos_phi, oz * cos + sin * (ox * cos_phi + oy * sin_phi)
         nh = (no + ni) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
-        return (
-            torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2) * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
-        )
+        lobe = torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2)
+        return lobe * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
 
     def cos_arc(theta: Tensor) -> Tensor:
         """Cosine of the azimuth beyond which light comes from below the surface."""
         return -nz * torch.cos(theta) / (sz * torch.sin(theta))
 
-    return over_circles(nodes, *full, integrand) + over_arcs(
-        nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc
-    )
+    circles = over_circles(nodes, *full, integrand)  # before the arcs' limits: derivatives are summed in this order
+    return circles + over_arcs(nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc)
 
 
-def about_half_vector(
-    nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor
-) -> Float[Tensor, " b"]:
+def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
     """∫ SG(i) D(h) G1(n·i) 4(o·h) dh in polar coordinates about n, azimuth from the plane of n and o.
 
     θ = α sinh y spreads the nodes over the peak of D and over its tail alike.
@@ -177,9 +166,8 @@ def about_half_vector(
         """Cosine of the azimuth beyond which light comes from below the surface."""
         return -no / (so * torch.tan(2 * alpha * torch.sinh(y)))
 
-    return over_circles(nodes, y_least.minimum(y_a), y_a, integrand) + over_arcs(
-        nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc
-    )
+    circles = over_circles(nodes, y_least.minimum(y_a), y_a, integrand)  # first, as above
+    return circles + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
 
 
 def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, " b"]:

@@ -66,9 +66,7 @@ class DiffuseSamples(msgspec.Struct, frozen=True):
 
 def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) -> DiffuseSamples:
     """Sharpness log-uniform; n·z uniform for one half, within three widths of the horizon for the other."""
-    u = torch.from_numpy(
-        qmc.Sobol(3, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count]
-    )
+    u = torch.from_numpy(_sobol(3, count, seed))
     lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 0]
     even = 2 * u[:, 1] - 1
     nz = torch.where(u[:, 2] < 0.5, even, (3 * even / torch.sqrt(lam)).clamp(-1, 1))
@@ -77,25 +75,21 @@ def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) 
 
 
 def specular_inputs(
-    count: int,
-    seed: int,
-    *,
-    alpha: Range = (0.01, 1.0),
-    sharpness: Range = (0.3, 5000.0),
-    least_no: float = 0.02,
+    count: int, seed: int, *, alpha: Range = (0.01, 1.0), sharpness: Range = (0.3, 5000.0), least_no: float = 0.02,
     grazing: bool = False,
-) -> tuple[Tensor, ...]:
+) -> tuple[Tensor, ...]:  # fmt: skip
     """α, λ, n·o, n·z, o·z [count] of the distribution above, by a scrambled Sobol sequence.
 
     grazing: n·o log-uniform up to GRAZING instead
     """
-    u = qmc.Sobol(6, rng=np.random.default_rng(seed)).random_base2(max(1, math.ceil(math.log2(count))))[:count]
+    u = _sobol(6, count, seed)
     a = alpha[0] * (alpha[1] / alpha[0]) ** u[:, 0]
     lam = sharpness[0] * (sharpness[1] / sharpness[0]) ** u[:, 1]
     no = least_no * (GRAZING / least_no) ** u[:, 2] if grazing else least_no + (1 - least_no) * u[:, 2]
     view = np.stack([np.sqrt(1 - no**2), 0 * no, no], 1)
     spread = 2 * np.sqrt(a**2 / 2 + 1 / lam)
-    near = _turned(view * [-1, 1, 1], spread * _rayleigh(u[:, 3]), 2 * np.pi * u[:, 4])
+    rayleigh = np.sqrt(-2 * np.log1p(-u[:, 3]))  # length of a two-dimensional normal vector of unit deviation
+    near = _turned(view * [-1, 1, 1], spread * rayleigh, 2 * np.pi * u[:, 4])
     far = _turned(np.tile([0.0, 0.0, 1.0], (count, 1)), np.arccos(1 - 2 * u[:, 3]), 2 * np.pi * u[:, 4])
     z = np.where(u[:, 5:] < 2 / 3, near, far)
     return tuple(torch.from_numpy(t.copy()) for t in (a, lam, no, z[:, 2], (z * view).sum(1)))
@@ -107,9 +101,10 @@ def specular_samples(count: int, seed: int, *, tolerance: float, **ranges: Any) 
     return Samples(*inputs, converged(*inputs, tolerance=tolerance))
 
 
-def _rayleigh(u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Length of a two-dimensional normal vector of unit deviation."""
-    return np.sqrt(-2 * np.log1p(-u))
+def _sobol(dimensions: int, count: int, seed: int) -> Float[np.ndarray, "count d"]:
+    """Scrambled points of the unit cube."""
+    sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
+    return sequence.random_base2(max(1, math.ceil(math.log2(count))))[:count]
 
 
 def _turned(

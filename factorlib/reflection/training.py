@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.reflection.diffuse import diffuse
+from factorlib.reflection.closed_form import diffuse
 from factorlib.reflection.filtering import filtered_specular
 from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
 from factorlib.reflection.samples import DiffuseSamples, Samples
@@ -69,10 +69,8 @@ def specular_problem(samples: Samples) -> Problem:
 
 def diffuse_problem(samples: DiffuseSamples) -> Problem:
     """What the diffuse network is fitted to, at `samples`."""
-    formula = diffuse(samples.sharpness, samples.nz)
-    return Problem(
-        diffuse_features(samples.sharpness, samples.nz), samples.sharpness, formula, samples.value, samples.scale()
-    )
+    formula, features = (f(samples.sharpness, samples.nz) for f in (diffuse, diffuse_features))
+    return Problem(features, samples.sharpness, formula, samples.value, samples.scale())
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -104,7 +102,7 @@ def train(
     while not run.finished():
         report(run.advance())
         checkpoint.save(run.state())
-    return run.kept, run.curve
+    return run.best, run.curve
 
 
 class Run:
@@ -117,7 +115,7 @@ class Run:
         self.parameters = [*self.layers.weights, *self.layers.biases]
         self.optimiser = torch.optim.Adam(self.parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
         self.order = torch.empty(0, dtype=torch.long)
-        self.kept, self.curve = self.layers, []
+        self.best, self.curve = self.layers, []
         self.stretch = max(1, schedule.steps // POINTS)  # steps between two points of the curve
 
     def finished(self) -> bool:
@@ -130,15 +128,20 @@ class Run:
         total, first = 0.0, len(self.curve) * self.stretch
         for step in range(first, first + self.stretch):
             for group in self.optimiser.param_groups:
-                group["lr"] = self.schedule.rate * _rate(step, self.schedule.steps)
-            loss = robust(self._batch().errors(self.layers)).mean()
+                group["lr"] = self.schedule.rate * share_of_rate(step, self.schedule.steps)
+            error = self._batch().errors(self.layers)
+            # about |e|, smooth at 0, plus 2e², so that single large errors count more
+            loss = (torch.sqrt(error * error + 1e-6) + 2 * error * error).mean()
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
             self.optimiser.step()
             total += float(loss.detach())
-        point = _measured(first + self.stretch, total / self.stretch, self.layers, self.held_out)
+        with torch.no_grad():
+            error = self.held_out.errors(self.layers).abs()
+        quantiles = (float(error.quantile(q)) for q in (0.5, 0.95, 0.999))
+        point = Step(first + self.stretch, total / self.stretch, *quantiles)
         if all(point.score() < earlier.score() for earlier in self.curve):
-            self.kept = _copy(self.layers)
+            self.best = self.layers.copy()
         self.curve.append(point)
         return point
 
@@ -161,7 +164,7 @@ class Run:
         """All that `load_state` needs to go on to the same bytes."""
         return {
             "parameters": [p.detach() for p in self.parameters],
-            "kept": [*self.kept.weights, *self.kept.biases],
+            "best": [*self.best.weights, *self.best.biases],
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
             "order": self.order,
@@ -174,24 +177,18 @@ class Run:
             for parameter, value in zip(self.parameters, state["parameters"], strict=True):
                 parameter.copy_(value)
         count = len(self.layers.weights)
-        self.kept = Layers(self.layers.mean, self.layers.scale, state["kept"][:count], state["kept"][count:])
+        self.best = Layers(self.layers.mean, self.layers.scale, state["best"][:count], state["best"][count:])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
         self.order = state["order"]
         self.curve = [Step(**point) for point in state["curve"]]
 
 
-def robust(error: Tensor) -> Tensor:
-    """About |e|, smooth at 0, plus 2e², so that single large errors count more."""
-    return torch.sqrt(error * error + 1e-6) + 2 * error * error
-
-
 def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator: torch.Generator) -> Layers:
     """Random weights of variance 1.7 over the number of inputs, the last layer's a tenth as large, so that the correction begins near 0."""
     sizes = [features.shape[1], *[schedule.width] * schedule.depth, 1]
-    weights = [
-        torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in zip(sizes, sizes[1:], strict=False)
-    ]
+    layers = zip(sizes, sizes[1:], strict=False)
+    weights = [torch.randn(b, a, generator=generator) * math.sqrt(1.7 / a) for a, b in layers]
     weights[-1] *= 0.1
     biases = [torch.zeros(b) for b in sizes[1:]]
     for tensor in (*weights, *biases):
@@ -199,21 +196,7 @@ def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator
     return Layers(features.mean(0), 1 / (features.std(0) + 1e-3), weights, biases)
 
 
-def _rate(step: int, steps: int) -> float:
+def share_of_rate(step: int, steps: int) -> float:
+    """Of the greatest step: it warms up and falls to zero by a cosine."""
     warm = min(1.0, (step + 1) / max(1, steps // 30))
     return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
-
-
-def _measured(step: int, loss: float, layers: Layers, held_out: Problem) -> Step:
-    with torch.no_grad():
-        error = held_out.errors(layers).abs()
-    return Step(step, loss, *(float(error.quantile(q)) for q in (0.5, 0.95, 0.999)))
-
-
-def _copy(layers: Layers) -> Layers:
-    return Layers(
-        layers.mean,
-        layers.scale,
-        [w.detach().clone() for w in layers.weights],
-        [b.detach().clone() for b in layers.biases],
-    )

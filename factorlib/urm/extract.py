@@ -6,7 +6,7 @@ normal faces the camera: elsewhere the normal belongs to something else than the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -46,15 +46,20 @@ def observations_of_photo(
     seen = observed_pixels(photo, geometry, least_confidence)
     y, x = np.nonzero(seen)
 
-    def gather(channels: Channels, names: Sequence[str]) -> np.ndarray:
+    def gather(channels: Channels, names: Iterable[str]) -> np.ndarray:
         """The named channels at the observed pixels."""
         return np.stack([channels[n][seen] for n in names], axis=-1)
 
+    def directions(name: str) -> Float[np.ndarray, "n 3"]:
+        """A vector of the geometry, at length 1."""
+        vectors = gather(geometry, [f"{name}.{axis}" for axis in "xyz"])
+        return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
     return Observations(
-        normal=_unit(gather(geometry, ["normal.x", "normal.y", "normal.z"])),
-        view=_unit(gather(geometry, ["view.x", "view.y", "view.z"])),
+        normal=directions("normal"),
+        view=directions("view"),
         radiance=np.maximum(gather(photo, "RGB"), 0.0),
-        clipped=gather(photo, ["clipped.R", "clipped.G", "clipped.B"]) > 0.5,
+        clipped=gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
         material=np.rint(photo["label"][seen]).astype("i2") - 1,
         photo=np.zeros(len(x), "i4"),
         illumination=np.zeros(len(x), "i4"),
@@ -67,7 +72,3 @@ def observations_of_photo(
         illuminations=(taken.illumination,),
         exposures=(taken.exposure,),
     )
-
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

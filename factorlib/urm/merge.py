@@ -11,6 +11,7 @@ alike, by the mean over the sphere of hidden × direction.
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import csr_array
@@ -28,23 +29,33 @@ def merge(observations: Observations, degrees: float) -> Observations:
 
     `x`, `y` and `met` become those of the group's first pixel.
     """
-    if degrees <= 0 or len(observations) == 0:
-        return observations
-    cell = np.radians(degrees)
-    mirror = mirror_directions(observations.normal, observations.view)
-    flags = observations.clipped @ np.array([1, 2, 4])
-    keys = np.column_stack(
-        [
-            observations.photo,
-            observations.material,
-            flags,
-            direction_cells(observations.normal, cell),
-            direction_cells(mirror, 2 * cell),
-        ]
-    )
-    if observations.visibility is not None:
-        keys = np.column_stack([keys, _hidden_cells(observations.visibility)])
-    return _merged(observations, *groups(keys))
+    seen = observations
+    if degrees <= 0 or len(seen) == 0:
+        return seen
+    cell, mirror = np.radians(degrees), mirror_directions(seen.normal, seen.view)
+    flags = seen.clipped @ np.array([1, 2, 4])
+    cells = [direction_cells(seen.normal, cell), direction_cells(mirror, 2 * cell)]
+    if seen.visibility is not None:
+        cells.append(_hidden_cells(seen.visibility))
+    first, group = groups(np.column_stack([seen.photo, seen.material, flags, *cells]))
+    weight = np.maximum(seen.weight.astype(float), 1e-12)
+    total = np.bincount(group, weight)
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
+        """Weighted mean of each group."""
+        return np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
+
+    def unit(vectors: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
+        """The vectors at length 1, float32."""
+        return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype("f4")
+
+    changed = {"normal": unit(mean(seen.normal)), "view": unit(mean(seen.view))}
+    changed |= {"radiance": mean(seen.radiance).astype("f4"), "weight": total.astype("f4")}
+    if seen.visibility is not None:
+        changed["visibility"] = _mean_visibility(seen.visibility, weight / total[group], group)
+    if seen.confidence is not None:
+        changed["confidence"] = (np.bincount(group, weight * seen.confidence) / total).astype("f4")
+    return msgspec.structs.replace(seen.take(first), **changed)
 
 
 def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"]:
@@ -52,36 +63,6 @@ def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"
     mean = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
     hidden = [(255 - visibility[i : i + ROWS]).astype("f4") / 255 @ mean for i in range(0, len(visibility), ROWS)]
     return np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64)
-
-
-def _merged(observations: Observations, first: Int[np.ndarray, " g"], group: Int[np.ndarray, " n"]) -> Observations:
-    weight = np.maximum(observations.weight.astype(float), 1e-12)
-    total = np.bincount(group, weight)
-
-    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
-        """Weighted mean of each group."""
-        return np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
-
-    def unit(vectors: np.ndarray) -> np.ndarray:
-        """The vectors at length 1, float32."""
-        return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype("f4")
-
-    kept = observations.take(first)
-    return Observations(
-        normal=unit(mean(observations.normal)),
-        view=unit(mean(observations.view)),
-        radiance=mean(observations.radiance).astype("f4"),
-        weight=total.astype("f4"),
-        **{name: getattr(kept, name) for name in ("clipped", "material", "photo", "illumination", "x", "y")},
-        **{name: getattr(kept, name) for name in ("materials", "photos", "illuminations", "exposures")},
-        visibility=None
-        if observations.visibility is None
-        else _mean_visibility(observations.visibility, weight / total[group], group),
-        met=kept.met,
-        confidence=None
-        if observations.confidence is None
-        else (np.bincount(group, weight * observations.confidence) / total).astype("f4"),
-    )
 
 
 def _mean_visibility(

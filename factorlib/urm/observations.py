@@ -39,13 +39,8 @@ MET = (
 )
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
-    "units": {
-        "radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo",
-        "x": "pixels",
-        "y": "pixels",
-        "weight": "pixels",
-    },
-}
+    "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo"} | dict.fromkeys(("x", "y", "weight"), "pixels"),
+}  # fmt: skip
 
 
 class Observations(msgspec.Struct, frozen=True):
@@ -66,7 +61,7 @@ class Observations(msgspec.Struct, frozen=True):
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
     met: UInt16[np.ndarray, "n k"] | None = (
-        None  # codes of what hides directions (geometry.met); with `visibility` alone
+        None  # codes of what hides directions (geometry.met); not without `visibility`
     )
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
@@ -81,13 +76,17 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        further = {
-            name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in (*WIDE, *OPTIONAL)
-        }
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS}, **further)
+        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL)}
+        taken = {name: values[rows] for name, values in columns.items() if values is not None}
+        return msgspec.structs.replace(self, **taken)
 
 
 COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
+NAMES = {
+    "materials": "material",
+    "photos": "photo",
+    "illuminations": "illumination",
+}  # and the columns that number them
 OPTIONAL = ("confidence",)  # columns that need not be there
 WIDE = {"visibility": np.dtype("u1"), "met": np.dtype("<u2")}  # K values a row, where there are any
 NOTHING = {"visibility": 255, "met": UNMET}  # of observations that see everything
@@ -100,21 +99,18 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     columns = {}
     given = [name for name in OPTIONAL if getattr(observations, name) is not None]
     for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:], *given):
-        dtype = DTYPES.get(name, "f4")
-        values = np.ascontiguousarray(getattr(observations, name), dtype=dtype)
+        values = np.ascontiguousarray(getattr(observations, name), dtype=DTYPES.get(name, "f4"))
         flat = pa.array(values.reshape(-1))
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
-    names = {
-        "materials": observations.materials,
-        "photos": observations.photos,
-        "illuminations": observations.illuminations,
-    }
-    about = {**UNITS, **names}
+    about = {**UNITS, **{kind: getattr(observations, kind) for kind in NAMES}}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
     for name, meaning in (("visibility", VISIBILITY), ("met", MET)):
         if (values := getattr(observations, name)) is not None:
-            columns[name], about[name] = _bytes(values, WIDE[name]), meaning
+            data = pa.py_buffer(np.ascontiguousarray(values, dtype=WIDE[name]))
+            type_ = pa.binary(values.shape[1] * WIDE[name].itemsize)  # a row's values as one binary of fixed size
+            columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
+            about[name] = meaning
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
     with writing(path):
         pq.write_table(pa.table(columns, metadata=metadata), path, compression="zstd")
@@ -124,99 +120,66 @@ def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
     parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
-        columns = {
-            name: _array(parts[name], DTYPES[name], name in VECTORS) for name in (*COLUMNS, *OPTIONAL) if name in parts
-        }
+        narrow = [name for name in (*COLUMNS, *OPTIONAL) if name in parts]
+        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in narrow}
         columns |= {name: _of_bytes(parts[name], dtype) for name, dtype in WIDE.items() if name in parts}
-        named = {
-            kind: tuple(msgspec.convert(about[kind], list[str])) for kind in ("materials", "photos", "illuminations")
-        }
+        named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**columns, **named, exposures=exposures)
         _check(observations)
     return observations
 
 
-def _check(observations: Observations) -> None:
+def _check(seen: Observations) -> None:
     """Raise ValueError for a number that names nothing; what is not finite, or weighs nothing, the solve leaves out and counts."""
-    for name, known in (
-        ("material", observations.materials),
-        ("photo", observations.photos),
-        ("illumination", observations.illuminations),
-    ):
-        index = getattr(observations, name)
+    for kind, name in NAMES.items():
+        index, known = getattr(seen, name), getattr(seen, kind)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
-    if observations.exposures and len(observations.exposures) != len(observations.photos):
+    if seen.exposures and len(seen.exposures) != len(seen.photos):
         raise ValueError("its exposures are not one a photo")
-    if (
-        observations.confidence is not None
-        and not ((observations.confidence >= 0) & (observations.confidence <= 1)).all()
-    ):
+    if seen.confidence is not None and not ((seen.confidence >= 0) & (seen.confidence <= 1)).all():
         raise ValueError("column 'confidence' is not between 0 and 1")
-    if observations.met is not None:
-        if observations.visibility is None or observations.visibility.shape != observations.met.shape:
+    if seen.met is not None:
+        if seen.visibility is None or seen.visibility.shape != seen.met.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
-        known = observations.met[observations.met != UNMET]
-        if len(known) and known.max() >= BINS * len(observations.materials):
+        known = seen.met[seen.met != UNMET]
+        if len(known) and known.max() >= BINS * len(seen.materials):
             raise ValueError("column 'met' points beyond the names of the metadata")
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
     """All observations of `parts`, indices renumbered over the sorted union of names: the order of parts changes no index."""
-    parts = sorted(parts, key=lambda part: part.photos)
+    parts, cure = sorted(parts, key=lambda part: part.photos), "run the stage `urm` again for all photos"
     materials = parts[0].materials
     if any(part.materials != materials for part in parts):
-        raise InputError(
-            "reflectance maps of different material lists", cure="run the stage `urm` again for all photos"
-        )
-    names = {
-        kind: tuple(sorted({n for part in parts for n in getattr(part, kind)})) for kind in ("photos", "illuminations")
-    }
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+        raise InputError("reflectance maps of different material lists", cure=cure)
+    columns, names = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}, {}
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
-        renumbered = [_renumber(getattr(part, column), getattr(part, kind), names[kind]) for part in parts]
+        names[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))
+        numbers = [np.array([names[kind].index(name) for name in getattr(part, kind)], "i4") for part in parts]
+        own = [getattr(part, column) for part in parts]
+        renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
         columns[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    columns |= {name: _of_all(parts, name) for name in WIDE}
+    for name, dtype in WIDE.items():  # those without see everything
+        given = [getattr(part, name) for part in parts]
+        counts = {values.shape[1] for values in given if values is not None}
+        if len(counts) > 1:
+            raise InputError(f"reflectance maps whose {name} has {sorted(counts)} directions", cure=cure)
+        for k in counts:
+            everything = (np.full((len(part), k), NOTHING[name], dtype) for part in parts)
+            filled = [full if own is None else own for full, own in zip(everything, given, strict=True)]
+            columns[name] = np.concatenate(filled)
     if any(part.confidence is not None for part in parts):
-        columns["confidence"] = np.concatenate(
-            [np.ones(len(p), "f4") if p.confidence is None else p.confidence for p in parts]
-        )
-    return Observations(
-        **columns, materials=materials, **names, exposures=tuple(exposures.get(p) for p in names["photos"])
-    )
-
-
-def _of_all(parts: Sequence[Observations], name: str) -> np.ndarray | None:
-    """`visibility` or `met` of all parts; those without see everything."""
-    counts = {getattr(part, name).shape[1] for part in parts if getattr(part, name) is not None}
-    if len(counts) > 1:
-        raise InputError(
-            f"reflectance maps whose {name} has {sorted(counts)} directions",
-            cure="run the stage `urm` again for all photos",
-        )
-    if not counts:
-        return None
-    (k,) = counts
-    given = [getattr(part, name) for part in parts]
-    return np.concatenate(
-        [np.full((len(part), k), NOTHING[name], WIDE[name]) if own is None else own for part, own in zip(parts, given)]
-    )
-
-
-def _renumber(index: np.ndarray, old: Sequence[str], new: Sequence[str]) -> np.ndarray:
-    return np.array([new.index(name) for name in old], dtype="i4")[index] if len(old) else index
-
-
-def _bytes(values: np.ndarray, dtype: np.dtype) -> pa.Array:
-    """A row's values as one binary of fixed size."""
-    data = pa.py_buffer(np.ascontiguousarray(values, dtype=dtype))
-    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(values.shape[1] * dtype.itemsize), len(values), [None, data])
+        sure = [np.ones(len(part), "f4") if part.confidence is None else part.confidence for part in parts]
+        columns["confidence"] = np.concatenate(sure)
+    of_photos = tuple(exposures.get(photo) for photo in names["photos"])
+    return Observations(**columns, materials=materials, **names, exposures=of_photos)
 
 
 def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
-    """The inverse of `_bytes`; ValueError for bytes that are no whole values."""
+    """The rows' values, each row's in one binary; ValueError for bytes that are no whole values."""
     k, over = divmod(column.type.byte_width, dtype.itemsize)
     if over:
         raise ValueError(f"a binary of {column.type.byte_width} bytes holds no numbers of {dtype.itemsize}")

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball, ball_normals, light_of_lat_long
-from factorlib.generate.drawn import drawn_light, drawn_materials
+from factorlib.generate.lights import random_light, random_materials
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import Material, look
 from studies.core.case import NAMES
@@ -40,7 +40,7 @@ GRAZING = 0.15  # n·o below which no pixel is seen
 
 def materials_of(seed: int, about: dict[str, Material] = ABOUT) -> dict[str, Reflectance]:
     """The materials of a world by name."""
-    drawn = drawn_materials(np.random.default_rng([11, seed]), SPREAD, about)
+    drawn = random_materials(np.random.default_rng([11, seed]), SPREAD, about)
     return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
 
 
@@ -49,7 +49,7 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     rng = np.random.default_rng([12, seed, light])
     world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
     lamps = 1 + light % 2 if light else 0  # none: by day
-    found = drawn_light(lamps, world_from_camera, [], rng, rows, spp)
+    found = random_light(lamps, world_from_camera, [], rng, rows, spp)
     return (found / found.mean()).astype(np.float32)
 
 

@@ -36,10 +36,8 @@ def blob():
     """Smooth, without symmetry."""
     part = ball()
     x, y, z = part.vertices.T
-    part.vertices = (
-        part.vertices
-        * (1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3)[:, None]
-    )
+    radius = 1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3
+    part.vertices = part.vertices * radius[:, None]
     return mesh_of([part])
 
 
@@ -54,10 +52,8 @@ def chair(mirrored: bool = False, labels=(1, 1)):
 
 def dumbbell(labels=(1, 2)):
     """Mirror-symmetric in shape; only the labels tell one end from the other."""
-    return mesh_of(
-        [at(ball(0.6), -0.9, 0, 0), at(ball(0.6), 0.9, 0, 0), trimesh.creation.box((1.2, 0.3, 0.5))],
-        [*labels, labels[0]],
-    )
+    ends = [at(ball(0.6), -0.9, 0, 0), at(ball(0.6), 0.9, 0, 0)]
+    return mesh_of([*ends, trimesh.creation.box((1.2, 0.3, 0.5))], [*labels, labels[0]])
 
 
 def photo_of(
@@ -76,8 +72,10 @@ def true_silhouette(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
     return Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
 
 
-def normal_error_deg(caster: Caster, camera: Camera, pose: Pose, found_camera: Camera, found_pose: Pose) -> float:
-    """Median over the true silhouette; a pixel that the found pose misses counts as 180°."""
-    truth, found = rasterise(caster, camera, pose), rasterise(caster, found_camera, found_pose)
+def normal_error_deg(
+    caster: Caster, camera: Camera, pose: Pose, found_camera: Camera, found_pose: Pose, given: Caster | None = None
+) -> float:
+    """Median over the true silhouette; a pixel that the mesh given misses in the pose found counts as 180°."""
+    truth, found = rasterise(caster, camera, pose), rasterise(given or caster, found_camera, found_pose)
     angle = np.rad2deg(np.arccos(np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)))
     return float(np.median(np.where(found.label > 0, angle, 180.0)[truth.label > 0]))

@@ -23,48 +23,41 @@ from factorlib.geometry.raster import rasterise
 from tests.align.scenes import at, ball, chair, dumbbell, mesh_of, photo_of, true_silhouette
 
 
-def channels(label, left_out=None, owner=None):
-    label = np.array(label, float)
-    zero = np.zeros(label.shape)
-    return {
-        "label": label,
-        "left_out": zero if left_out is None else np.array(left_out),
-        "object": zero if owner is None else np.array(owner),
+def label_of(number, labels, own_mask, label, owner=None, left_out=None):
+    """What the masks say of an object, or of the whole photo (number 0), in one row of pixels."""
+    row = {
+        name: np.array([x if x else [0] * len(label)], float) for name, x in (("object", owner), ("left_out", left_out))
     }
+    row["label"] = np.array([label], float)
+    silhouette = silhouette_of_object(row, number, labels, own_mask) if number else silhouette_of_photo(row)
+    return silhouette.label[0].tolist()
 
 
-def test_left_out_is_unknown():
-    assert silhouette_of_photo(channels([[0, 1, 0]], left_out=[[0, 0, 1]])).label.tolist() == [[0, 1, UNKNOWN]]
-
-
-def test_foreign_materials_may_hide_an_object():
-    assert silhouette_of_object(channels([[0, 1, 2, 3]]), 1, (1, 3), False).label.tolist() == [[0, 1, UNKNOWN, 3]]
-
-
-def test_own_masks_part_objects_of_one_material():
-    given = channels([[0, 1, 1, 1]], owner=[[0, 1, 2, 0]])
-    assert silhouette_of_object(given, 1, (1,), True).label.tolist() == [[0, 1, UNKNOWN, UNKNOWN]]
-    assert silhouette_of_object(given, 2, (1,), False).label.tolist() == [[0, UNKNOWN, 1, 1]]
+@pytest.mark.parametrize(
+    "of, expected",
+    [
+        ((0, (), False, [0, 1, 0], None, [0, 0, 1]), [0, 1, UNKNOWN]),  # what is left out
+        ((1, (1, 3), False, [0, 1, 2, 3]), [0, 1, UNKNOWN, 3]),  # foreign materials may hide an object
+        (
+            (1, (1,), True, [0, 1, 1, 1], [0, 1, 2, 0]),
+            [0, 1, UNKNOWN, UNKNOWN],
+        ),  # own masks part objects of one material
+        ((2, (1,), False, [0, 1, 1, 1], [0, 1, 2, 0]), [0, UNKNOWN, 1, 1]),
+    ],
+)
+def test_what_masks_say_of_an_object(of, expected):
+    assert label_of(*of) == expected
 
 
 def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
     caster, camera, pose = photo_of(dumbbell(), 3)
-    silhouette = true_silhouette(caster, camera, pose)
-    mesh_label = rasterise(caster, camera, pose).label
+    silhouette, mesh_label = true_silhouette(caster, camera, pose), rasterise(caster, camera, pose).label
     label = silhouette.label.copy()
     label[:, 150:] = UNKNOWN
     for known in (silhouette, Silhouette(label)):
-        assert (
-            silhouette_iou(known, mesh_label)
-            == label_agreement(known, mesh_label)
-            == labelled_iou(known, mesh_label)
-            == 1
-        )
+        assert [of(known, mesh_label) for of in (silhouette_iou, label_agreement, labelled_iou)] == [1, 1, 1]
     swapped = np.where(mesh_label > 0, 3 - mesh_label, 0)
-    assert (
-        silhouette_iou(silhouette, swapped) == 1
-        and label_agreement(silhouette, swapped) == labelled_iou(silhouette, swapped) == 0
-    )
+    assert [of(silhouette, swapped) for of in (silhouette_iou, label_agreement, labelled_iou)] == [1, 0, 0]
 
 
 def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
@@ -108,47 +101,40 @@ def test_confidence_grows_from_contour_inward_and_is_zero_where_labels_differ():
     assert confidence(maps, Silhouette(wrong))[row, column] == 0
 
 
+def seen(mesh, seed, **photo):
+    """The maps of a photo of the mesh, and the confidence in them."""
+    maps = rasterise(*photo_of(mesh, seed, **photo))
+    return maps, confidence(maps, Silhouette(maps.label.astype(np.int16)))
+
+
 def test_confidence_falls_at_depth_jumps():
-    front, behind = at(ball(0.5), 0, 0, -2.0), ball()
-    caster, camera, pose = photo_of(mesh_of([front, behind]), 6)
-    pose = type(pose)(np.eye(3), np.array([0, 0, pose.translation[2]]))
-    maps = rasterise(caster, camera, pose)
+    caster, camera, pose = photo_of(mesh_of([at(ball(0.5), 0, 0, -2.0), ball()]), 6)
+    maps = rasterise(caster, camera, type(pose)(np.eye(3), np.array([0, 0, pose.translation[2]])))
     sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
-    jump = np.abs(np.diff(maps.depth, axis=1))[:, :] > 0.3
-    inner = jump & (maps.label[:, 1:] > 0) & (maps.label[:, :-1] > 0)
+    inner = (np.abs(np.diff(maps.depth, axis=1)) > 0.3) & (maps.label[:, 1:] > 0) & (maps.label[:, :-1] > 0)
     assert inner.sum() > 20 and sure[:, 1:][inner].max() == 0
 
 
-def middle_confidence(part, **photo):
-    caster, camera, pose = photo_of(mesh_of([part], crease_deg=photo.pop("crease_deg", 40.0)), 3, **photo)
-    maps = rasterise(caster, camera, pose)
-    sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
-    return float(np.median(sure[maps.edge > 0.7]))
-
-
 def test_normals_of_a_coarse_round_mesh_are_believed_less_than_those_of_a_fine_one_or_of_flat_faces():
-    finer = [middle_confidence(ball(subdivisions=n), crease_deg=180.0) for n in range(4)]
-    assert finer == sorted(finer) and finer[0] < 0.1 and finer[3] > 0.8
-    assert middle_confidence(trimesh.creation.box()) == 1.0
+    balls = [mesh_of([ball(subdivisions=n)], crease_deg=180.0) for n in range(4)]
+    seen_each = [seen(mesh, 3) for mesh in (*balls, mesh_of([trimesh.creation.box()]))]
+    *finer, flat = [float(np.median(sure[maps.edge > 0.7])) for maps, sure in seen_each]
+    assert finer == sorted(finer) and finer[0] < 0.1 and finer[3] > 0.8 and flat == 1.0
 
 
 @pytest.mark.parametrize("height", [30, 60, 240])
 def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(height):
-    caster, camera, pose = photo_of(
-        mesh_of([ball(subdivisions=5)], crease_deg=180.0), 3, width=2 * height, height=height, focal=40.0
-    )
-    maps = rasterise(caster, camera, pose)
+    fine = mesh_of([ball(subdivisions=5)], crease_deg=180.0)
+    maps, sure = seen(fine, 3, width=2 * height, height=height, focal=40.0)
     middle, radius = (height // 2, height), 0.75 * height / 2  # pixels
     expected = np.sqrt(4 / 3) / radius  # of n = (x, y) / radius over 3 × 3 pixels
     assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
     believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
-    assert confidence(maps, Silhouette(maps.label.astype(np.int16)))[middle] == pytest.approx(believed, rel=0.02)
+    assert sure[middle] == pytest.approx(believed, rel=0.02)
 
 
 def test_a_small_smooth_object_keeps_its_slanted_normals():
-    caster, camera, pose = photo_of(mesh_of([ball()]), 6, width=80, height=60)
-    maps = rasterise(caster, camera, pose)
-    sure = confidence(maps, Silhouette(maps.label.astype(np.int16)))
+    maps, sure = seen(mesh_of([ball()]), 6, width=80, height=60)
     slanted = (maps.edge > 0.35) & (maps.edge < 0.7)
     assert slanted.sum() > 50 and (sure[slanted] > 0).mean() > 0.95
 

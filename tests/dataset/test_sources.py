@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.external_camera import focal_and_centre
+from factorlib.align.given import focal_and_centre
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import CameraSource, DatasetFile, ExternalCamera, PhotoEntry
 from factorlib.dataset.slices import dataset_slice

@@ -25,9 +25,7 @@ def moved_by_shading(seed, monkeypatch):
     silhouette, prior = Silhouette(np.where(about, UNKNOWN, label)), FocalPrior(photo.camera.focal, 0.0)
     view = View(pixels_of(photo.channels, [True] * 3, 2400), [photo.given], [True])
     surfaces = Surfaces(TRUE, OPERATOR)
-    moving = descent.moving_object(
-        descent.Photographed(view, 0, photo.camera, silhouette, prior), [photo.pose], surfaces
-    )
+    moving = descent.moving_object(view, 0, photo.camera, silhouette, prior, [photo.pose], surfaces)
     start, true = (state_of(pose, photo.camera, photo.given) for pose in (photo.pose, photo.truth))
     block, agrees = moving.block(true, None)
     light = pursued_light(block.take(agrees), surfaces)
