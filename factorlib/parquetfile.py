@@ -36,12 +36,15 @@ def read_columns(
     """
     check_plain(path, what, most_bytes=None)
     with reading(what, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
+        schema = file.schema_arrow
         if file.metadata.num_rows > most_rows:
             raise ValueError(f"{file.metadata.num_rows:,} rows, more than {most_rows:,}")
-        schema = file.schema_arrow
         names = [*needed, *(name for name in optional if name in schema.names)]
         for name in names:
-            _check_type(name, schema)
+            if schema.names.count(name) != 1:
+                raise ValueError(f"it has {schema.names.count(name)} columns {name!r}")
+            if not _is_readable(kind := schema.field(name).type):
+                raise ValueError(f"column {name!r} is of type {kind}")
         table = file.read(columns=names)
         columns = {name: table[name].combine_chunks() for name in names}
         for name, column in columns.items():
@@ -55,26 +58,18 @@ def read_columns(
 
 
 def write_rows(path: str | Path, type_: type[msgspec.Struct], rows: Sequence[msgspec.Struct]) -> None:
-    """A column for each field of the rows, which are structs of `type_`."""
+    """Write a column for each field of the rows, which are structs of `type_`."""
     columns = {name: [getattr(row, name) for row in rows] for name in type_.__struct_fields__}
     with writing(path):
         pq.write_table(pa.table(columns), path, compression="zstd")
 
 
-def _check_type(name: str, schema: pa.Schema) -> None:
-    """Numbers, text, bytes, or short lists of numbers."""
-    if schema.names.count(name) != 1:
-        raise ValueError(f"it has {schema.names.count(name)} columns {name!r}")
-    kind = schema.field(name).type
+def _is_readable(kind: pa.DataType) -> bool:
+    """Whether a column holds numbers, text, bytes of a fixed length, or lists of three numbers."""
     if pa.types.is_fixed_size_list(kind):
-        good = kind.list_size == 3 and _is_number(kind.value_type)
-    elif pa.types.is_fixed_size_binary(kind):
-        good = 0 < kind.byte_width <= MOST_BYTES
-    else:
-        good = _is_number(kind) or pa.types.is_string(kind)
-    if not good:
-        raise ValueError(f"column {name!r} is of type {kind}")
-
-
-def _is_number(kind: pa.DataType) -> bool:
-    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+        return kind.list_size == 3 and _is_readable(kind.value_type) and not pa.types.is_string(kind.value_type)
+    if pa.types.is_fixed_size_binary(kind):
+        return 0 < kind.byte_width <= MOST_BYTES
+    return any(
+        test(kind) for test in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_string)
+    )

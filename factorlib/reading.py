@@ -1,7 +1,5 @@
 """The boundary of every reader of a user's files: whatever goes wrong within becomes an InputError with file, key and cure.
 
-A parser raises whatever its authors thought of.  Here that is said once, in three layers:
-
     with reading("a mesh", path, key):          # around the calls of a parser, and only those: what it raises is the
         scene = trimesh.load_scene(path)        #   file's fault; FAILURES names the families
     content = read_bytes(path, "a mesh", key)   # the whole of a plain file that is not too large; never a pipe or a device
@@ -26,38 +24,23 @@ import msgspec
 from factorlib.errors import InputError
 
 FAILURES = (
-    OSError,  # also PIL.UnidentifiedImageError
-    ValueError,  # also UnicodeError, json.JSONDecodeError, pyarrow.ArrowInvalid
-    ArithmeticError,  # a division by zero, a number too large
-    LookupError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    RuntimeError,  # also RecursionError, a loop of links in pathlib
-    MemoryError,
-    EOFError,
-    SyntaxError,  # Pillow's word for a damaged PNG
-    BufferError,
-    ImportError,  # a parser that asks for a package only for odd files
-    struct.error,
-    zlib.error,
-    msgspec.MsgspecError,
+    # OSError has PIL.UnidentifiedImageError, ValueError UnicodeError and pyarrow.ArrowInvalid, RuntimeError RecursionError;
+    # SyntaxError is Pillow's word for a damaged PNG, ImportError for a package that a parser wants for odd files only
+    *(OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, RuntimeError),
+    *(MemoryError, EOFError, SyntaxError, BufferError, ImportError, struct.error, zlib.error, msgspec.MsgspecError),
 )
 COPY_AGAIN = "is it whole, and of the kind its suffix says? copy it again from where it came"
 MOST_BYTES = 1 << 30  # of a file that is read as a whole
 MOST_WORDS = 200  # characters of a parser's message
-KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
+         stat.S_IFBLK: "a device"}  # fmt: skip
+NO_RIGHT = "give yourself the right to read it, and to enter the folders above it (chmod u+rX)"
+NOT_THERE = "put it there, or correct the path"
 CURES = {
-    errno.EACCES: "give yourself the right to read it, and to enter the folders above it (chmod u+rX)",
-    errno.EPERM: "give yourself the right to read it, and to enter the folders above it (chmod u+rX)",
-    errno.ENOENT: "put it there, or correct the path",
-    errno.ENOTDIR: "put it there, or correct the path",
+    errno.EACCES: NO_RIGHT,
+    errno.EPERM: NO_RIGHT,
+    errno.ENOENT: NOT_THERE,
+    errno.ENOTDIR: NOT_THERE,
     errno.ELOOP: "its symbolic links lead in a circle: replace one by the file itself",
     errno.ENAMETOOLONG: "a name in it is longer than file systems allow (255 bytes): shorten it",
     errno.EIO: "the disk does not give it back: copy it from elsewhere",
@@ -82,15 +65,16 @@ def reading(
     except InputError:
         raise
     except (*FAILURES, *also) as error:
-        raise InputError(found_in(error, what), file=file, key=key, cure=cure_of(error, cure)) from error
+        cure = CURES.get(error.errno, cure) if isinstance(error, OSError) else cure
+        raise InputError(_fault(error, what), file=file, key=key, cure=cure) from error
 
 
-def found_in(error: BaseException, what: str) -> str:
+def _fault(error: BaseException, what: str) -> str:
     """What went wrong, in one line.
 
-    >>> found_in(PermissionError(13, "Permission denied"), "a mesh")
+    >>> _fault(PermissionError(13, "Permission denied"), "a mesh")
     'cannot be read (Permission denied)'
-    >>> found_in(IndexError("list index out of range"), "a mesh")
+    >>> _fault(IndexError("list index out of range"), "a mesh")
     'not readable as a mesh (IndexError: list index out of range)'
     """
     if isinstance(error, RecursionError):
@@ -100,16 +84,11 @@ def found_in(error: BaseException, what: str) -> str:
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
     words = one_line(str(error))
-    needs_type = (
-        isinstance(error, (LookupError, TypeError, AttributeError, AssertionError)) or not words
-    )  # says little without its name
-    said = ": ".join(part for part in (type(error).__name__ if needs_type else "", words) if part)
-    return f"not readable as {what} ({said})"
-
-
-def cure_of(error: BaseException, otherwise: str) -> str:
-    """The cure for an OSError of a known kind; `otherwise` for any other error."""
-    return CURES.get(error.errno, otherwise) if isinstance(error, OSError) and error.errno is not None else otherwise
+    if not words or isinstance(
+        error, (LookupError, TypeError, AttributeError, AssertionError)
+    ):  # says little by itself
+        words = ": ".join(filter(None, (type(error).__name__, words)))
+    return f"not readable as {what} ({words})"
 
 
 def one_line(text: str) -> str:
@@ -122,9 +101,6 @@ def one_line(text: str) -> str:
     return flat if len(flat) <= MOST_WORDS else flat[: MOST_WORDS - 1] + "…"
 
 
-# ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
     """The size in bytes of a plain file, links followed, that can be opened; nothing of it is read.
 
@@ -132,18 +108,16 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
     and for a file of more than `most_bytes`; None: of any size.
     """
     with reading(what, file, key):
-        found = os.stat(file)
-        if not stat.S_ISREG(found.st_mode):
-            kind = next((name for test, name in KINDS if test(found.st_mode)), "no plain file")
-            raise InputError(
-                f"is {kind}, not a file", file=file, key=key, cure=f"put {what} there, or correct the path"
-            )
+        status = os.stat(file)
+        if not stat.S_ISREG(status.st_mode):
+            fault = f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'no plain file')}, not a file"
+            raise InputError(fault, file=file, key=key, cure=f"put {what} there, or correct the path")
         if not os.access(file, os.R_OK, effective_ids=os.access in os.supports_effective_ids):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    if most_bytes is not None and found.st_size > most_bytes:
-        words = f"has {megabytes(found.st_size)}; {what} has {megabytes(most_bytes)} at most"
-        raise InputError(words, file=file, key=key, cure="is it the right file?")
-    return found.st_size
+    if most_bytes is not None and status.st_size > most_bytes:
+        fault = f"has {status.st_size / 1e6:,.1f} MB; {what} has {most_bytes / 1e6:,.1f} MB at most"
+        raise InputError(fault, file=file, key=key, cure="is it the right file?")
+    return status.st_size
 
 
 def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
@@ -154,23 +128,12 @@ def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_
 
 
 def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:
-    """The same as UTF-8 text, without a byte order mark."""
+    """The content as UTF-8 text, without a byte order mark; InputError as in `check_plain`, and for other text."""
     content = read_bytes(file, what, key, most_bytes)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"not UTF-8 text (byte {error.start})", file=file, key=key, cure="save it as UTF-8") from error
-
-
-def megabytes(count: int) -> str:
-    """
-    >>> megabytes(12_345_678_000)
-    '12,345.7 MB'
-    """
-    return f"{count / 1e6:,.1f} MB"
-
-
-# ── paths ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def path_inside(folder: str | os.PathLike, path: str) -> Path:
@@ -179,17 +142,14 @@ def path_inside(folder: str | os.PathLike, path: str) -> Path:
     Raises ValueError, whose words say what is wrong with it, for a path that leads outside the folder (links followed), an
     absolute or empty one, and one that no file system can follow: with a NUL, a name of over 255 bytes, or links in a circle.
     """
-    if not path or Path(path).is_absolute():
-        raise ValueError("leads outside the dataset")
     target = Path(folder) / path
     try:
         where = target.resolve()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # for whoever opens it to say
             os.stat(target)
     except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"is no path that can be followed ({one_line(getattr(error, 'strerror', None) or str(error))})"
-        ) from error
-    if not where.is_relative_to(Path(folder).resolve()):
+        words = one_line(getattr(error, "strerror", None) or str(error))
+        raise ValueError(f"is no path that can be followed ({words})") from error
+    if not path or Path(path).is_absolute() or not where.is_relative_to(Path(folder).resolve()):
         raise ValueError("leads outside the dataset")
     return target

@@ -1,7 +1,7 @@
 """A contact sheet of a dataset, to be looked at before anything is solved: each photo, its labels, and the meshes in the labels' colours.
 
 A row for each photo: the photo; the same in grey, materials in their colours and what is left out hatched; each object's mesh as it lies
-in its file, seen from the +z side with +y up, its parts in the colours of their materials in this photo.
+in its file, from the +z side with +y up, its parts in the colours of their materials in this photo.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import Dataset, ObjectEntry, PhotoEntry
+from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.palette import nearest_tags, rgb_of
@@ -31,7 +31,7 @@ SIDE, MESH_SIDE, MARGIN, HEAD = (
     240,
     12,
     18,
-)  # pixels of a photo's longer side, of a mesh, between pictures, and of a line of text
+)  # pixels: a photo's longer side, a mesh, between pictures, a line of text
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 DISTANCE = 6.0  # of the camera from a mesh, in its radii
 HATCH = 8  # pixels from line to line
@@ -42,34 +42,34 @@ Pixels = UInt8[np.ndarray, "h w 3"]
 def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
     """The sheet of the dataset in `folder` as a PNG; report: how many pieces are done of how many, two a photo."""
     dataset = read_dataset(folder)
-    photos, pictures = dataset.spec.photos, []
+    photos, materials, pictures = dataset.spec.photos, dataset.spec.materials, []
     for done, photo in enumerate(photos):
         report(done, 2 * len(photos))
         pictures.append(_photo(dataset, photo))
-    colours = _colours(dataset.spec.materials, pictures)
-    rows = [_legend(dataset.spec.materials, colours)]
+    colours, rows = _colours(materials, pictures), []
     for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
         report(len(photos) + done, 2 * len(photos))
         named = [(photo.name, image), ("labels", _coloured(image, labels, colours))]
-        named += [(obj.name, drawn(_mesh(dataset, obj), colours)) for obj in photo.objects]
-        rows.append(_beside([_titled(title, pixels) for title, pixels in named]))
-    write_bytes(path, png_bytes(np.concatenate(_of_one_width(rows))))
+        for obj in photo.objects:
+            entry = dataset.spec.meshes[obj.mesh]
+            mesh = read_mesh(dataset.folder / entry.file, materials, entry.made_of, obj.materials)
+            named.append((obj.name, drawn(mesh, colours)))
+        titled = [np.concatenate([_text(title, each.shape[1]), each]) for title, each in named]
+        tall = max(len(each) for each in titled) + MARGIN
+        rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
+    rows.insert(0, legend(materials, colours, max(row.shape[1] for row in rows)))
+    wide = max(row.shape[1] for row in rows)
+    write_bytes(path, png_bytes(np.concatenate([_padded(row, len(row), wide) for row in rows])))
 
 
 def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
     """Both averaged down, or every so many pixels taken."""
     key, path = f"photos[{photo.name}]", dataset.folder / photo.image
     stored = open_photo(path, f"{key}.image")
-    factor = max(1, -(-max(stored.size) // SIDE))
+    factor, materials = max(1, -(-max(stored.size) // SIDE)), dataset.spec.materials
     image = picture(decoded(stored, photo.encoding, factor, path).radiance, 1.0)
-    labels = read_labels(
-        photo.masks,
-        lambda name: dataset.folder / name,
-        dataset.spec.materials,
-        stored.size,
-        photo.image,
-        f"{key}.masks",
-    )
+    file = lambda name: dataset.folder / name  # noqa: E731
+    labels = read_labels(photo.masks, file, materials, stored.size, photo.image, f"{key}.masks")
     height, width = image.shape[:2]
     fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
     return image, Labels(labels.label[fewer], labels.left_out[fewer])
@@ -77,16 +77,11 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
 
 def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) -> Pixels:
     grey = np.repeat((0.3 * image.mean(axis=-1, keepdims=True) + 150).astype(np.uint8), 3, axis=-1)
-    tint = colours[labels.label]
-    shown = np.where(labels.label[..., None] > 0, (0.75 * tint + 0.25 * image).astype(np.uint8), grey)
+    tinted = (0.75 * colours[labels.label] + 0.25 * image).astype(np.uint8)
+    pixels = np.where(labels.label[..., None] > 0, tinted, grey)
     row, column = np.indices(labels.label.shape)
-    shown[labels.left_out & ((row + column) % HATCH < HATCH // 4)] = 0
-    return shown
-
-
-def _mesh(dataset: Dataset, obj: ObjectEntry) -> Mesh:
-    entry = dataset.spec.meshes[obj.mesh]
-    return read_mesh(dataset.folder / entry.file, dataset.spec.materials, entry.made_of, obj.materials)
+    pixels[labels.left_out & ((row + column) % HATCH < HATCH // 4)] = 0
+    return pixels
 
 
 def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
@@ -94,55 +89,42 @@ def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
     camera = Camera(MESH_SIDE, MESH_SIDE, MESH_SIDE * DISTANCE / 2.2, (MESH_SIDE / 2, MESH_SIDE / 2))
     rotation = np.diag([1.0, -1.0, -1.0])
     maps = rasterise(mesh, camera, Pose(rotation, np.array([0, 0, DISTANCE * mesh.radius]) - rotation @ mesh.centre))
-    colours = by_label[maps.label].astype(float)
     facing = np.clip(np.einsum("hwc,hwc->hw", maps.normal, maps.view), 0, 1)[..., None]
-    return np.where(maps.label[..., None] > 0, colours * (0.35 + 0.65 * facing), 255).astype(np.uint8)
+    shaded = by_label[maps.label].astype(float) * (0.35 + 0.65 * facing)
+    return np.where(maps.label[..., None] > 0, shaded, 255).astype(np.uint8)
 
 
 def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[np.ndarray, "k 3"]:
     """By label, distinct and near to what the photos show there; row 0 is the background's."""
-    pixels, labels = (
-        np.concatenate(parts) for parts in zip(*((i.reshape(-1, 3), p.label.ravel()) for i, p in pictures), strict=True)
-    )
-    mean = [
-        pixels[labels == k].mean(axis=0) / 255 if (labels == k).any() else np.full(3, 0.5)
-        for k in range(1, len(names) + 1)
-    ]
+    pixels = np.concatenate([image.reshape(-1, 3) for image, _ in pictures])
+    labels = np.concatenate([labels.label.ravel() for _, labels in pictures])
+    own = [pixels[labels == k] for k in range(1, len(names) + 1)]
+    mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in own]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
     return np.array([PAPER, *(rgb_of(tags[name]) for name in names)], np.uint8)
 
 
-def _legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
-    """The materials and their colours."""
-    colours = by_label[1:]
-    width = sum(_width(name) + HEAD + 2 * MARGIN for name in names) + MARGIN
-    sheet = Image.new("RGB", (width, HEAD + 2 * MARGIN), PAPER)
-    pen, x = ImageDraw.Draw(sheet), MARGIN
-    for k, name in enumerate(names):
-        pen.rectangle((x, MARGIN, x + HEAD - 4, MARGIN + HEAD - 4), fill=tuple(int(c) for c in colours[k]), outline=INK)
-        pen.text((x + HEAD, MARGIN), name, fill=INK)
-        x += _width(name) + HEAD + 2 * MARGIN
+def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> Pixels:
+    """The materials and their colours, in as many lines of `width` pixels as they need; a longer name widens its own."""
+    pen, places, x, line = ImageDraw.Draw(Image.new("RGB", (1, 1))), [], MARGIN, 0
+    for name in names:
+        own = int(pen.textlength(name)) + 1 + HEAD + 2 * MARGIN
+        if x > MARGIN and x + own > width:
+            x, line = MARGIN, line + 1
+        places.append((x, MARGIN + line * HEAD, own))
+        x += own
+    sheet = Image.new("RGB", (max(x + own for x, _, own in places), (line + 1) * HEAD + 2 * MARGIN), PAPER)
+    pen = ImageDraw.Draw(sheet)
+    for name, colour, (x, y, _) in zip(names, by_label[1:].tolist(), places):
+        pen.rectangle((x, y, x + HEAD - 4, y + HEAD - 4), fill=tuple(colour), outline=INK)
+        pen.text((x + HEAD, y), name, fill=INK)
     return np.asarray(sheet)
 
 
-def _width(text: str) -> int:
-    return int(ImageDraw.Draw(Image.new("RGB", (1, 1))).textlength(text)) + 1
-
-
-def _titled(title: str, pixels: Pixels) -> Pixels:
-    head = Image.new("RGB", (pixels.shape[1], HEAD), PAPER)
+def _text(title: str, width: int) -> Pixels:
+    head = Image.new("RGB", (width, HEAD), PAPER)
     ImageDraw.Draw(head).text((0, 2), title, fill=INK)
-    return np.concatenate([np.asarray(head), pixels])
-
-
-def _beside(pictures: list[Pixels]) -> Pixels:
-    tall = max(len(each) for each in pictures) + MARGIN
-    return np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in pictures], axis=1)
-
-
-def _of_one_width(rows: list[Pixels]) -> list[Pixels]:
-    wide = max(row.shape[1] for row in rows)
-    return [_padded(row, len(row), wide) for row in rows]
+    return np.asarray(head)
 
 
 def _padded(pixels: Pixels, height: int, width: int) -> Pixels:

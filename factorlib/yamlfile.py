@@ -1,8 +1,8 @@
 """YAML files as typed structs: scalars as in YAML 1.2, no key twice or unknown, every complaint with file, line and key.
 
-PyYAML reads `1e-3` as a string and `no` as False, and lets a duplicate key win silently, so only its events are used.  The
-value is built from them as they come: what is nested without end, grows without end through aliases, or is merely huge is
-refused when it passes a limit, not when memory or the stack is full.  msgspec converts the value to its type.
+PyYAML reads `1e-3` as a string and `no` as False, and lets a duplicate key win silently, so only its events are used.  What is
+nested without end, grows without end through aliases, or is merely huge is refused when it passes a limit, not when memory or
+the stack is full.  msgspec converts the value to its type, whose `Meta` says what a number or a name may be and how to mend it.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin
 
 import msgspec
 import yaml
-from msgspec import inspect
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import one_line, read_text
@@ -27,10 +27,11 @@ _CORE = re.compile(  # YAML 1.2.2, section 10.3.2
     r"|(?P<float>[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
 )
 _Parser = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
 
 
 class Limits(msgspec.Struct, frozen=True):
-    """What a file may hold, far above a dataset of ten thousand photos.
+    """The most that a file may hold, far above a dataset of ten thousand photos.
 
     values: scalars, lists and maps, those that aliases repeat counted each time;  depth: of lists and maps in each other
     """
@@ -51,7 +52,7 @@ def read_yaml(path: str | Path, type_: type[T], limits: Limits = LIMITS) -> T:
 
 
 def load_yaml(path: str | Path) -> Any:
-    """The file as dicts, lists and scalars."""
+    """The file as dicts, lists and scalars; InputError with file, line, key and cure for what is not YAML."""
     return parse_yaml(_text_of(path, LIMITS), path)
 
 
@@ -69,121 +70,88 @@ def parse_yaml(text: str, name: str | Path = "", limits: Limits = LIMITS) -> Any
 
 
 class _Document:
-    """One pass over the events of a text.  sought: the keys whose line is looked for."""
+    """One pass over the events of a text, which builds its value and counts it."""
 
-    def __init__(self, text: str, path: str | Path, limits: Limits, sought: Keys = ()):
-        self.path, self.limits, self.sought, self.line = path, limits, sought, 1
-        self.count, self.anchors, self.open = 0, {}, set()
-        self.events = self._events(text)
-
-    def _events(self, text: str) -> Iterator[yaml.Event]:
-        try:
-            parser = _Parser(text)
-            try:
-                while parser.check_event():
-                    yield parser.get_event()
-            finally:
-                parser.dispose()
-        except yaml.YAMLError as error:
-            mark, context = getattr(error, "problem_mark", None), getattr(error, "context", None)
-            words = " ".join(
-                one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part
-            )
-            file = f"{self.path}:{mark.line + 1}" if mark else self.path
-            cure = "look for a bracket, quote, colon or indent on or above this line"
-            raise InputError(f"not YAML: {words}", file=file, cure=cure) from error
+    def __init__(self, text: str, name: str | Path, limits: Limits):
+        self.name, self.limits, self.events = name, limits, _events(text, name)
+        self.count, self.anchors, self.unfinished = 0, {}, set()
 
     def value(self) -> Any:
         """The value of the one document in the text, None for an empty text.  InputError where there is a second."""
         next(self.events)  # the stream
         if isinstance(next(self.events), yaml.StreamEndEvent):
             return None
-        first = next(self.events)
-        self._note((), first)
-        value = self._node(first, ())
+        value = self._node(next(self.events), ())
         next(self.events)  # the document's end
         if not isinstance(after := next(self.events), yaml.StreamEndEvent):
             self._refuse("there is a second document", after, (), "delete it, and the --- before it")
         return value
 
-    def _note(self, keys: Keys, event: yaml.Event) -> None:
-        if self.sought[: len(keys)] == keys:
-            self.line = event.start_mark.line + 1
-
     def _node(self, event: yaml.Event, keys: Keys) -> Any:
         if isinstance(event, yaml.AliasEvent):
-            return self._repeated(self._anchored(event, keys), event, keys)
-        self._spend(event, keys)
-        self.open.add(event.anchor)
+            if event.anchor in self.unfinished:
+                self._refuse("an alias that contains itself", event, keys, "write the value out")
+            if event.anchor not in self.anchors:
+                cure = "correct its name, or write the value out"
+                self._refuse(f"there is no &{event.anchor} above this alias", event, keys, cure)
+            return self._copy(self.anchors[event.anchor], event, keys, 0)
+        self._count(event, keys, 0)
+        self.unfinished.add(event.anchor)
         if isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event, keys)
+        elif isinstance(event, yaml.SequenceStartEvent):
+            self._check_tag(event, keys, "seq")
+            value = []
+            while not isinstance(item := next(self.events), yaml.SequenceEndEvent):
+                value.append(self._node(item, (*keys, len(value))))
         else:
-            value = (self._list if isinstance(event, yaml.SequenceStartEvent) else self._map)(event, keys)
-        self.open.discard(event.anchor)
+            value = self._map(event, keys)
+        self.unfinished.discard(event.anchor)
         self.anchors[event.anchor] = value
         return value
 
-    def _list(self, start: yaml.Event, keys: Keys) -> list:
-        self._check_tag(start, keys, "seq")
-        values: list = []
-        while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
-            self._note((*keys, len(values)), event)
-            values.append(self._node(event, (*keys, len(values))))
-        return values
-
     def _map(self, start: yaml.Event, keys: Keys) -> dict[str, Any]:
         self._check_tag(start, keys, "map")
-        values: dict[str, Any] = {}
-        lines: dict[str, int] = {}
+        values, lines = {}, {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 self._refuse("a key that is not a word", event, keys, "write key: value")
             key = event.value
             if key in values:
-                words = f"the key {one_line(repr(key))} stands here twice, first on line {lines[key]}"
-                self._refuse(words, event, (*keys, key), "delete or rename one of them")
+                fault = f"the key {one_line(repr(key))} stands here twice, first on line {lines[key]}"
+                self._refuse(fault, event, (*keys, key), "delete or rename one of them")
             lines[key] = event.start_mark.line + 1
-            self._note((*keys, key), event)
             values[key] = self._node(next(self.events), (*keys, key))
         return values
 
-    def _anchored(self, event: yaml.AliasEvent, keys: Keys) -> Any:
-        if event.anchor in self.open:
-            self._refuse("an alias that contains itself", event, keys, "write the value out")
-        if event.anchor not in self.anchors:
-            cure = "correct its name, or write the value out"
-            self._refuse(f"there is no &{event.anchor} above this alias", event, keys, cure)
-        return self.anchors[event.anchor]
-
-    def _repeated(self, value: Any, event: yaml.Event, keys: Keys, depth: int = 0) -> Any:
-        """A copy, each value of which counts."""
-        self._spend(event, keys, depth)
+    def _copy(self, value: Any, event: yaml.Event, keys: Keys, depth: int) -> Any:
+        """A copy of what an alias repeats, each value of which counts."""
+        self._count(event, keys, depth)
         if isinstance(value, list):
-            return [self._repeated(item, event, keys, depth + 1) for item in value]
+            return [self._copy(item, event, keys, depth + 1) for item in value]
         if isinstance(value, dict):
-            return {key: self._repeated(item, event, keys, depth + 1) for key, item in value.items()}
+            return {key: self._copy(item, event, keys, depth + 1) for key, item in value.items()}
         return value
 
-    def _spend(self, event: yaml.Event, keys: Keys, deeper: int = 0) -> None:
+    def _count(self, event: yaml.Event, keys: Keys, deeper: int) -> None:
         self.count += 1
         if self.count > self.limits.values:
             cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
             self._refuse(f"holds more than {self.limits.values:,} values", event, (), cure)
         if len(keys) + deeper > self.limits.depth:
-            words = f"lists and maps are nested more than {self.limits.depth} deep"
-            self._refuse(words, event, keys[:4], "is a bracket missing, or an indent too much?")
+            fault = f"lists and maps are nested more than {self.limits.depth} deep"
+            self._refuse(fault, event, keys[:4], "is a bracket missing, or an indent too much?")
 
     def _scalar(self, event: yaml.ScalarEvent, keys: Keys) -> Any:
-        text, match, tagged = event.value, _CORE.fullmatch(event.value), event.tag not in (None, "!")
+        text, match = event.value, _CORE.fullmatch(event.value)
         kind = match.lastgroup if match and event.tag is None and event.implicit[0] else "str"
-        if tagged:
+        if event.tag not in (None, "!"):
             kind = event.tag.removeprefix(_TAG)
             if kind not in ("null", "bool", "int", "float"):
                 self._check_tag(event, keys, "str")
             elif match is None or (match.lastgroup != kind and (match.lastgroup, kind) != ("int", "float")):
-                self._refuse(
-                    f"{one_line(repr(text))} is no {kind}", event, keys, "delete the tag, or correct the value"
-                )
+                cure = "delete the tag, or correct the value"
+                self._refuse(f"{one_line(repr(text))} is no {kind}", event, keys, cure)
         if kind in ("int", "float") and len(text) > self.limits.digits:
             cure = f"write it with {self.limits.digits} at most"
             self._refuse(f"a number of {len(text)} characters", event, keys, cure)
@@ -197,12 +165,23 @@ class _Document:
         if event.tag not in (None, "!", _TAG + kind):
             self._refuse(f"the tag {one_line(repr(event.tag))} is not known", event, keys, "delete the tag")
 
-    def _refuse(self, words: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
-        raise InputError(words, file=f"{self.path}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)
+    def _refuse(self, fault: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
+        raise InputError(fault, file=f"{self.name}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)
+
+
+def _events(text: str, name: str | Path) -> Iterator[yaml.Event]:
+    try:
+        yield from yaml.parse(text, Loader=_Parser)
+    except yaml.YAMLError as error:
+        mark, context = getattr(error, "problem_mark", None), getattr(error, "context", None)
+        words = [one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part]
+        cure = "look for a bracket, quote, colon or indent on or above this line"
+        file = f"{name}:{mark.line + 1}" if mark else name
+        raise InputError(f"not YAML: {' '.join(words)}", file=file, cure=cure) from error
 
 
 def key_path(keys: Keys) -> str | None:
-    """How errors write the way to a value.
+    """The way to a value as errors write it.
 
     >>> key_path(("photos", 0, "masks"))
     'photos[0].masks'
@@ -213,113 +192,82 @@ def key_path(keys: Keys) -> str | None:
 
 # ── types ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-_MESSAGE = re.compile(r"^(?P<found>.*?)(?: - at `(?P<where>[^`]*)`)?$", re.DOTALL)
-_STEP = re.compile(r"\.(?P<name>[^.\[]+)|\[(?P<index>\d+|\.\.\.)\]")
-_UNKNOWN = re.compile(r"unknown field `(.*)`", re.DOTALL)
-_MISSING = re.compile(r"missing required field `(.*)`", re.DOTALL)
-
 
 def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text: str | None = None) -> T:
     """Plain data, wherever it came from, as a value of a msgspec type; errors as in `read_yaml`.
 
+    The cure is the `description` of the field's `Meta`, where it has one.
     name: what errors call the data;  prefix: stands before their keys;  text: what it was read from, for their lines
     """
     try:
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
-        words, keys = _place(str(error), value, type_)
-    if unknown := _UNKNOWN.search(words):
-        fields = [field for info in _types_at(type_, keys) for field in getattr(info, "fields", ())]
-        keys, cure = (*keys, unknown[1]), did_you_mean(unknown[1], [field.encode_name for field in fields])
-        words = f"unknown key {one_line(repr(unknown[1]))}"
-    elif missing := _MISSING.search(words):
-        words, cure = f"the key {missing[1]!r} is missing", f"add {missing[1]}: …"
+        words, value, types, keys = _innermost(error, value, type_)
+    if field := _FIELD.search(words):
+        words, cure = f"the key {field['name']!r} is missing", f"add {field['name']}: …"
+        if field["fault"] == "unknown":
+            known = [f.encode_name for each in types if _is_struct(each) for f in msgspec.structs.fields(each)]
+            words, cure = f"unknown key {one_line(repr(field['name']))}", did_you_mean(field["name"], known)
+            keys = (*keys, field["name"])
     else:
-        given = _at_keys(value, keys)
-        choices = [str(word) for info in _types_at(type_, keys) for word in getattr(info, "values", ())]
-        quoted = isinstance(given, int | float) and "xpected `str" in words
-        words = f"{words[:1].lower()}{words[1:]}" + (
-            "" if isinstance(given, dict | list) else f": {one_line(repr(given))}"
-        )
-        cure = f"one of {', '.join(choices)}" if choices else "write a value of that kind"
-        cure = f'put it in quotes: "{one_line(str(given))}"' if quoted else cure
+        choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
+        described = [meta.description for each in types for meta in getattr(each, "__metadata__", ())]
+        cure = next(filter(None, described), "write a value of that kind")
+        cure = f"one of {', '.join(choices)}" if choices else cure
+        if isinstance(value, int | float) and "xpected `str" in words:
+            cure = f'put it in quotes: "{one_line(str(value))}"'
+        words = f"{words[:1].lower()}{words[1:]}"
+        words += "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
     file = f"{name}:{_line_of(text, keys)}" if text is not None else name
-    raise InputError(
-        words, file=file, key=".".join(filter(None, (prefix, key_path(keys)))) or None, cure=cure
-    ) from None
+    key = ".".join(filter(None, (prefix, key_path(keys)))) or None
+    raise InputError(words, file=file, key=key, cure=cure) from None
+
+
+def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> tuple[str, Any, list, Keys]:
+    """The fault's words, the innermost value at fault, the types that it may have, and the way to it."""
+    types = _alternatives(type_)
+    for key, item, inner in (child for each in types for child in _children(value, each)):
+        try:
+            msgspec.convert(item, inner)
+        except msgspec.ValidationError as below:
+            return _innermost(below, item, inner, (*keys, key))
+    return str(error), value, types, keys
+
+
+def _alternatives(type_: Any) -> list:
+    """A type and, where it is a union or described by a `Meta`, all that it stands for."""
+    inner = get_args(type_) if get_origin(type_) in (Union, UnionType) else ()
+    inner = get_args(type_)[:1] if get_origin(type_) is Annotated else inner
+    return [type_, *(one for each in inner for one in _alternatives(each))]
+
+
+def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
+    """Key, value and type of what a list or map holds, and of a map's own keys."""
+    args, origin = get_args(type_), get_origin(type_)
+    if isinstance(value, dict) and origin is dict:
+        yield from ((key, key, args[0]) for key in value)
+        yield from ((key, item, args[1]) for key, item in value.items())
+    elif isinstance(value, dict) and _is_struct(type_):
+        fields = msgspec.structs.fields(type_)
+        yield from ((f.encode_name, value[f.encode_name], f.type) for f in fields if f.encode_name in value)
+    elif isinstance(value, list) and origin in (list, tuple):
+        same = origin is list or args[-1:] == (...,)
+        yield from zip(range(len(value)), value, args[:1] * len(value) if same else args)
+
+
+def _is_struct(type_: Any) -> bool:
+    return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
 
 
 def _line_of(text: str, keys: Keys) -> int:
     """The line on which the value at `keys` stands, or what of the way to it is there; the text has been read before."""
-    document = _Document(text, "", LIMITS, keys)
-    try:
-        document.value()
-    except InputError:
-        pass  # as far as it goes
-    return document.line
-
-
-def _place(error: str, value: Any, type_: type) -> tuple[str, Keys]:
-    """msgspec's message and where it points; it calls every key of a dict `[...]`, so the guilty one is looked for."""
-    match = _MESSAGE.match(error)
-    keys: Keys = ()
-    try:
-        for step in _STEP.finditer((match["where"] or "$").removeprefix("key in ")):
-            if step["index"] == "...":
-                keys = (*keys, _guilty_key(error, keys, value, type_))
-            else:
-                keys = (*keys, int(step["index"]) if step["index"] else step["name"])
-            _at_keys(value, keys)
-    except (LookupError, TypeError):  # a key of the user's that looks like msgspec's own words
-        return error, ()
-    return match["found"], keys
-
-
-def _guilty_key(error: str, keys: Keys, value: Any, type_: type) -> str:
-    """The first key of the dict at `keys` without which msgspec would not say `error`: found by halving."""
-    table = _at_keys(value, keys)
-    names = list(table)
-    while len(names) > 1:
-        half = names[: len(names) // 2]
-        try:
-            msgspec.convert(_with(value, keys, {key: table[key] for key in half}), type_)
-            guilty = False
-        except msgspec.ValidationError as other:
-            guilty = str(other) == error
-        names = half if guilty else names[len(half) :]
-    return names[0]
-
-
-def _at_keys(value: Any, keys: Keys) -> Any:
+    node = yaml.compose(text, Loader=_Parser)
+    line = node.start_mark.line if node else 0
     for key in keys:
-        value = value[key]
-    return value
-
-
-def _with(value: Any, keys: Keys, new: Any) -> Any:
-    """A copy of `value` in which `new` stands at `keys`."""
-    if not keys:
-        return new
-    copy = value.copy()
-    copy[keys[0]] = _with(value[keys[0]], keys[1:], new)
-    return copy
-
-
-def _types_at(type_: type, keys: Keys) -> list[inspect.Type]:
-    """What may stand where `keys` lead to, each alternative of a union for itself."""
-    here = _alternatives([inspect.type_info(type_)])
-    for key in keys:
-        here = _alternatives([below for info in here for below in _below(info, key)])
-    return here
-
-
-def _alternatives(infos: list) -> list:
-    return [one for info in infos for one in (_alternatives(list(info.types)) if hasattr(info, "types") else [info])]
-
-
-def _below(info: inspect.Type, key: str | int) -> list:
-    if isinstance(info, inspect.StructType):
-        return [field.type for field in info.fields if field.encode_name == key]
-    if isinstance(info, inspect.TupleType):
-        return list(info.item_types[key : key + 1]) if isinstance(key, int) else []
-    return [getattr(info, name) for name in ("value_type", "item_type") if hasattr(info, name)]
+        if isinstance(node, yaml.MappingNode):
+            word, node = next((pair for pair in node.value if pair[0].value == key), (None, None))
+            line = word.start_mark.line if word else line
+        elif isinstance(node, yaml.SequenceNode):
+            node = node.value[key]
+            line = node.start_mark.line
+    return line + 1

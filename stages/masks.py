@@ -14,7 +14,7 @@ from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
-from factorlib.images.photo import Photo, decoded, open_photo
+from factorlib.images.photo import Photo, check_bright, decoded, open_photo
 from factorlib.labels import Labels, read_labels, read_objects
 from factorlib.results.photos import PhotoFacts, write_photo_facts
 from factorlib.stage import Inputs, Progress, silent
@@ -97,6 +97,7 @@ def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarr
     if lost == total:
         cure = "render or develop the photo again"
         raise InputError("every pixel in its mask is NaN or infinite", file=path, key=key, cure=cure)
+    check_bright(photo, inside, path, key)
     if lost:
         log.warning("%s: %d of the %d pixels in its mask are NaN or infinite: they are not used", path, lost, total)
     return inside & photo.finite

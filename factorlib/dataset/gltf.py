@@ -18,6 +18,7 @@ from factorlib.reading import MOST_BYTES, check_plain, read_bytes, reading
 
 Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
+Numbers3, Numbers4 = tuple[float, float, float], tuple[float, float, float, float]
 WHAT = "glTF"
 CURE = "is it whole? export it again, as .glb or .gltf"
 MOST_VALUES = 2_000_000  # of a header: each becomes an object of some hundred bytes; base64 has no commas
@@ -33,14 +34,14 @@ class Asset(msgspec.Struct, frozen=True):
 
 
 class Buffer(msgspec.Struct, frozen=True):
-    """uri: a file, or `data:…`; None for the chunk of a .glb."""
+    """Bytes in a file, or in `data:…`; uri is None for the chunk of a .glb."""
 
     byteLength: Count
     uri: str | None = None
 
 
 class View(msgspec.Struct, frozen=True):
-    """A run of bytes of buffer number `buffer`; byteStride: from one element to the next, None where they lie close together."""
+    """A run of bytes of a buffer; byteStride: from one element to the next, None where they lie close together."""
 
     buffer: Count
     byteLength: Count
@@ -48,31 +49,24 @@ class View(msgspec.Struct, frozen=True):
     byteStride: Positive | None = None
 
 
-class SparseIndices(msgspec.Struct, frozen=True):
-    """Which elements of an accessor are replaced: integers of `componentType` in a view."""
-
-    bufferView: Count
-    componentType: int
-    byteOffset: Count = 0
-
-
-class SparseValues(msgspec.Struct, frozen=True):
-    """What replaces those elements, in the accessor's own type."""
+class Place(msgspec.Struct, frozen=True):
+    """Where in a view numbers begin, and for indices their type."""
 
     bufferView: Count
     byteOffset: Count = 0
+    componentType: int | None = None
 
 
 class Sparse(msgspec.Struct, frozen=True):
     """`count` elements of an accessor that differ from what its view says, or from zero where it has none."""
 
     count: Count
-    indices: SparseIndices
-    values: SparseValues
+    indices: Place
+    values: Place
 
 
 class Accessor(msgspec.Struct, frozen=True):
-    """An array in a view: `count` elements of `type` (SCALAR, VEC3 …), each of numbers of `componentType`; zeros where it has no view."""
+    """An array of `count` elements of `type` (SCALAR, VEC3 …), of numbers of `componentType`; zeros where it has no view."""
 
     componentType: int
     count: Count
@@ -93,7 +87,7 @@ class Primitive(msgspec.Struct, frozen=True):
 
 
 class Geometry(msgspec.Struct, frozen=True):
-    """What glTF calls a mesh."""
+    """The primitives that glTF calls a mesh."""
 
     primitives: list[Primitive]
     name: str | None = None
@@ -106,16 +100,16 @@ class Material(msgspec.Struct, frozen=True):
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A place in the scene's tree: a mesh, and the motion to its parent as a matrix (column by column) or as translation, rotation
+    """A place in the scene's tree: a mesh, and its motion to the parent as a matrix (by columns) or translation, rotation
     (quaternion x y z w) and scale."""
 
     mesh: Count | None = None
     name: str | None = None
     children: list[Count] = []
     matrix: tuple[float, ...] | None = None
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    translation: Numbers3 = (0.0, 0.0, 0.0)
+    rotation: Numbers4 = (0.0, 0.0, 0.0, 1.0)
+    scale: Numbers3 = (1.0, 1.0, 1.0)
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -141,22 +135,20 @@ class Header(msgspec.Struct, frozen=True):
 
 def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
     """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
-    text = (
-        _json_chunk(file, key, most_bytes) if file.suffix.lower() == ".glb" else read_bytes(file, WHAT, key, most_bytes)
-    )
+    is_binary = file.suffix.lower() == ".glb"
+    text = _json_chunk(file, key, most_bytes) if is_binary else read_bytes(file, WHAT, key, most_bytes)
     if text.count(b",") > MOST_VALUES:
         cure = "export the geometry alone, with its data in a .bin file or as .glb"
         raise InputError(f"its header has more than {MOST_VALUES:,} values", file=file, key=key, cure=cure)
     with reading(WHAT, file, key, CURE):
         header = msgspec.json.decode(text, type=Header)
     if header.asset.version.split(".")[0] != "2":
-        found = f"is glTF {header.asset.version[:20]}"
-        raise InputError(found, file=file, key=key, cure="export it again, as glTF 2.0")
-    packed = [name for name in COMPRESSED if name in header.extensionsRequired]
-    if packed:
-        raise InputError(
-            f"its meshes are compressed ({packed[0]})", file=file, key=key, cure="export it without compression"
-        )
+        fault = f"is glTF {header.asset.version[:20]}"
+        raise InputError(fault, file=file, key=key, cure="export it again, as glTF 2.0")
+    for name in COMPRESSED:
+        if name in header.extensionsRequired:
+            cure = "export it without compression"
+            raise InputError(f"its meshes are compressed ({name})", file=file, key=key, cure=cure)
     return header
 
 

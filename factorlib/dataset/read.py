@@ -1,25 +1,28 @@
 """Reading a dataset: YAML to types, then every check that needs no pixel.
 
-Imports nothing heavy, for a run that finds nothing to do passes here too; only a dataset that names a source of cameras
+Imports nothing heavy, for a run that has nothing to do passes here too; only a dataset that names a source of cameras
 pays for pycolmap (.2 s).
 """
 
 from __future__ import annotations
 
 import logging
+import mmap
 import os
-from pathlib import Path
+import re
+from pathlib import Path, PurePosixPath
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
-from factorlib.dataset.companions import companions_of_mesh
+from factorlib.dataset.gltf import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, is_there
 from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
 from factorlib.errors import InputError
-from factorlib.reading import reading
+from factorlib.reading import check_plain, path_inside, reading
 from factorlib.yamlfile import read_yaml
 
 FILE = "dataset.yaml"
 RESERVED = ("studies", "bench", "store")  # folders of build/ that are no datasets
+MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 
 
@@ -35,23 +38,18 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
-        raise InputError(
-            f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name"
-        )
-    spec = read_yaml(file, DatasetFile)
+        cure = "rename its folder: build/ uses that name"
+        raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure=cure)
+    spec, external = read_yaml(file, DatasetFile), {}
     check_dataset(spec, file)
-    companions, external = _companions(spec, file), {}
+    refuse = Refusal(file, file.parent)
+    companions = {name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items()}
     if spec.cameras is not None:
         from factorlib.dataset.sources.external import external_cameras
 
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
     return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
-
-
-def _companions(spec: DatasetFile, file: Path) -> dict[str, list[str]]:
-    refuse = Refusal(file, file.parent)
-    return {name: companions_of_mesh(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items()}
 
 
 def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
@@ -63,13 +61,57 @@ def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
         return None
     truth = read_yaml(truth_file, TruthFile)
     check_truth(truth, spec, truth_file, file.parent)
-    for path in truth_paths(truth):
+    for path in truth.maps:
         if not is_there(file.parent / path, "truth"):
             log.warning("%s: there is no %s: nothing is compared with the truth", truth_file, path)
             return None
     return truth
 
 
-def truth_paths(truth: TruthFile) -> list[str]:
-    """The maps a truth.yaml names, in a fixed order."""
-    return sorted({*truth.illumination.values(), *truth.normals.values()})
+def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
+    """The files that the mesh at dataset-relative `path` draws in: an OBJ's .mtl, a glTF's buffers, not their textures.
+
+    They belong to the mesh's content: when one changes, so does the mesh.  An absent .mtl is left out, for a part's name is in
+    the OBJ itself, and so is one that is no plain file; an absent glTF buffer is refused, and so is any companion outside
+    the dataset, or too large.
+    """
+    file, is_obj = refuse.folder / path, path.lower().endswith(".obj")
+    if not is_obj and not path.lower().endswith((".gltf", ".glb")):
+        return []
+    named = _mtllibs(file, key) if is_obj else _buffers(file, key, refuse)
+    near = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in named})
+    for companion in near:
+        try:
+            path_inside(refuse.folder, companion)
+        except ValueError as error:
+            words = "is outside the dataset" if "outside" in str(error) else str(error)
+            refuse(key, f"{file.name} names {companion[:80]!r}, which {words}", "copy that file beside the mesh")
+    if is_obj:
+        near = [companion for companion in near if os.path.isfile(refuse.folder / companion)]
+    for companion in near:
+        if not os.path.lexists(refuse.folder / companion):
+            cure = "copy it beside the mesh, or export one .glb"
+            refuse(key, f"the mesh names {companion!r}, which is not there", cure)
+        check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
+    return near
+
+
+def _mtllibs(file: Path, key: str) -> list[str]:
+    if check_plain(file, "an OBJ", key) == 0:
+        return []
+    with (
+        reading("an OBJ", file, key),
+        file.open("rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
+    ):
+        names = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
+        return [match.group(1).decode("utf-8", "replace").strip() for match in names]
+
+
+def _buffers(file: Path, key: str, refuse: Refusal) -> list[str]:
+    header = read_header(file, key)
+    try:
+        named = [buffer_path(buffer.uri) for buffer in header.buffers if buffer.uri is not None]
+    except ValueError as error:
+        refuse(key, f"{file.name} {error}", "export it again, with its buffers beside it or as one .glb")
+    return [path for path in named if path is not None]

@@ -1,27 +1,41 @@
 """The fixed dataset format as types, and the slices of it that stages are handed.
 
-`DatasetFile` and `TruthFile` mirror dataset.yaml and truth.yaml key by key.  The `…Slice` structs are what a stage
-converts its facts to: `msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)`.  Every path is relative to the
-dataset's folder.  Frames, units and directions are those of `factorlib.conventions`.
+`DatasetFile` and `TruthFile` mirror dataset.yaml and truth.yaml key by key; the `Meta` of a type says which values it may
+have and, as its `description`, how to mend another one.  The `…Slice` structs are what a stage converts its facts to:
+`msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)`.  Every path is relative to the dataset's folder.  Frames, units and
+directions are those of `factorlib.conventions`.
 """
 
 from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
-FORMAT = 1
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
 MAX_MATERIALS = LEFT_OUT - 1
+LONGEST_NAME = 100  # characters; names of files are made of it, and file systems allow these 255 bytes
 SOURCES = ("colmap", "transforms", "bop")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # suffixes of raw photos
-ENCODINGS = ("srgb", "linear", "gamma2.2")
+LARGEST = 1e15  # of any number: what is larger loses its digits in the squares that are taken of it
+FOCAL_PX = 1.0, 1e7  # a telescope has 1e6
+CENTRE_PX = 1e6  # a principal point from the photo's corner, even of a small crop
 
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="give a finite number below 1e+15, or none")]
+Share = Annotated[float, Meta(ge=0, le=1, description="give a fraction, 0 to 1: reflectance is linear, not 0 to 255")]
+Focal = Annotated[float, Meta(ge=FOCAL_PX[0], le=FOCAL_PX[1], description="give finite pixels, 1 to 1e+07, or none")]
+Centre = Annotated[float, Meta(ge=-CENTRE_PX, le=CENTRE_PX, description="give finite pixels, up to 1e+06, or none")]
+Unit = Annotated[float, Meta(ge=1e-9, le=1e9, description="give the ratio of two units, more than 0: 1e-09 to 1e+09")]
+NAMES = "names have 1 to 100 of the characters A-Z a-z 0-9 _ and -, for they name files"
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+\Z", max_length=LONGEST_NAME, description=NAMES)]
+OneOf254 = Meta(min_length=1, max_length=MAX_MATERIALS, description="give 1 to 254: a mask has no more labels")
+AtLeastOne = Meta(min_length=1, description="add at least one: {name: …, image: …, masks: …}")
+Vec2 = tuple[Number, Number]
+Vec3 = tuple[Number, Number, Number]
+Shares = tuple[Share, Share, Share]
 Mat3 = tuple[Vec3, Vec3, Vec3]  # rows
 Masks = str | dict[str, str]  # a label PNG, a COCO json, or {material: PNG}
 
@@ -44,10 +58,10 @@ class MeshEntry(_Format):
 
 
 class Camera(_Format):
-    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is found."""
+    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is sought."""
 
-    focal_px: float | None = None
-    principal_point: Vec2 | None = None
+    focal_px: Focal | None = None
+    principal_point: tuple[Centre, Centre] | None = None
 
 
 class Pose(_Format):
@@ -67,7 +81,7 @@ class Keypoint(_Format):
 class ObjectEntry(_Format):
     """One instance of a mesh in a photo; `materials` overrides the mesh's parts, `mask` is its own silhouette."""
 
-    name: str
+    name: Name
     mesh: str
     materials: dict[str, str] = {}
     mask: str | None = None
@@ -83,27 +97,32 @@ class Ground(_Format):
 
     point: Vec3
     normal: Vec3
-    diffuse: Vec3 | None = None
+    diffuse: Shares | None = None
 
 
 class PhotoEntry(_Format):
     """One photo.  `illumination` defaults to the photo's name; `world_from_camera` fixes its light to the world."""
 
-    name: str
+    name: Name
     image: str
     masks: Masks
-    encoding: str | None = None
-    illumination: str | None = None
+    encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
+    illumination: Name | None = None
     world_from_camera: Mat3 | None = None
     camera: Camera | None = None
     objects: list[ObjectEntry] = []
     ground: Ground | None = None
 
+    @property
+    def light(self) -> str:
+        """The name of the illumination that the photo is in."""
+        return self.illumination or self.name
+
 
 class Similarity(_Format):
     """world_from_object: x_world = scale · rotation · x_object + translation; as it stands, the mesh lies in the world's frame."""
 
-    scale: float = 1.0
+    scale: Unit = 1.0
     rotation: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     translation: Vec3 = (0.0, 0.0, 0.0)
 
@@ -123,16 +142,16 @@ class CameraSource(_Format):
     world_from_object: dict[str, Similarity] = {}
     world_from_camera: bool = False
     obj_ids: dict[str, int] = {}
-    mesh_unit_mm: float = 1.0
+    mesh_unit_mm: Unit = 1.0
 
 
 class DatasetFile(_Format):
     """dataset.yaml."""
 
-    format: int
-    materials: list[str]
-    photos: list[PhotoEntry]
-    meshes: dict[str, MeshEntry] = {}
+    format: Annotated[Literal[1], Meta(description="this version reads format: 1")]
+    materials: Annotated[list[Name], OneOf254]
+    photos: Annotated[list[PhotoEntry], AtLeastOne]
+    meshes: dict[Name, MeshEntry] = {}
     cameras: CameraSource | None = None
     truth: str | None = None
 
@@ -140,9 +159,9 @@ class DatasetFile(_Format):
 class TrueMaterial(_Format):
     """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
 
-    diffuse: Vec3
-    specular: Vec3
-    roughness: float
+    diffuse: Shares
+    specular: Shares
+    roughness: Share
 
 
 class TruthFile(_Format):
@@ -153,9 +172,14 @@ class TruthFile(_Format):
     normals: dict[str, str] = {}
     poses: dict[str, dict[str, Pose]] = {}
 
+    @property
+    def maps(self) -> list[str]:
+        """The maps it names, in a fixed order."""
+        return sorted({*self.illumination.values(), *self.normals.values()})
+
 
 class ExternalCamera(msgspec.Struct, frozen=True):
-    """What a source of cameras says of one photo, in its own pixels: of an image of `size` (width, height).
+    """The camera of one photo by a source of cameras, in the source's own pixels: of an image of `size` (width, height).
 
     size: None where the source does not say it, the height None where only the width counts (a focal length in widths);
     principal_point: None where the source does not say it; poses: object -> cam_from_object, in the mesh's units
@@ -169,10 +193,10 @@ class ExternalCamera(msgspec.Struct, frozen=True):
 
 
 class Dataset(msgspec.Struct, frozen=True, dict=True):
-    """A dataset that has been read and found good.
+    """A dataset that has been read and checked.
 
     companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
-    external: photo -> what the source of cameras says of it
+    external: photo -> its camera by the source of cameras
     """
 
     folder: Path
@@ -203,7 +227,7 @@ class ObjectMask(msgspec.Struct, frozen=True):
 
 
 class PhotoSlice(msgspec.Struct, frozen=True):
-    """What is needed to read a photo and its masks."""
+    """The slice needed to read a photo and its masks."""
 
     image: str
     encoding: Literal["srgb", "linear", "gamma2.2"] | None
@@ -214,7 +238,7 @@ class PhotoSlice(msgspec.Struct, frozen=True):
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):
-    """What is needed to lay meshes over a photo: its camera, its objects, the meshes these use, and what else is known."""
+    """The slice needed to lay meshes over a photo: its camera, its objects, the meshes these use, and what else is known."""
 
     camera: Camera
     objects: list[ObjectEntry]
@@ -223,7 +247,7 @@ class ObjectsSlice(msgspec.Struct, frozen=True):
 
 
 class LightSlice(msgspec.Struct, frozen=True):
-    """Which light a photo is in, and the rotation that fixes it to the world (None: fixed to the camera)."""
+    """The illumination that a photo is in, and the rotation that fixes it to the world (None: fixed to the camera)."""
 
     illumination: str
     world_from_camera: Mat3 | None

@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 
 from factorlib.dataset import schema
-from factorlib.dataset.read import truth_paths
 from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.errors import did_you_mean
 
@@ -34,21 +33,25 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
     photo, objects, light, ground are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
     materials, set, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
     """
+    fields: dict[str, Any] = {}
     if name in _OF_SET:
         facts, files = _OF_SET[name](dataset)
         facts = _json_able(facts)
-        fields = _fields(facts, name) if name in ("materials", "truth") else _fields_of_set(facts)
-    elif name not in _OF_PHOTO:
-        raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
-    elif photo is not None:
-        facts, files = _OF_PHOTO[name](dataset, dataset.photo(photo))
-        facts = _json_able(facts)
-        fields = _fields_of_photo(facts, photo)
+        parts = facts.items() if name == "set" else [(name, facts)]
+        for key, part in parts:
+            fields |= _fields(part, "the folder's name" if (name, key) == ("set", "name") else key)
+    elif name in _OF_PHOTO:
+        names = [photo] if photo is not None else [entry.name for entry in dataset.spec.photos]
+        slices = {each: _OF_PHOTO[name](dataset, dataset.photo(each)) for each in names}
+        files = [file for _, own in slices.values() for file in own]
+        facts = {each: _json_able(own) for each, (own, _) in slices.items()}
+        for each, own in facts.items():
+            places = {"focal_px": f"photos.{each}.camera.focal_px", "meshes": "meshes", "external": f"cameras.{each}"}
+            for key, value in own.items():
+                fields |= _fields(value, places.get(key, f"photos.{each}.{key}"))
+        facts = facts if photo is None else facts[photo]
     else:
-        parts = {entry.name: _OF_PHOTO[name](dataset, entry) for entry in dataset.spec.photos}
-        facts = _json_able({key: part[0] for key, part in parts.items()})
-        files = [file for part in parts.values() for file in part[1]]
-        fields = {name: value for key, part in facts.items() for name, value in _fields_of_photo(part, key).items()}
+        raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
     return Slice(facts=facts, files=sorted(set(files)), fields=fields)
 
 
@@ -58,7 +61,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
         encoding=photo.encoding,
         masks=photo.masks,
         focal_px=photo.camera.focal_px if photo.camera else None,
-        illumination=photo.illumination or photo.name,
+        illumination=photo.light,
         objects=[schema.ObjectMask(obj.name, obj.mask) for obj in photo.objects],
     )
     masks = [photo.masks] if isinstance(photo.masks, str) else list(photo.masks.values())
@@ -67,24 +70,14 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
-    camera = photo.camera or schema.Camera()
-    facts = schema.ObjectsSlice(
-        camera=camera, objects=photo.objects, meshes=meshes, external=dataset.external.get(photo.name)
-    )
+    external = dataset.external.get(photo.name)
+    facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
     files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
     return facts, files + _object_masks(photo)
 
 
-def _light(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.LightSlice, list[str]]:
-    return schema.LightSlice(photo.illumination or photo.name, photo.world_from_camera), []
-
-
-def _ground(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.GroundSlice, list[str]]:
-    return schema.GroundSlice(photo.ground), []
-
-
-def _materials(dataset: Dataset) -> tuple[list[str], list[str]]:
-    return dataset.spec.materials, []
+def _object_masks(photo: PhotoEntry) -> list[str]:
+    return [obj.mask for obj in photo.objects if obj.mask]
 
 
 def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
@@ -92,34 +85,8 @@ def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
     return schema.SetSlice(dataset.name, spec.materials, spec.meshes, [photo.name for photo in spec.photos]), []
 
 
-def _truth(dataset: Dataset) -> tuple[schema.TruthFile | None, list[str]]:
-    return dataset.truth, truth_paths(dataset.truth) if dataset.truth else []
-
-
-def _object_masks(photo: PhotoEntry) -> list[str]:
-    return [obj.mask for obj in photo.objects if obj.mask]
-
-
 def _json_able(facts: Any) -> Any:
     return msgspec.json.decode(msgspec.json.encode(facts))
-
-
-# ── facts by their names in dataset.yaml ─────────────────────────────────────────────────────────────────────────────
-
-
-def _fields_of_photo(facts: dict[str, Any], photo: str) -> dict[str, Any]:
-    """Most are keys of the photo; meshes stand beside the photos, and `external` comes from the source of cameras."""
-    places = {"focal_px": f"photos.{photo}.camera.focal_px", "meshes": "meshes", "external": f"cameras.{photo}"}
-    parts = [_fields(value, places.get(key, f"photos.{photo}.{key}")) for key, value in facts.items()]
-    return {name: value for part in parts for name, value in part.items()}
-
-
-def _fields_of_set(facts: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: value
-        for key, part in facts.items()
-        for name, value in _fields(part, "the folder's name" if key == "name" else key).items()
-    }
 
 
 def _fields(value: Any, name: str) -> dict[str, Any]:
@@ -136,6 +103,15 @@ def _fields(value: Any, name: str) -> dict[str, Any]:
     return {key: leaf for inner, item in items for key, leaf in _fields(item, inner).items()}
 
 
-_OF_PHOTO: dict[str, Callable] = {"photo": _photo, "objects": _objects, "light": _light, "ground": _ground}
-_OF_SET: dict[str, Callable] = {"materials": _materials, "set": _set, "truth": _truth}
+_OF_PHOTO: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
+    "photo": _photo,
+    "objects": _objects,
+    "light": lambda dataset, photo: (schema.LightSlice(photo.light, photo.world_from_camera), []),
+    "ground": lambda dataset, photo: (schema.GroundSlice(photo.ground), []),
+}
+_OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
+    "materials": lambda dataset: (dataset.spec.materials, []),
+    "set": _set,
+    "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),
+}
 SLICES = (*_OF_PHOTO, *_OF_SET)

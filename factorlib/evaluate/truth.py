@@ -8,27 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.exr import read_exr
+from factorlib.images.light_map import read_light_map
 from factorlib.reading import reading
-
-LEAST = -1e-3  # of the mean magnitude: resampling leaves a little below 0
 
 
 def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
     """The lat-long map of illumination `name`; InputError where a texel is no radiance."""
-    key = f"illumination.{name}"
-    with reading("an image", path, key):
-        radiance = read_rgb_exr(path)
-    finite = np.isfinite(radiance)
-    if not finite.all():
-        found = f"{int((~finite).any(axis=-1).sum())} texels are NaN or infinite"
-        raise InputError(found, file=path, key=key, cure="render the map again")
-    if radiance.min() < LEAST * np.abs(radiance).mean(dtype=float):
-        found = f"a radiance of {radiance.min():.4g} is less than 0"
-        raise InputError(
-            found, file=path, key=key, cure="give linear radiance: was a filter with negative lobes used? cut it at 0"
-        )
-    return radiance
+    return read_light_map(path, f"illumination.{name}").astype(np.float32)
 
 
 def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:

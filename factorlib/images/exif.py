@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from PIL import Image
 
@@ -48,54 +48,38 @@ def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
 
 
 def exif_of_bytes(data: bytes | None) -> dict[str, float | int]:
-    """Of a block as HEIF keeps it ("Exif", two zeros, a TIFF); what is damaged says nothing."""
-    try:
-        exif = Image.Exif()
-        with _unwarned():
-            exif.load(data or b"")
-        return _named(exif)
-    except DAMAGED:
-        return {}
+    """The tags of a block as HEIF keeps it ("Exif", two zeros, a TIFF); what is damaged says nothing."""
+    return _tags(data or b"", _named)
 
 
 def exif_of_tiff(path: str | Path) -> dict[str, float | int]:
-    """Of a file that begins as a TIFF does, as DNG and most raw files do; nothing of others."""
-    try:
-        with Path(path).open("rb") as stream:
-            return _named(_tags(stream))
-    except DAMAGED:
-        return {}
+    """The tags of a file that begins as a TIFF does, as DNG and most raw files do; none of others."""
+    return _tags(path, _named)
 
 
 def is_dng(path: str | Path) -> bool:
     """Whether a file is a TIFF that says it is a DNG."""
-    try:
-        with Path(path).open("rb") as stream:
-            return DNG_VERSION in _tags(stream)
-    except DAMAGED:
-        return False
+    return bool(_tags(path, lambda exif: {DNG_VERSION: True} if DNG_VERSION in exif else {}))
 
 
-def _tags(stream: BinaryIO) -> Image.Exif:
-    exif = Image.Exif()
-    with _unwarned():
-        exif.load_from_fp(stream)
-    return exif
-
-
-@contextmanager
-def _unwarned() -> Iterator[None]:
+def _tags(source: bytes | str | Path, take: Callable[[Image.Exif], dict]) -> dict:
     """Pillow warns of tags that are damaged, in its own source's lines: such tags say nothing here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    exif = Image.Exif()
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            nullcontext() if isinstance(source, bytes) else Path(source).open("rb") as stream,
+        ):
+            exif.load(source) if stream is None else exif.load_from_fp(stream)
+            return take(exif)
+    except DAMAGED:
+        return {}
 
 
 def _named(exif: Image.Exif) -> dict[str, float | int]:
-    with _unwarned():
-        tags = exif.get_ifd(EXIF_IFD)
-    found = {tag: _number(tags[tag]) for tag in NAMES if tag in tags}
-    return {NAMES[tag]: round(value) if tag in WHOLE else value for tag, value in found.items() if value is not None}
+    tags = exif.get_ifd(EXIF_IFD)
+    numbers = {tag: _number(tags[tag]) for tag in NAMES if tag in tags}
+    return {NAMES[tag]: round(value) if tag in WHOLE else value for tag, value in numbers.items() if value is not None}
 
 
 def _number(value: Any) -> float | None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.write import write_image
+from factorlib.reading import check_plain
 
 FIXED_DATE = "2000:01:01 00:00:00"
 LAT_LONG = {"textureformat": "LatLong Environment"}  # OpenImageIO's word for the OpenEXR attribute `envmap`
@@ -26,12 +27,8 @@ def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str
     pixels = np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), oiio.FLOAT)
     spec.channelnames = names
-    for name, value in {
-        "compression": "zip",
-        "DateTime": FIXED_DATE,
-        "Software": "factorlib",
-        **(attributes or {}),
-    }.items():
+    fixed = {"compression": "zip", "DateTime": FIXED_DATE, "Software": "factorlib"}
+    for name, value in {**fixed, **(attributes or {})}.items():
         spec.attribute(name, value)
     write_image(path, spec, pixels)
 
@@ -42,7 +39,8 @@ def write_rgb_exr(path: str | Path, radiance: Float[np.ndarray, "h w 3"], attrib
 
 
 def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
-    """All channels of an EXR as float32 by name."""
+    """All channels of an EXR as float32 by name; InputError for what is none, or no plain file (a pipe would never end)."""
+    check_plain(path, "an image", most_bytes=None)
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise InputError(f"not readable as an image ({oiio.geterror()})", file=path, cure="is it whole, and an EXR?")
@@ -58,9 +56,8 @@ def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
 def read_rgb_exr(path: str | Path) -> Float[np.ndarray, "h w 3"]:
     """The channels R, G, B."""
     channels = read_exr(path)
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise InputError(
-            f"has no channel {missing[0]}, only {', '.join(channels)}", file=path, cure="an RGB image is expected"
-        )
+    for name in "RGB":
+        if name not in channels:
+            fault = f"has no channel {name}, only {', '.join(channels)}"
+            raise InputError(fault, file=path, cure="an RGB image is expected")
     return np.stack([channels[name] for name in "RGB"], axis=-1)

@@ -34,31 +34,23 @@ def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str
     >>> focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 4000, 4000) is None
     True
     """
-    focal = _of_film(exif, width, height) or _of_focal_plane(exif, width)
+    film = positive(exif.get("Exif:FocalLengthIn35mmFilm"))
+    focal = film / FILM_DIAGONAL * math.hypot(width, height) if film else _of_focal_plane(exif, width)
     if focal is not None and _is_cropped(exif, width, height):
         log.warning("%s: is a crop of what the camera took, so its EXIF focal length is not used", file)
         return None
     return focal
 
 
-def _of_film(exif: Mapping[str, Any], width: int, height: int) -> float | None:
-    film = positive(exif.get("Exif:FocalLengthIn35mmFilm"))
-    return film and film / FILM_DIAGONAL * math.hypot(width, height)
-
-
 def _of_focal_plane(exif: Mapping[str, Any], width: int) -> float | None:
-    focal = positive(exif.get("Exif:FocalLength"))
-    density = positive(exif.get("Exif:FocalPlaneXResolution"))
-    taken = positive(exif.get("Exif:PixelXDimension"))
+    tags = ("FocalLength", "FocalPlaneXResolution", "PixelXDimension")
+    focal, density, taken = (positive(exif.get(f"Exif:{tag}")) for tag in tags)
     unit = UNIT_MM.get(exif.get("Exif:FocalPlaneResolutionUnit", 2))
-    if not (focal and density and taken and unit):
-        return None
-    return focal * density / unit * width / taken
+    return focal * density / unit * width / taken if focal and density and taken and unit else None
 
 
 def _is_cropped(exif: Mapping[str, Any], width: int, height: int) -> bool:
-    shape = _proportion(width, height)
-    taken = [positive(exif.get(f"Exif:Pixel{axis}Dimension")) for axis in "XY"]
+    shape, taken = _proportion(width, height), [positive(exif.get(f"Exif:Pixel{axis}Dimension")) for axis in "XY"]
     if all(taken) and not _same(shape, _proportion(*taken)):
         return True
     return not any(_same(shape, frame) for frame in FRAMES)

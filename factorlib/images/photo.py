@@ -13,20 +13,20 @@ Size          a photo can be averaged down by a whole factor (`boxes`) while it 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from factorlib.errors import InputError
 from factorlib.images.boxes import box_any, box_mean
 from factorlib.images.exif import exposure_of_exif
 from factorlib.images.focal import focal_px_of_exif
 from factorlib.images.heif import is_heif, open_heif
 from factorlib.images.raw import is_raw, open_raw
-from factorlib.images.scanlines import open_scanlines
-from factorlib.images.stored import Stored
+from factorlib.images.scanlines import Stored, open_scanlines
 from factorlib.images.transfer import decoder
 from factorlib.reading import reading
 
@@ -72,14 +72,31 @@ def read_photo(path: str | Path, encoding: str | None = None, key: str | None = 
     return decoded(open_photo(path, key), encoding, 1, path)
 
 
-def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path) -> Photo:
-    """An open photo as displayed, averaged down by `factor`; `path` is named in warnings."""
+def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
+    """Raises InputError where no pixel of `where` that is a number has any radiance: all are black, or less than 0."""
+    if not (photo.radiance[where & photo.finite] > 0).any():
+        cure = "expose, render or develop it again; was the exposure 0, or a sign turned? or drop the photo"
+        raise InputError("every pixel in its mask is black, or less than 0", file=path, key=key, cure=cure)
+
+
+def decoded(
+    stored: Stored,
+    encoding: str | None,
+    factor: int,
+    path: str | Path,
+    look: Callable[[Float[np.ndarray, "r w 3"]], None] = lambda linear: None,
+) -> Photo:
+    """An open photo as displayed, averaged down by `factor`; `path` is named in warnings.
+
+    look: is handed all linear values of the file, some rows at a time, before they are averaged
+    """
     encoding = encoding or stored.encoding
     height, width = (n // factor for n in (stored.height, stored.width))
     radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(stored, factor, path):
         linear = _decoded(codes, stored.white, encoding)
+        look(linear)
         numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
         if factor == 1:
@@ -87,7 +104,10 @@ def decoded(stored: Stored, encoding: str | None, factor: int, path: str | Path)
         else:
             radiance[rows], finite[rows] = box_mean(linear, numbers, factor)
             clipped[rows] = box_any(cut, factor)
-    _warn_of_profile(stored.profile, path)
+    profile = stored.profile
+    if profile and "srgb" not in profile.lower() and "709" not in profile:
+        words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
+        log.warning("%s: its colour profile is %r; %s", path, profile, words)
     radiance, clipped, finite = (_oriented(pixels, stored.orientation) for pixels in (radiance, clipped, finite))
     focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
     return Photo(
@@ -140,12 +160,3 @@ def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.nd
     if white >= 2**16:
         return decoder(encoding)(codes / white).astype(np.float32)
     return decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
-
-
-def _warn_of_profile(profile: str, path: str | Path) -> None:
-    if profile and "srgb" not in profile.lower() and "709" not in profile:
-        log.warning(
-            "%s: its colour profile is %r; its primaries are taken for Rec. 709: convert it to sRGB for exact colours",
-            path,
-            profile,
-        )

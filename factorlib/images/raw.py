@@ -9,22 +9,22 @@ The picture is cut as the file says (DNG's DefaultCrop), as other programs show 
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Shaped
+from jaxtyping import Bool
 from scipy.ndimage import maximum_filter
 
 from factorlib.dataset.schema import RAW
 from factorlib.errors import InputError
 from factorlib.images.exif import exif_of_tiff, is_dng
-from factorlib.images.stored import CLIPPED, Stored
+from factorlib.images.scanlines import CLIPPED, Stored
 
 ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's of LibRaw's `flip`
 AROUND = 5  # pixels a side from which demosaicing takes a pixel's colour
 WHITE = 2**16 - 1
-CONVERT = "develop it: darktable-cli {0} {1}.tif"
 
 
 def is_raw(path: str | Path) -> bool:
@@ -34,55 +34,50 @@ def is_raw(path: str | Path) -> bool:
 
 def open_raw(path: str | Path, key: str | None) -> Stored:
     """Raises InputError for a file that LibRaw cannot read."""
-    rawpy, sensor = _opened(path, key)
-    try:
-        sizes, camera, cached = sensor.sizes, _of_camera(sensor), {}
-    except rawpy.LibRawError as error:
-        raise _refused(f"not readable as a raw photo ({_said(error)})", path, key) from None
-    top, left, height, width = _crop(sizes)
 
-    def developed() -> dict[str, np.ndarray]:
-        """The picture and where it is saturated; developed for the first call."""
-        if not cached:
-            with sensor:
-                pixels, saturated = _developed(rawpy, sensor, path, key), _saturated(sensor)
-            inner = slice(top, top + height), slice(left, left + width)
-            cached.update(pixels=pixels[inner], saturated=saturated[inner])
-        return cached
+    def refused(fault: str, error: Exception) -> InputError:
+        """The error that names this file, in LibRaw's words."""
+        text = error.args[0] if error.args else error
+        words = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        cure = f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif"
+        return InputError(f"{fault} ({words})", file=path, key=key, cure=cure)
+
+    try:
+        import rawpy
+    except ImportError as error:
+        raise refused("raw photos are read by rawpy, which cannot be imported", error) from None
+    try:
+        sensor = rawpy.imread(str(path))
+        sizes, camera = sensor.sizes, _of_camera(sensor.other)
+    except rawpy.LibRawError as error:
+        raise refused("not readable as a raw photo", error) from None
+    top, left, height, width = _crop(sizes)
+    inner = slice(top, top + height), slice(left, left + width)
+
+    @cache
+    def developed() -> tuple[np.ndarray, np.ndarray]:
+        """16-bit linear codes, not turned, and where they are saturated; the sensor's white level is the top code of its
+        least amplified channel."""
+        with sensor:
+            try:
+                pixels = sensor.postprocess(
+                    output_bps=16, gamma=(1, 1), no_auto_bright=True, use_camera_wb=True,
+                    output_color=rawpy.ColorSpace.sRGB, adjust_maximum_thr=0.0, user_flip=0,
+                )  # fmt: skip
+            except rawpy.LibRawError as error:
+                raise refused("cannot be developed", error) from None
+            return pixels[inner], _saturated(sensor)[inner]
 
     return Stored(
         width=width,
         height=height,
         orientation=ORIENTATION.get(sizes.flip, 1),
         exif={**camera, **exif_of_tiff(path)},
-        profile="",
         white=WHITE,
         encoding="linear",
-        rows=lambda begin, end: developed()["pixels"][begin:end],
-        saturated=lambda begin, end: np.repeat(developed()["saturated"][begin:end, :, None], 3, axis=2),
+        rows=lambda begin, end: developed()[0][begin:end],
+        saturated=lambda begin, end: np.repeat(developed()[1][begin:end, :, None], 3, axis=2),
     )
-
-
-def _opened(path: str | Path, key: str | None) -> tuple[Any, Any]:
-    try:
-        import rawpy
-    except ImportError as error:
-        raise _refused(f"raw photos are read by rawpy, which cannot be imported ({error})", path, key) from None
-    try:
-        return rawpy, rawpy.imread(str(path))
-    except rawpy.LibRawError as error:
-        raise _refused(f"not readable as a raw photo ({_said(error)})", path, key) from None
-
-
-def _developed(rawpy: Any, sensor: Any, path: str | Path, key: str | None) -> Shaped[np.ndarray, "h w 3"]:
-    """16-bit linear codes, not turned; the sensor's white level is the top code of its least amplified channel."""
-    try:
-        return sensor.postprocess(
-            output_bps=16, gamma=(1, 1), no_auto_bright=True, use_camera_wb=True, output_color=rawpy.ColorSpace.sRGB,
-            adjust_maximum_thr=0.0, user_flip=0,
-        )  # fmt: skip
-    except rawpy.LibRawError as error:
-        raise _refused(f"cannot be developed ({_said(error)})", path, key) from None
 
 
 def _saturated(sensor: Any) -> Bool[np.ndarray, "h w"]:
@@ -100,21 +95,7 @@ def _crop(sizes: Any) -> tuple[int, int, int, int]:
     return (top, left, height, width) if inside else (0, 0, sizes.iheight, sizes.iwidth)
 
 
-def _of_camera(sensor: Any) -> dict[str, float]:
+def _of_camera(other: Any) -> dict[str, float]:
     """What LibRaw knows of the exposure, for raw files that are no TIFF."""
-    other = sensor.other
-    return {
-        "ExposureTime": other.shutter_speed,
-        "FNumber": other.aperture,
-        "Exif:PhotographicSensitivity": other.iso_speed,
-        "Exif:FocalLength": other.focal_length,
-    }
-
-
-def _said(error: Exception) -> str:
-    text = error.args[0] if error.args else error
-    return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-
-
-def _refused(found: str, path: str | Path, key: str | None) -> InputError:
-    return InputError(found, file=path, key=key, cure=CONVERT.format(Path(path).name, Path(path).stem))
+    names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLength")
+    return dict(zip(names, (other.shutter_speed, other.aperture, other.iso_speed, other.focal_length)))

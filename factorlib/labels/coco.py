@@ -1,26 +1,26 @@
 """COCO annotations as masks: polygons, and RLE as counts or compressed, by category and file name.
 
 Polygons are filled by pycocotools, which takes memory for every pixel of an outline: how long one may be is checked first.
-RLE is decoded by `rle`.  The shapes of other photos in the file are left as text.
+Run lengths are decoded here, for pycocotools takes every one at its word; what is drawn of several is their union, at the cost
+of the number of runs and one picture.  The shapes of other photos in the file are left as text.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path, PurePosixPath
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Int
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.labels.rle import Union
 from factorlib.reading import read_bytes, reading
 
 OVERSHOOT = 2.0  # pixels by which a polygon may leave the image
 MOST_BYTES = 512_000_000  # of a file; a hundred thousand outlines have half of it
 LONGEST, LONGEST_OF_ALL = 200, 5000  # an outline, and all of a photo together, in half perimeters of the photo
+MOST_DIGITS = 7  # of a compressed run length, 5 bits each: no picture has 2**35 pixels
 CURE = "export the file again"
 
 
@@ -70,121 +70,121 @@ def read_coco(
     """The union of the annotations of each material in the photo named `image`, and the (height, width) they are for.
 
     size: (height, width) of the photo, for files that do not say it; key: where the file is named, for messages.
+    Raises InputError naming the annotation.
     """
-    coco = _decode(path, key)
+    content = read_bytes(path, "COCO", key, MOST_BYTES)
+    with reading("COCO", path, key, "it needs images, annotations and categories"):
+        coco = msgspec.json.decode(content, type=Coco)
     entry = _entry(coco, image, path)
     shape = (entry.height or size[0], entry.width or size[1])
     if shape != size:
         return {}, shape
     names = {category.id: category.name for category in coco.categories}
-    of_material: dict[str, list[tuple[str, Annotation]]] = {}
+    of_material: dict[str, list[tuple[str, msgspec.Raw]]] = {}
     for index, annotation in enumerate(coco.annotations):
-        if annotation.image_id == entry.id:
-            name = _material(annotation, names, materials, path, f"annotations[{index}]")
-            of_material.setdefault(name, []).append((f"annotations[{index}].segmentation", annotation))
-    masks: dict[str, np.ndarray] = {}
-    length = 0.0
-    for name, parts in of_material.items():
-        masks[name], length = _union(parts, shape, length, path)
+        if annotation.image_id != entry.id:
+            continue
+        at, name = f"annotations[{index}]", names.get(annotation.category_id)
+        if name is None:
+            fault = f"category_id {annotation.category_id!r} is not in categories"
+            raise InputError(fault, file=path, key=at, cure=CURE)
+        if name not in materials:
+            cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
+            raise InputError(f"category {name!r} is no material", file=path, key=at, cure=cure)
+        of_material.setdefault(name, []).append((f"{at}.segmentation", annotation.segmentation))
+    masks, length = {}, 0.0  # of all outlines
+    for name, own in of_material.items():
+        edges = np.zeros(shape[0] * shape[1] + 1, np.int32)  # how many shapes begin at a pixel, less how many end
+        for at, segmentation in own:
+            shapes, longer = _shapes(segmentation, shape, path, at)
+            length += longer
+            if length > LONGEST_OF_ALL * sum(shape):
+                fault = "the outlines of this photo are longer than any drawing"
+                raise InputError(fault, file=path, key=at, cure=CURE)
+            for counts in shapes:
+                with reading("RLE", path, at, CURE):
+                    borders = np.cumsum(runs_of(counts, len(edges) - 1))
+                np.add.at(edges, borders[0::2], 1)
+                np.add.at(edges, borders[1::2], -1)
+        inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
+        masks[name] = np.ascontiguousarray(inside.reshape(shape[::-1]).T)
     return masks, shape
 
 
-def _union(
-    parts: list[tuple[str, Annotation]], shape: tuple[int, int], length: float, path: str | Path
-) -> tuple[Bool[np.ndarray, "h w"], float]:
-    """Of the annotations of one material; length: of all outlines of the photo so far, pixels, before and after."""
-    union = Union(*shape)
-    for key, annotation in parts:
-        counts, longer = _counts(annotation.segmentation, shape, path, key)
-        length += longer
-        if length > LONGEST_OF_ALL * sum(shape):
-            raise InputError("the outlines of this photo are longer than any drawing", file=path, key=key, cure=CURE)
-        for each in counts:
-            with reading("RLE", path, key, CURE):
-                union.add(each)
-    return union.mask(), length
+def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
+    """Run lengths, decompressed where they are a string.  Raises ValueError unless they fill so many pixels exactly.
 
+    Compressed, a character holds 5 bits (+48), the sixth says "more follows", the sign is the highest bit of the last; from the
+    third run on each is the difference to the run two before.
 
-def _decode(path: str | Path, key: str) -> Coco:
-    content = read_bytes(path, "COCO", key, MOST_BYTES)
-    with reading("COCO", path, key, "it needs images, annotations and categories"):
-        return msgspec.json.decode(content, type=Coco)
+    >>> runs_of([1, 2, 1], 4).tolist(), runs_of("R47g1", 192).tolist()
+    ([1, 2, 1], [130, 7, 55])
+    """
+    if isinstance(counts, str):
+        codes = np.frombuffer(counts.encode("ascii"), np.uint8).astype(np.int64) - 48
+        ends = np.flatnonzero(codes & 32 == 0)
+        if ((codes < 0) | (codes >= 64)).any() or len(codes) != (ends[-1] + 1 if len(ends) else 0):
+            raise ValueError("it is no compressed RLE, or cut short")
+        begins = np.r_[0, ends[:-1] + 1][: len(ends)]
+        digits = ends - begins + 1
+        if digits.max(initial=0) > MOST_DIGITS:
+            raise ValueError("a run of its compressed RLE is longer than any picture")
+        place = np.arange(len(codes)) - np.repeat(begins, digits)
+        runs = np.add.reduceat((codes & 31) << 5 * place, begins) if len(ends) else codes
+        runs -= np.where(codes[ends] & 16, 1 << 5 * digits, 0)
+        runs[1::2], runs[2::2] = np.cumsum(runs[1::2]), np.cumsum(runs[2::2])
+    else:
+        runs = np.array(counts, np.int64)
+    if runs.min(initial=0) < 0 or runs.max(initial=0) > pixels or runs.sum() != pixels:
+        raise ValueError(f"its runs do not fill {pixels} pixels")
+    return runs
 
 
 def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     """The image entry of the same path, or else of the same file name."""
-    same = [e for e in coco.images if PurePosixPath(e.file_name) == PurePosixPath(image)]
     base = PurePosixPath(image).name
-    found = same or [e for e in coco.images if _base(e.file_name) == base]
-    if not found:
-        cure = did_you_mean(base, [_base(e.file_name) for e in coco.images])
-        raise InputError(f"has no image {base!r}", file=path, key="images", cure=cure)
-    if len(found) > 1:
-        raise InputError(
-            f"has {len(found)} images {base!r}", file=path, key="images", cure=f"keep one, or name it {image!r} in full"
-        )
-    return found[0]
+    bases = [PurePosixPath(entry.file_name.replace("\\", "/")).name for entry in coco.images]
+    same = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
+    same = same or [entry for entry, name in zip(coco.images, bases) if name == base]
+    if not same:
+        raise InputError(f"has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases))
+    if len(same) > 1:
+        cure = f"keep one, or name it {image!r} in full"
+        raise InputError(f"has {len(same)} images {base!r}", file=path, key="images", cure=cure)
+    return same[0]
 
 
-def _base(file_name: str) -> str:
-    return PurePosixPath(file_name.replace("\\", "/")).name
-
-
-def _material(annotation: Annotation, names: dict, materials: list[str], path: str | Path, key: str) -> str:
-    name = names.get(annotation.category_id)
-    if name is None:
-        fault = f"category_id {annotation.category_id!r} is not in categories"
-        raise InputError(fault, file=path, key=key, cure="export the file again")
-    if name not in materials:
-        cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-        raise InputError(f"category {name!r} is no material", file=path, key=key, cure=cure)
-    return name
-
-
-def _counts(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: str) -> tuple[list, float]:
+def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: str) -> tuple[list, float]:
     """Run lengths of the parts of a shape, and how long its outlines are."""
     with reading("a COCO segmentation", path, key, CURE):
         segmentation = msgspec.json.decode(text, type=list[list[float]] | Rle | None)
     if not segmentation:
-        raise InputError(
-            "is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it"
-        )
-    if not isinstance(segmentation, Rle):
-        return _filled(segmentation, shape, path, key)
-    if tuple(segmentation.size) != shape:
-        found = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
-        raise InputError(found, file=path, key=key, cure="export it at the photo's own size")
-    return [segmentation.counts], 0.0
-
-
-def _filled(polygons: list[list[float]], shape: tuple[int, int], path: str | Path, key: str) -> tuple[list[str], float]:
-    height, width = shape
-    clipped, length = [], 0.0
-    for index, polygon in enumerate(polygons):
-        corners = _corners(polygon, shape, path, f"{key}[{index}]")
-        longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
-        if longer > LONGEST * (height + width):
-            fault = f"its outline is {longer:.3g} pixels long"
-            raise InputError(fault, file=path, key=f"{key}[{index}]", cure="draw it again, with fewer corners")
-        clipped.append(corners.ravel().tolist())
+        cure = "draw its outline, or delete it"
+        raise InputError("is empty: the annotation has only a box", file=path, key=key, cure=cure)
+    if isinstance(segmentation, Rle):
+        if tuple(segmentation.size) != shape:
+            fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
+            raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
+        return [segmentation.counts], 0.0
+    polygons, length = [], 0.0
+    for index, polygon in enumerate(segmentation):
+        fault, cure, longer = None, "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more", 0.0
+        if len(polygon) < 6 or len(polygon) % 2 or not np.isfinite(polygon).all():
+            fault = "is no polygon"
+        else:
+            corners, limit = np.reshape(polygon, (-1, 2)), np.array(shape[::-1])
+            if (corners < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
+                fault = f"leaves the image of {_wh(shape)} pixels"
+                cure = "was it drawn at another size? cut it at the image's edge"
+            corners = np.clip(corners, 0, limit)
+            longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
+            if longer > LONGEST * sum(shape):
+                fault, cure = f"its outline is {longer:.3g} pixels long", "draw it again, with fewer corners"
+        if fault:
+            raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
+        polygons.append(corners.ravel().tolist())
         length += longer
-    return [each["counts"].decode("ascii") for each in pycocomask.frPyObjects(clipped, height, width)], length
-
-
-def _corners(polygon: list[float], shape: tuple[int, int], path: str | Path, key: str) -> Float[np.ndarray, "n 2"]:
-    """x, y of each corner, cut at the edge of the image."""
-    height, width = shape
-    if len(polygon) < 6 or len(polygon) % 2 or not all(map(math.isfinite, polygon)):
-        found, cure = "is no polygon", "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
-        raise InputError(found, file=path, key=key, cure=cure)
-    corners = np.reshape(polygon, (-1, 2))
-    if (corners < -OVERSHOOT).any() or (corners > np.array([width, height]) + OVERSHOOT).any():
-        found, cure = (
-            f"leaves the image of {_wh(shape)} pixels",
-            "was it drawn at another size? cut it at the image's edge",
-        )
-        raise InputError(found, file=path, key=key, cure=cure)
-    return np.clip(corners, 0, [width, height])
+    return [each["counts"].decode("ascii") for each in pycocomask.frPyObjects(polygons, *shape)], length
 
 
 def _wh(shape: tuple[int, int]) -> str:

@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
 
+from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
 from factorlib.labels.png import check_size, read_inside, read_values
 
-LEFT_OUT = 255
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
 log = logging.getLogger("factorlib.labels")
 
@@ -44,14 +44,19 @@ def read_labels(
     size: (height, width) of the photo as displayed; image: its name, for COCO; key: of `masks`, for messages.
     Raises InputError naming file and key.
     """
+    where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
     if not isinstance(masks, str):
-        labels = _of_materials(masks, file, materials, size, key)
+        names = sorted(masks, key=materials.index)
+        inside = {name: read_inside(file(masks[name]), f"{key}.{name}", size) for name in names}
+        places = {name: (file(masks[name]), f"{key}.{name}") for name in names}
+        labels = _merged(inside, materials, size, places, edge=0)
     elif masks.lower().endswith(".json"):
-        labels = _of_coco(file(masks), materials, size, image, key)
+        inside, shape = read_coco(where, image, materials, size, key)
+        check_size(shape, size, where, key)
+        labels = _merged(inside, materials, size, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
     else:
-        labels = _of_values(read_values(file(masks), key, size), file(masks), materials, key)
+        labels = _of_values(read_values(where, key, size), where, materials, key)
     if not labels.label.any():
-        where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
         fault = "the mask is empty: no pixel has a material"
         raise InputError(fault, file=where, key=key, cure="paint at least one material, or drop the photo")
     return labels
@@ -73,42 +78,25 @@ def read_objects(
         if objects[inside].any():
             other = int(objects[inside & (objects > 0)][0]) - 1
             count = int((objects[inside] == other + 1).sum())
-            found = f"objects {masks[other][0]!r} and {name!r} share {count} pixels"
-            raise InputError(
-                found, file=file(path), key=where, cure="a pixel shows one object: erase it from the one behind"
-            )
+            fault = f"objects {masks[other][0]!r} and {name!r} share {count} pixels"
+            cure = "a pixel shows one object: erase it from the one behind"
+            raise InputError(fault, file=file(path), key=where, cure=cure)
         objects[inside] = index + 1
     return objects
 
 
 def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
-    found, counts = np.unique(values, return_counts=True)
-    if set(found.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in found:
+    present, counts = np.unique(values, return_counts=True)
+    if set(present.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in present:
         cure = f"if 255 means inside, write masks: {{{materials[0]}: <this file>}}: in a label mask it means leave out"
         raise InputError("the mask is empty: it holds only 0 and 255", file=path, key=key, cure=cure)
-    for value, count in zip(found.tolist(), counts.tolist()):
+    for value, count in zip(present.tolist(), counts.tolist()):
         if value > len(materials) and value != LEFT_OUT:
             known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
             fault = f"unknown label {value} ({count} pixels)"
             raise InputError(fault, file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out")
     left_out = values == LEFT_OUT
     return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
-
-
-def _of_materials(
-    masks: Mapping[str, str], file: Callable[[str], Path], materials: list[str], size: tuple[int, int], key: str
-) -> Labels:
-    inside = {}
-    for material in sorted(masks, key=materials.index):
-        inside[material] = read_inside(file(masks[material]), f"{key}.{material}", size)
-    where = {material: (file(masks[material]), f"{key}.{material}") for material in inside}
-    return _merged(inside, materials, size, where, edge=0)
-
-
-def _of_coco(path: Path, materials: list[str], size: tuple[int, int], image: str, key: str) -> Labels:
-    inside, shape = read_coco(path, image, materials, size, key)
-    check_size(shape, size, path, key)
-    return _merged(inside, materials, size, {material: (path, key) for material in inside}, edge=DRAWN_EDGE)
 
 
 def _merged(
@@ -124,21 +112,21 @@ def _merged(
         if material not in inside:
             continue
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            both = inside[material] & (label == other)
-            _refuse_overlap(materials[other - 1], material, both, where, edge)
+            both, (path, key), also = (
+                inside[material] & (label == other),
+                where[material],
+                where[materials[other - 1]][0],
+            )
+            fault = f"materials {materials[other - 1]!r} and {material!r} share {int(both.sum())} pixels"
+            fault += f" with {also.name}" if also != path else ""
+            if _is_wider(both, edge):
+                cure = "a pixel shows one material: erase it from the one behind"
+                raise InputError(fault, file=path, key=key, cure=cure)
+            log.warning("%s: %s: %s along their outlines: these are left out", path, key, fault)
             left_out |= both
         label[inside[material]] = number
     label[left_out] = 0
     return Labels(label=label, left_out=left_out)
-
-
-def _refuse_overlap(one: str, other: str, both: np.ndarray, where: Mapping[str, tuple[Path, str]], edge: int) -> None:
-    count = int(both.sum())
-    (path, key), also = where[other], where[one][0]
-    found = f"materials {one!r} and {other!r} share {count} pixels" + (f" with {also.name}" if also != path else "")
-    if _is_wider(both, edge):
-        raise InputError(found, file=path, key=key, cure="a pixel shows one material: erase it from the one behind")
-    log.warning("%s: %s: %s along their outlines: these are left out", path, key, found)
 
 
 def _is_wider(region: Bool[np.ndarray, "h w"], width: int) -> bool:

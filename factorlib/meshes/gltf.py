@@ -14,10 +14,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from factorlib.dataset.gltf import BEFORE_JSON, CURE, Accessor, Header, Node, Primitive, buffer_path, read_header
+from factorlib.dataset.gltf import BEFORE_JSON, CURE, Header, Node, Primitive, buffer_path, read_header
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.parts import check_count
 from factorlib.meshes.soup import Soup, at_corners, floats, no_normals
 from factorlib.reading import read_bytes
 
@@ -25,6 +24,7 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 UNNAMED = "GLTF"
+MOST_PARTS = 100_000  # of one file
 
 
 class Placed(msgspec.Struct, frozen=True):
@@ -35,51 +35,50 @@ class Placed(msgspec.Struct, frozen=True):
     world_from_node: Float[np.ndarray, "4 4"]
 
 
+def check_count(parts: int, file: str | Path) -> None:
+    """Raise InputError for more than MOST_PARTS parts in one file."""
+    if parts > MOST_PARTS:
+        cure = f"join parts of one material: at most {MOST_PARTS:,} are read"
+        raise InputError(f"has {parts:,} parts", file=file, cure=cure)
+
+
 def read_gltf(path: Path, limits: Limits) -> Soup:
     """InputError, or what a wrong index in its header raises."""
     header = read_header(path, most_bytes=limits.bytes)
     check_count(sum(len(header.meshes[node.mesh].primitives) for node in header.nodes if node.mesh is not None), path)
-    places = [(place, *_size(place.primitive, header, path)) for place in placed(header)]
+    places = [(place, *_size(place.primitive, header, path)) for place in _placed(header)]
     limits.check(sum(vertices for _, vertices, _ in places), sum(triangles for _, _, triangles in places), path)
-    data = Buffers(header, path, limits)
-    return _joined([place for place, _, triangles in places if triangles], data)
+    return _joined([place for place, _, triangles in places if triangles], _Buffers(header, path, limits))
 
 
 # ── which triangles there are, and where ─────────────────────────────────────────────────────────────────────────────
 
 
-def placed(header: Header) -> list[Placed]:
+def _placed(header: Header) -> list[Placed]:
     """The primitives of the scene's nodes, in the order of the nodes; ValueError for nodes that are no tree."""
-    names = _primitive_names(header)
-    found = []
+    used: dict[str, int] = {}  # how often each name has been asked for
+    names = [[_unused(mesh.name or UNNAMED, used) for _ in mesh.primitives] for mesh in header.meshes]
+    places = []
     for index, world_from_node in sorted(_world_from_nodes(header).items()):
         node = header.nodes[index]
-        if node.mesh is None:
-            continue
-        primitives = header.meshes[node.mesh].primitives
+        primitives = header.meshes[node.mesh].primitives if node.mesh is not None else []
         for k, primitive in enumerate(primitives):
             own = (node.name or str(index),) if len(primitives) == 1 else ()
             material = header.materials[primitive.material].name if primitive.material is not None else None
             known = dict.fromkeys(name for name in (names[node.mesh][k], *own, material) if name)
-            found.append(Placed(primitive, tuple(known), world_from_node))
-    return found
-
-
-def _primitive_names(header: Header) -> list[list[str]]:
-    """A name of its own for every primitive of every mesh."""
-    used: dict[str, int] = {}  # how often each name has been asked for
-    return [[_unused(mesh.name or UNNAMED, used) for _ in mesh.primitives] for mesh in header.meshes]
+            places.append(Placed(primitive, tuple(known), world_from_node))
+    return places
 
 
 def _unused(name: str, used: dict[str, int]) -> str:
     number = used.get(name, 0)
-    found = f"{name}_{number}" if number else name
-    while number and found in used:
+    free = f"{name}_{number}" if number else name
+    while number and free in used:
         number += 1
-        found = f"{name}_{number}"
+        free = f"{name}_{number}"
     used[name] = number + 1
-    used.setdefault(found, 1)
-    return found
+    used.setdefault(free, 1)
+    return free
 
 
 def _world_from_nodes(header: Header) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -89,19 +88,19 @@ def _world_from_nodes(header: Header) -> dict[int, Float[np.ndarray, "4 4"]]:
     else:
         below = {child for node in header.nodes for child in node.children}
         roots = [index for index in range(len(header.nodes)) if index not in below]
-    found: dict[int, np.ndarray] = {}
+    places: dict[int, np.ndarray] = {}
     waiting = [(index, np.eye(4)) for index in roots]
     while waiting:
         index, world_from_parent = waiting.pop()
-        if index in found:
+        if index in places:
             raise ValueError(f"its node {index} is below two others, or below itself")
         with np.errstate(all="ignore"):  # what is not finite is refused with the vertices
-            found[index] = world_from_parent @ parent_from_node(header.nodes[index])
-        waiting += [(child, found[index]) for child in header.nodes[index].children]
-    return found
+            places[index] = world_from_parent @ _parent_from_node(header.nodes[index])
+        waiting += [(child, places[index]) for child in header.nodes[index].children]
+    return places
 
 
-def parent_from_node(node: Node) -> Float[np.ndarray, "4 4"]:
+def _parent_from_node(node: Node) -> Float[np.ndarray, "4 4"]:
     """Its matrix (given by columns), or scale, then rotation (quaternion x y z w), then translation."""
     if node.matrix is not None:
         return np.array(node.matrix, float).reshape(4, 4).T
@@ -134,36 +133,32 @@ def _size(primitive: Primitive, header: Header, path: Path) -> tuple[int, int]:
 # ── what they are ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Buffers:
+class _Buffers:
     """The buffers of a glTF, each read when it is first asked for, all together within the limits."""
 
     def __init__(self, header: Header, path: Path, limits: Limits):
         self.header, self.path, self.left = header, path, limits.bytes
-        self._read: dict[int, bytes] = {}
+        self.contents: dict[int, bytes] = {}
 
     def buffer(self, index: int) -> bytes:
         """The bytes of buffer `index`; InputError where it is shorter than the header says, or larger than the limits."""
-        if index not in self._read:
-            said = self.header.buffers[index]
-            content = self._content(said.uri)
-            if len(content) < said.byteLength:
-                raise InputError(
-                    f"buffer {index} has {len(content)} of {said.byteLength} bytes", file=self.path, cure=CURE
-                )
-            self._read[index], self.left = content, self.left - len(content)
-        return self._read[index]
+        if index not in self.contents:
+            entry = self.header.buffers[index]
+            content = self._content(entry.uri)
+            if len(content) < entry.byteLength:
+                fault = f"buffer {index} has {len(content)} of {entry.byteLength} bytes"
+                raise InputError(fault, file=self.path, cure=CURE)
+            self.contents[index], self.left = content, self.left - len(content)
+        return self.contents[index]
 
     def _content(self, uri: str | None) -> bytes:
-        if uri is None:
-            return self._binary_chunk()
-        near = buffer_path(uri)
-        if near is not None:
-            return read_bytes(self.path.parent / near, "a glTF buffer", most_bytes=max(self.left, 0))
-        kind, _, text = uri.partition(",")
-        return base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
-
-    def _binary_chunk(self) -> bytes:
-        """The second chunk of a .glb."""
+        if uri is not None:
+            near = buffer_path(uri)
+            if near is not None:
+                return read_bytes(self.path.parent / near, "a glTF buffer", most_bytes=max(self.left, 0))
+            kind, _, text = uri.partition(",")
+            return base64.b64decode(text, validate=True) if kind.endswith(";base64") else unquote_to_bytes(text)
+        # the second chunk of a .glb
         content = read_bytes(self.path, "glTF", most_bytes=self.left) if self.path.suffix.lower() == ".glb" else b""
         begin = BEFORE_JSON + int.from_bytes(content[12:16], "little")
         length, kind = int.from_bytes(content[begin : begin + 4], "little"), content[begin + 4 : begin + 8]
@@ -174,25 +169,18 @@ class Buffers:
     def array(self, index: int) -> np.ndarray:
         """The [count, width] of an accessor, normalized integers as floats."""
         accessor = self.header.accessors[index]
-        width = WIDTHS[accessor.type]
-        values = self._plain(accessor, width)
-        if accessor.sparse is not None and accessor.sparse.count:
-            sparse, values = accessor.sparse, values.copy()
-            where = self._view(
-                sparse.indices.bufferView, sparse.indices.byteOffset, sparse.indices.componentType, sparse.count, 1
-            )
-            there = self._view(
-                sparse.values.bufferView, sparse.values.byteOffset, accessor.componentType, sparse.count, width
-            )
-            values[where[:, 0]] = there
+        width, type_, sparse = WIDTHS[accessor.type], accessor.componentType, accessor.sparse
+        if accessor.bufferView is None:  # zeros, which `sparse` fills; the header's counts are within the limits
+            values = np.zeros((accessor.count, width), COMPONENTS[type_])
+        else:
+            values = self._view(accessor.bufferView, accessor.byteOffset, type_, accessor.count, width)
+        if sparse is not None and sparse.count:
+            at, put, values = sparse.indices, sparse.values, values.copy()
+            where = self._view(at.bufferView, at.byteOffset, at.componentType, sparse.count, 1)
+            values[where[:, 0]] = self._view(put.bufferView, put.byteOffset, type_, sparse.count, width)
         return values / np.iinfo(values.dtype).max if accessor.normalized and values.dtype.kind in "iu" else values
 
-    def _plain(self, accessor: Accessor, width: int) -> np.ndarray:
-        if accessor.bufferView is None:  # zeros, which `sparse` fills; the header's counts are within the limits
-            return np.zeros((accessor.count, width), COMPONENTS[accessor.componentType])
-        return self._view(accessor.bufferView, accessor.byteOffset, accessor.componentType, accessor.count, width)
-
-    def _view(self, index: int, offset: int, component: int, count: int, width: int) -> np.ndarray:
+    def _view(self, index: int, offset: int, component: int | None, count: int, width: int) -> np.ndarray:
         view, kind = self.header.bufferViews[index], np.dtype(COMPONENTS[component])
         stride = view.byteStride or kind.itemsize * width
         last = offset + (count - 1) * stride + kind.itemsize * width
@@ -201,59 +189,46 @@ class Buffers:
             raise InputError(f"an accessor reaches beyond buffer view {index}", file=self.path, cure=CURE)
         return np.ndarray((count, width), kind, data, view.byteOffset + offset if count else 0, (stride, kind.itemsize))
 
+    def vectors(self, primitive: Primitive, attribute: str) -> Float[np.ndarray, "v 3"]:
+        """An attribute of a primitive's vertices; InputError where it is not of three numbers."""
+        values = self.array(primitive.attributes[attribute])
+        if values.shape[1] != 3:
+            raise InputError(f"a {attribute} has {values.shape[1]} numbers, not 3", file=self.path, cure=CURE)
+        return floats(values)
 
-def _joined(places: list[Placed], data: Buffers) -> Soup:
+    def faces(self, primitive: Primitive) -> Int[np.ndarray, "f 3"]:
+        """Triangles of a list, a strip (every second one turned over) or a fan of corners."""
+        if primitive.indices is not None:
+            corners = self.array(primitive.indices)[:, 0].astype(np.int64)
+        else:
+            corners = np.arange(self.header.accessors[primitive.attributes["POSITION"]].count)
+        if primitive.mode == TRIANGLES:
+            if len(corners) % 3:
+                fault = f"a primitive has {len(corners)} corners, which makes no triangles"
+                raise InputError(fault, file=self.path, cure=CURE)
+            return corners.reshape(-1, 3)
+        first = np.full(max(len(corners) - 2, 0), corners[0]) if primitive.mode == FAN else corners[:-2]
+        faces = np.stack([first, corners[1:-1], corners[2:]], axis=1)
+        if primitive.mode == STRIP:
+            faces[1::2] = faces[1::2, ::-1]
+        return faces
+
+
+def _joined(places: list[Placed], data: _Buffers) -> Soup:
+    """One soup of all primitives, in the scene's frame; normals transform by the cofactors of the linear part."""
     vertices, faces, normals, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [no_normals(0)], 0
     for place in places:
-        points, own, linear = (
-            _vectors(place.primitive, "POSITION", data),
-            _faces(place.primitive, data),
-            place.world_from_node[:3, :3],
-        )
+        points, own = data.vectors(place.primitive, "POSITION"), data.faces(place.primitive)
+        linear, shift = place.world_from_node[:3, :3], place.world_from_node[:3, 3]
+        of_corners = no_normals(len(own))
         with np.errstate(all="ignore"):  # as above
-            vertices.append(points @ linear.T + place.world_from_node[:3, 3])
-            normals.append(_normals(place.primitive, data, linear, own))
+            vertices.append(points @ linear.T + shift)
+            if "NORMAL" in place.primitive.attributes:
+                cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
+                of_corners = at_corners(data.vectors(place.primitive, "NORMAL") @ cofactor.T, own)
+        normals.append(of_corners)
         faces.append(np.where((own >= 0) & (own < len(points)), own + offset, -1))
         offset += len(points)
     part = np.repeat(np.arange(len(places)), [len(own) for own in faces[1:]])
-    return Soup(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        part,
-        [place.names for place in places],
-        np.concatenate(normals),
-    )
-
-
-def _normals(primitive: Primitive, data: Buffers, linear: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Per corner, from the file's vertex normals; NaN where it has none."""
-    if "NORMAL" not in primitive.attributes:
-        return no_normals(len(faces))
-    cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))  # normals transform by it
-    return at_corners(_vectors(primitive, "NORMAL", data) @ cofactor.T, faces)
-
-
-def _vectors(primitive: Primitive, attribute: str, data: Buffers) -> Float[np.ndarray, "v 3"]:
-    values = data.array(primitive.attributes[attribute])
-    if values.shape[1] != 3:
-        raise InputError(f"a {attribute} has {values.shape[1]} numbers, not 3", file=data.path, cure=CURE)
-    return floats(values)
-
-
-def _faces(primitive: Primitive, data: Buffers) -> Int[np.ndarray, "f 3"]:
-    """Triangles of a list, a strip (every second one turned over) or a fan of corners."""
-    if primitive.indices is not None:
-        corners = data.array(primitive.indices)[:, 0].astype(np.int64)
-    else:
-        corners = np.arange(data.header.accessors[primitive.attributes["POSITION"]].count)
-    if primitive.mode == TRIANGLES:
-        if len(corners) % 3:
-            raise InputError(
-                f"a primitive has {len(corners)} corners, which makes no triangles", file=data.path, cure=CURE
-            )
-        return corners.reshape(-1, 3)
-    first = np.full(max(len(corners) - 2, 0), corners[0]) if primitive.mode == FAN else corners[:-2]
-    faces = np.stack([first, corners[1:-1], corners[2:]], axis=1)
-    if primitive.mode == STRIP:
-        faces[1::2] = faces[1::2, ::-1]
-    return faces
+    names = [place.names for place in places]
+    return Soup(np.concatenate(vertices), np.concatenate(faces), part, names, np.concatenate(normals))

@@ -27,12 +27,10 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def check(self, vertices: int, triangles: int, file: str | Path) -> None:
         """Raises InputError for more triangles, or more vertices than so many triangles can use."""
-        for count, most, what in (
-            (triangles, self.triangles, "triangles"),
-            (vertices, VERTICES_A_TRIANGLE * self.triangles, "vertices"),
-        ):
+        most_vertices = VERTICES_A_TRIANGLE * self.triangles
+        for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
             if count > most:
-                cure = f'simplify it, for a rough mesh does; at most {most:,} {what} are read (SET="align.limits.triangles=…")'
+                cure = f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")'
                 raise InputError(f"has {count:,} {what}", file=file, cure=cure)
 
 

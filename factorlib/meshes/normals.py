@@ -27,30 +27,6 @@ def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[n
     return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def edges_of(
-    faces: Int[np.ndarray, "f 3"],
-) -> tuple[Int[np.ndarray, "e 2"], Bool[np.ndarray, " e"], Int[np.ndarray, " e"]]:
-    """The 3F half-edges sorted by edge: (low, high) vertex, whether it runs from low to high, and its face."""
-    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
-    face = np.repeat(np.arange(len(faces)), 3)
-    pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
-    order = np.lexsort((face, pair[:, 1], pair[:, 0]))
-    return pair[order], (start < end)[order], face[order]
-
-
-def neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"], bool]:
-    """Pairs of faces across edges that exactly two share, whether each pair agrees in winding, and whether any edge has one face only."""
-    pair, forward, face = edges_of(faces)
-    starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
-    counts = np.diff(np.r_[starts, len(pair)])
-    first = starts[counts == 2]
-    return (
-        np.stack([face[first], face[first + 1]], axis=1),
-        forward[first] != forward[first + 1],
-        bool((counts == 1).any()),
-    )
-
-
 def consistently_wound(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Bool[np.ndarray, " f"], bool]:
@@ -63,19 +39,31 @@ def consistently_wound(
     from scipy.sparse.csgraph import connected_components
 
     count = len(faces)
-    pairs, agrees, has_border = neighbours(faces)
-    a, b = pairs.T
+    (a, b), agrees, has_border = _neighbours(faces)
     other = np.where(agrees, 0, count)  # node f: as it is; node f + count: flipped
     rows, columns = np.r_[a, a + count], np.r_[b + other, b + count - other]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
     _, part = connected_components(graph, directed=False)
-    kept, flipped = part[:count], part[count:]
+    as_it_is, flipped = part[:count], part[count:]
     area = area_vectors(vertices, faces)
-    size = np.linalg.norm(area, axis=1)
     volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
-    gain = volume if not has_border else size
-    total = np.bincount(kept, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
-    return (total[kept] < 0) & (kept != flipped), has_border
+    gain = np.linalg.norm(area, axis=1) if has_border else volume
+    total = np.bincount(as_it_is, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
+    return (total[as_it_is] < 0) & (as_it_is != flipped), has_border
+
+
+def _neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "2 n"], Bool[np.ndarray, " n"], bool]:
+    """Pairs of faces across edges that exactly two share, whether each pair agrees in winding, and whether any edge has
+    one face only."""
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)  # half-edges, sorted by edge
+    face = np.repeat(np.arange(len(faces)), 3)
+    pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
+    order = np.lexsort((face, pair[:, 1], pair[:, 0]))
+    pair, forward, face = pair[order], (start < end)[order], face[order]
+    starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
+    counts = np.diff(np.r_[starts, len(pair)])
+    first = starts[counts == 2]
+    return np.stack([face[first], face[first + 1]]), forward[first] != forward[first + 1], bool((counts == 1).any())
 
 
 def corner_normals(

@@ -14,8 +14,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.soup import Soup
-from factorlib.meshes.text import check_length, lines_of, shown
+from factorlib.meshes.soup import Soup, check_length, lines_of, quoted
 
 MOST = 2**31  # vertices that any file numbers
 COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
@@ -23,20 +22,43 @@ COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     """Triangles of an OBJ file, parts named by (usemtl, groups…, object); InputError names the line that is wrong."""
-    reader = _Reader()
+    table = {"v": array("d"), "vn": array("d")}
+    faces, face_normals, part = array("q"), array("q"), array("q")  # indices from 0; −1 for no normal
+    parts: dict[tuple[str, ...], int] = {}
+    names = {"usemtl": (), "g": (), "o": ()}  # of the faces that follow
+    current: int | None = None  # the part of these; None until a face asks
     for number, line in _statements(content):
-        words = line.split("#", 1)[0].split() if "#" in line else line.split()
-        if not words:
-            continue
+        key, *words = line.split("#", 1)[0].split() or [""]
         try:
-            reader.take(words[0], words[1:])
+            if key in table:
+                if len(words) < 3:
+                    raise ValueError("three numbers expected")
+                table[key].extend([float(word) for word in words[:3]])
+            elif key == "f":
+                corners = [_corner(word, len(table["v"]) // 3, len(table["vn"]) // 3) for word in words]
+                if len(corners) < 3:
+                    raise ValueError("a face has three corners at least")
+                if current is None:
+                    own = tuple(dict.fromkeys(name for kind in names.values() for name in kind if name))
+                    current = parts.setdefault(own, len(parts))
+                for second, third in zip(corners[1:], corners[2:]):
+                    faces.extend((corners[0][0], second[0], third[0]))
+                    face_normals.extend((corners[0][1], second[1], third[1]))
+                    part.append(current)
+            elif key in names:
+                names[key], current = tuple(words) if key == "g" else (" ".join(words),), None
         except (ValueError, IndexError, OverflowError) as error:
-            found = f"line {number}: {shown(line)} cannot be read ({shown(str(error))[1:-1]})"
-            raise InputError(found, file=path, cure="is it a text OBJ?") from error
+            fault = f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})"
+            raise InputError(fault, file=path, cure="is it a text OBJ?") from error
         if number % COUNTED_EVERY == 0:
-            reader.check(limits, path)
-    reader.check(limits, path)
-    return reader.soup()
+            limits.check(len(table["v"]) // 3, len(part), path)
+    limits.check(len(table["v"]) // 3, len(part), path)
+    normals = np.concatenate([np.array(table["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
+    index = np.array(face_normals, dtype=np.int64).reshape(-1, 3)
+    index[(index < 0) | (index >= len(normals))] = len(normals) - 1
+    corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
+    return Soup(vertices, corners, np.array(part, dtype=np.int64), list(parts), normals[index])
 
 
 def _statements(content: bytes) -> Iterator[tuple[int, str]]:
@@ -56,75 +78,10 @@ def _statements(content: bytes) -> Iterator[tuple[int, str]]:
         yield number, " ".join(begun)
 
 
-class _Reader:
-    """The state of an OBJ file while it is read line by line; numbers of vertices, faces and normals in flat arrays."""
-
-    def __init__(self) -> None:
-        self.vertices, self.vertex_normals = array("d"), array("d")
-        self.faces, self.face_normals = array("q"), array("q")  # indices from 0; of vertex_normals, −1 for none
-        self.part = array("q")
-        self.parts: dict[tuple[str, ...], int] = {}
-        self.material, self.groups, self.object = "", (), ""
-        self.current: int | None = None  # the part that faces belong to now; None until one asks
-
-    def take(self, key: str, words: list[str]) -> None:
-        """Take in one line: its first word `key` and the words after it.  ValueError where they are malformed."""
-        if key == "v":
-            self.vertices.extend(_three(words, "coordinates"))
-        elif key == "vn":
-            self.vertex_normals.extend(_three(words, "numbers"))
-        elif key == "f":
-            self.face(words)
-        elif key in ("usemtl", "g", "o"):
-            self.name(key, words)
-
-    def name(self, key: str, words: list[str]) -> None:
-        """Faces that follow are of another material, group or object."""
-        self.current = None
-        if key == "usemtl":
-            self.material = " ".join(words)
-        elif key == "g":
-            self.groups = tuple(words)
-        else:
-            self.object = " ".join(words)
-
-    def face(self, words: list[str]) -> None:
-        """Add a polygon as a fan of triangles; a corner of it is `v`, `v/vt`, `v//vn` or `v/vt/vn`."""
-        corners = [self.corner(word) for word in words]
-        if len(corners) < 3:
-            raise ValueError("a face has three corners at least")
-        if self.current is None:
-            names = tuple(dict.fromkeys(name for name in (self.material, *self.groups, self.object) if name))
-            self.current = self.parts.setdefault(names, len(self.parts))
-        for second, third in zip(corners[1:], corners[2:]):
-            self.faces.extend((corners[0][0], second[0], third[0]))
-            self.face_normals.extend((corners[0][1], second[1], third[1]))
-            self.part.append(self.current)
-
-    def corner(self, word: str) -> tuple[int, int]:
-        """Index of a corner's vertex and of its normal, from 0; −1 where it has no normal."""
-        fields = word.split("/")
-        vertex = _index(fields[0], len(self.vertices) // 3)
-        return vertex, _index(fields[2], len(self.vertex_normals) // 3) if len(fields) > 2 and fields[2] else -1
-
-    def check(self, limits: Limits, path: Path) -> None:
-        """Raise InputError where more has been read than the limits allow."""
-        limits.check(len(self.vertices) // 3, len(self.part), path)
-
-    def soup(self) -> Soup:
-        """All that was read, as arrays; corners without a normal have NaN."""
-        normal_table = np.concatenate([np.array(self.vertex_normals), np.full(3, np.nan)]).reshape(-1, 3)
-        index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
-        index[(index < 0) | (index >= len(normal_table))] = len(normal_table) - 1
-        vertices = np.array(self.vertices, dtype=float).reshape(-1, 3)
-        faces = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
-        return Soup(vertices, faces, np.array(self.part, dtype=np.int64), list(self.parts), normal_table[index])
-
-
-def _three(words: list[str], what: str) -> list[float]:
-    if len(words) < 3:
-        raise ValueError(f"three {what} expected")
-    return [float(word) for word in words[:3]]
+def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
+    """Index of the vertex and of the normal of `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 0; −1 where it has no normal."""
+    fields = word.split("/")
+    return _index(fields[0], vertices), _index(fields[2], normals) if len(fields) > 2 and fields[2] else -1
 
 
 def _index(word: str, count: int) -> int:

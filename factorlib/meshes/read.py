@@ -14,17 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
-from factorlib.errors import InputError
-from factorlib.meshes.gltf import read_gltf
+from factorlib.errors import InputError, did_you_mean
+from factorlib.meshes.gltf import check_count, read_gltf
 from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
-from factorlib.meshes.parts import check_count, part_labels
 from factorlib.meshes.ply import read_ply
 from factorlib.meshes.soup import Soup, check
 from factorlib.meshes.stl import read_off, read_stl
-from factorlib.reading import read_bytes, reading
+from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # all in one file
 FORMATS = (*WITHIN, ".glb", ".gltf")
@@ -95,6 +94,45 @@ def read_soup(path: str | Path, limits: Limits) -> Soup:
             soup = read_gltf(path, limits)
     check_count(len(soup.parts), path)
     return check(soup, path)
+
+
+def part_labels(
+    names: Sequence[tuple[str, ...]],
+    materials: Sequence[str],
+    made_of: Mapping[str, str] | str | None,
+    overrides: Mapping[str, str],
+    file: str | Path,
+) -> np.ndarray:
+    """Material label (int16, from 1) of each part of a file, given the names it goes by.
+
+    made_of: part -> material, or the material of all parts;  overrides: part -> material, which go before it
+
+    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], {"shell": "red", "wood": "oak"}, {}, "a.obj").tolist()
+    [1, 2]
+    """
+    known = sorted({name for each in names for name in each})
+    parts, default = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
+    for part, material in [*parts.items(), *overrides.items(), *([(None, default)] if default is not None else [])]:
+        if part is not None and part not in known:
+            cure = did_you_mean(part, [one_line(name) for name in known])
+            raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=cure)
+        if material not in materials:
+            cure = did_you_mean(material, materials)
+            raise InputError(f"unknown material {material!r}", file=file, key=part, cure=cure)
+    labels = []
+    for goes_by in names:
+        chosen = next(filter(None, ({m[n] for n in goes_by if n in m} for m in (overrides, parts))), {default})
+        called = one_line(" / ".join(goes_by)) or "(unnamed)"
+        if len(chosen) > 1:
+            fault = f"part {called} gets several materials: {', '.join(sorted(chosen))}"
+            raise InputError(fault, file=file, cure="name it once")
+        if None in chosen:
+            cure = (
+                f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else "name it in an editor"
+            )
+            raise InputError(f"part {called} has no material", file=file, key=called, cure=cure)
+        labels.append(list(materials).index(*chosen) + 1)
+    return np.array(labels, dtype=np.int16)
 
 
 def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:

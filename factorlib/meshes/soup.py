@@ -1,7 +1,13 @@
-"""What a mesh file says, before it is made fit for use: triangles, their corners' normals, the names of their parts."""
+"""A mesh as its file says it, before it is made fit for use: triangles, their corners' normals, the names of their parts.
+
+Text in mesh files is UTF-8, or else Latin-1, in which old programs write names and comments.
+"""
 
 from __future__ import annotations
 
+import io
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -13,6 +19,8 @@ from factorlib.errors import InputError
 LARGEST = 1e15  # coordinate: cubes of it, and its ratio to any honest length, are numbers
 LEAST_EXTENT = 1e-12
 LEAST_SHARE = 1e-9  # extent over distance from the origin: below, too few digits are left for the shape
+QUOTED = 80  # characters of a line in a message
+LONGEST = 2_000_000  # characters of a line: words of a line are objects of their own
 
 
 class Soup(msgspec.Struct, frozen=True):
@@ -21,7 +29,7 @@ class Soup(msgspec.Struct, frozen=True):
     vertices  [V, 3] float64
     faces     [F, 3] int64
     part      [F] int: index into `parts`
-    parts     one tuple of names per part: whatever the file calls it (OBJ: groups, object, usemtl; glTF: primitive,
+    parts     one tuple of names per part: whatever the file calls it (OBJ: usemtl, groups, object; glTF: primitive,
               node, material); a dataset may use any of them
     normals   [F, 3, 3] float64 per corner, NaN where the file has none
     """
@@ -53,9 +61,9 @@ def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
 
 def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Normals by vertex as normals by corner, NaN where a face's index is not one of a vertex."""
-    there = (faces >= 0) & (faces < len(normals))
+    exists = (faces >= 0) & (faces < len(normals))
     table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
-    return table[np.where(there, faces, len(normals))]
+    return table[np.where(exists, faces, len(normals))]
 
 
 def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "f 3"]:
@@ -75,26 +83,72 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
 def check(soup: Soup, file: str | Path) -> Soup:
     """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
     place that leaves no digits for the shape."""
+    fault, cure = _fault(soup)
+    if fault:
+        raise InputError(fault, file=file, cure=cure)
+    return soup
 
-    def refuse(found: str, cure: str) -> None:
-        """Raise the error that names this file."""
-        raise InputError(found, file=file, cure=cure)
 
+def _fault(soup: Soup) -> tuple[str | None, str]:
     if len(soup.faces) == 0:
-        refuse("mesh without faces", "export triangles, not only points or lines")
+        return "mesh without faces", "export triangles, not only points or lines"
     low, high = int(soup.faces.min()), int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
-        refuse(f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}", "is the file whole?")
+        return f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}", "is the file whole?"
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
-        found = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
-        refuse(found, "remove them in a mesh editor, or export the mesh again")
-    corners, unit = soup.vertices[soup.faces.reshape(-1)], "give it in another unit, about its own origin"
+        fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
+        return fault, "remove them in a mesh editor, or export the mesh again"
+    corners, cure = soup.vertices[soup.faces.reshape(-1)], "give it in another unit, about its own origin"
     largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
     if largest > LARGEST:
-        refuse(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", unit)
+        return f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", cure
     if 0 < extent < LEAST_EXTENT:
-        refuse(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", unit)
+        return f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", cure
     if 0 < extent < LEAST_SHARE * largest:
-        refuse(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", unit)
-    return soup
+        return f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", cure
+    return None, ""
+
+
+def lines_of(content: bytes) -> Iterator[str]:
+    """Lines, whichever of the three ways they end; characters that Python alone takes for line ends are none.  ValueError
+    for one of more than LONGEST characters.
+
+    >>> list(lines_of("Stühle\\r\\nb\\rc\\x0cd\\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
+    (['Stühle', 'b', 'c\\x0cd'], ['Stühle'])
+    """
+    try:
+        content.decode("utf-8-sig")
+        encoding = "utf-8-sig"
+    except UnicodeDecodeError:
+        encoding = "latin-1"
+    with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line: a list of them is far larger
+        for line in text:
+            check_length(len(line))
+            yield line.rstrip("\n")
+
+
+def check_length(letters: int) -> None:
+    """ValueError for more letters than the line of any polygon has."""
+    if letters > LONGEST:
+        raise ValueError(f"a line of more than {LONGEST:,} letters")
+
+
+def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
+    """All numbers of a text, whatever white space is between them; ValueError for anything else in it.
+
+    >>> numbers_in("1 2.5\\n-3e2").tolist()
+    [1.0, 2.5, -300.0]
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # NumPy stops at what is no number, with a warning
+        try:
+            return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
+        except DeprecationWarning:
+            raise ValueError("something in it is no number") from None
+
+
+def quoted(line: str) -> str:
+    """A line as messages quote it, cut to QUOTED characters."""
+    line = line.strip()
+    return repr(line if len(line) <= QUOTED else line[: QUOTED - 1] + "…")

@@ -1,4 +1,7 @@
-"""STL files, binary and text, and OFF files, text: triangles of one part.  Normals, colours and what else they hold are left alone."""
+"""STL files, binary and text, and OFF files, text: triangles of one part.  Normals, colours and what else they hold are left alone.
+
+trimesh would read them, too, but takes a file that was cut short for a smaller mesh.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.soup import Soup, fans, of_one_part
-from factorlib.meshes.text import lines_of, numbers_in, shown
+from factorlib.meshes.soup import Soup, fans, lines_of, numbers_in, of_one_part, quoted
 
 HEADER = 84  # bytes: 80 for any text, 4 for the number of triangles
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -18,7 +20,7 @@ VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
 SOLID = re.compile(rb"\s*solid\b", re.IGNORECASE)
 OFF = re.compile(
     r"(ST)?C?N?OFF\b(?!\s*BINARY)|(?=[0-9])|OFF(?=[0-9])"
-)  # it may be left out, and so may the space after it
+)  # the word may be left out, so may the space after
 CURE = "is it whole? export it again"
 
 
@@ -30,23 +32,18 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> Soup:
         limits.check(3 * count, count, path)
         corners = np.frombuffer(content, FACET, count, HEADER)["corners"].reshape(-1, 3)
     elif SOLID.match(content):
-        corners = _text_corners(path, content, limits)
+        lines = VERTEX.findall(content)
+        limits.check(len(lines), len(lines) // 3, path)
+        if len(lines) % 3:
+            raise InputError(f"has {len(lines)} corners, which makes no triangles", file=path, cure=CURE)
+        for number, line in enumerate(lines, start=1):
+            if len(line.split(None, 3)) != 3:
+                raise InputError(f"vertex {number} has not three coordinates", file=path, cure=CURE)
+        corners = numbers_in(b"\n".join(lines)).reshape(-1, 3)
     else:
         as_binary = f"; as binary STL of {count} triangles it would have {size}" if count >= 0 else ""
         raise InputError(f"has {len(content)} bytes{as_binary}", file=path, cure=CURE)
     return of_one_part(corners, np.arange(len(corners)), path.stem)
-
-
-def _text_corners(path: Path, content: bytes, limits: Limits) -> np.ndarray:
-    """Of the lines `vertex x y z`, three to a facet."""
-    lines = VERTEX.findall(content)
-    if len(lines) % 3:
-        raise InputError(f"has {len(lines)} corners, which makes no triangles", file=path, cure=CURE)
-    limits.check(len(lines), len(lines) // 3, path)
-    wrong = next((number for number, line in enumerate(lines, start=1) if len(line.split(None, 3)) != 3), None)
-    if wrong:
-        raise InputError(f"vertex {wrong} has not three coordinates", file=path, cure=CURE)
-    return numbers_in(b"\n".join(lines)).reshape(-1, 3)
 
 
 def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
@@ -58,26 +55,21 @@ def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
     lines[0] = lines[0][keyword.end() :]
     lines = lines if lines[0].strip() else lines[1:]
     vertices, faces = _numbers(lines[0], 2, int, path) if lines else (0, 0)
-    if min(vertices, faces) < 0:
-        raise InputError(f"says {vertices} vertices and {faces} faces", file=path, cure=CURE)
     limits.check(vertices, faces, path)
-    if vertices + faces > len(lines) - 1:
-        found = f"says {vertices} vertices and {faces} faces, and has {len(lines) - 1} lines of them"
-        raise InputError(found, file=path, cure=CURE)
+    if min(vertices, faces) < 0 or vertices + faces > len(lines) - 1:
+        fault = f"says {vertices} vertices and {faces} faces, and has {len(lines) - 1} lines of them"
+        raise InputError(fault, file=path, cure=CURE)
     points = np.array([_numbers(line, 3, float, path) for line in lines[1 : vertices + 1]]).reshape(-1, 3)
-    polygons = [_polygon(line, path) for line in lines[vertices + 1 : vertices + faces + 1]]
+    polygons = []
+    for line in lines[vertices + 1 : vertices + faces + 1]:  # their number of corners, these, and perhaps a colour
+        (count,) = _numbers(line, 1, int, path)
+        if not 0 <= count < len(line.split()):
+            raise InputError(f"{quoted(line)} is no face: its first number counts its corners", file=path, cure=CURE)
+        polygons.append(_numbers(line, 1 + count, int, path)[1:])
     counts = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     limits.check(vertices, int(counts.sum()) - 2 * len(counts), path)
     corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
     return of_one_part(points, fans(counts, corners), path.stem)
-
-
-def _polygon(line: str, path: Path) -> list[int]:
-    """The corners of a face: their number, themselves, and perhaps a colour."""
-    (count,) = _numbers(line, 1, int, path)
-    if not 0 <= count < len(line.split()):
-        raise InputError(f"{shown(line)} is no face: its first number counts its corners", file=path, cure=CURE)
-    return _numbers(line, 1 + count, int, path)[1:]
 
 
 def _numbers(line: str, count: int, kind: type, path: Path) -> list:
@@ -87,4 +79,4 @@ def _numbers(line: str, count: int, kind: type, path: Path) -> list:
             raise ValueError("too few")
         return [kind(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{shown(line)} does not begin with {count} numbers", file=path, cure=CURE) from error
+        raise InputError(f"{quoted(line)} does not begin with {count} numbers", file=path, cure=CURE) from error

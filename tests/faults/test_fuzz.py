@@ -27,8 +27,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from factorlib.errors import InputError
-from factorlib.images.header import check_values
-from factorlib.images.limits import check_pixels
+from factorlib.images.limits import check_pixels, check_values
 from factorlib.images.photo import decoded, open_photo
 from factorlib.meshes import read_mesh
 from tests.faults.good import (

@@ -128,7 +128,7 @@ def test_many_and_long_names_of_parts_stay_cheap(tmp_path, name, text):
 
 
 def test_more_parts_than_any_mesh_has_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("factorlib.meshes.parts.MOST_PARTS", 1000)
+    monkeypatch.setattr("factorlib.meshes.gltf.MOST_PARTS", 1000)
     text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"g {k}\nf 1 2 3\n" for k in range(1001))
     with pytest.raises(InputError, match="1,001 parts"):
         read(put(tmp_path / "a.obj", text))

@@ -6,22 +6,20 @@ of a depth map into the ray through (0, 0)), here they are at 0.5.  It does not 
 
 from __future__ import annotations
 
-import re
+from typing import Annotated
 
 import msgspec
-import pycolmap
 
-from factorlib.dataset.numbers import check_rotation
+from factorlib.dataset.check import check_rotation
 from factorlib.dataset.paths import Refusal, file_of
-from factorlib.dataset.schema import Pose, Vec3
-from factorlib.dataset.sources.shot import Shot, colmap_camera
-from factorlib.dataset.sources.transforms import read_source
-from factorlib.reading import one_line
+from factorlib.dataset.schema import Number, Pose, Vec3
+from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
 
 KEY = "cameras.bop"
-ID = re.compile("[0-9]{1,18}")
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
-Nine = tuple[float, float, float, float, float, float, float, float, float]
+IDS = "it is not the id of an image: ids are whole numbers, of 18 digits at most"
+ImageId = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,18}\Z", description=IDS)]
+Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
 
 
 class SceneCamera(msgspec.Struct, frozen=True):
@@ -39,41 +37,29 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 
 def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
-    """The images of the scene in the dataset's folder `path`, by id."""
+    """The images of the scene in the dataset's folder `path`, by id; each is taken to be twice its principal point large."""
     camera_file, pose_file = (file_of(KEY, path, name, refuse) for name in (CAMERAS, POSES))
     if camera_file is None:
         refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
-    cameras = read_source(camera_file, dict[str, SceneCamera], KEY)
+    cameras = read_source(camera_file, dict[ImageId, SceneCamera], KEY)
     poses = read_source(pose_file, dict[str, list[SceneObject]], KEY) if pose_file else {}
     of_cameras, of_poses = (Refusal(refuse.folder / path / name, refuse.folder) for name in (CAMERAS, POSES))
-    for image in cameras:
-        if not ID.fullmatch(image):
-            of_cameras(one_line(image), "is not the id of an image", "ids are whole numbers, of 18 digits at most")
-    return [
-        Shot(
-            int(image),
-            _camera(image, camera, of_cameras),
-            None,
-            f"{CAMERAS}: {image}",
-            poses=_poses(image, poses, of_poses),
-        )
-        for image, camera in sorted(cameras.items(), key=lambda item: int(item[0]))
-    ]
+    shots = []
+    for image, camera in sorted(cameras.items(), key=lambda item: int(item[0])):
+        fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
+        if skew != 0 or min(fx, fy, cx, cy) <= 0:
+            cure = "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
+            of_cameras(f"{image}.cam_K", "is not the camera of square axes", cure)
+        size, params = (2 * cx + 1, 2 * cy + 1), [fx, fy, cx + 0.5, cy + 0.5]
+        pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, of_cameras)
+        instances = _poses(image, poses.get(image, []), of_poses)
+        shots.append(Shot(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
+    return shots
 
 
-def _camera(image: str, camera: SceneCamera, refuse: Refusal) -> pycolmap.Camera:
-    """Its image is taken to be as large as twice the principal point."""
-    fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
-    if skew != 0 or min(fx, fy, cx, cy) <= 0:
-        cure = "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
-        refuse(f"{image}.cam_K", "is not the camera of square axes", cure)
-    centre = cx + 0.5, cy + 0.5
-    return colmap_camera(f"{image}.cam_K", "PINHOLE", 2 * centre[0], 2 * centre[1], [fx, fy, *centre], refuse)
-
-
-def _poses(image: str, poses: dict[str, list[SceneObject]], refuse: Refusal) -> dict[int, list[Pose]]:
+def _poses(image: str, objects: list[SceneObject], refuse: Refusal) -> dict[int, list[Pose]]:
     result: dict[int, list[Pose]] = {}
-    for index, obj in enumerate(poses.get(image, [])):
+    for index, obj in enumerate(objects):
         rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
         check_rotation(f"{image}[{index}].cam_R_m2c", rows, refuse)
         result.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
