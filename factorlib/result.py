@@ -36,7 +36,7 @@ from factorlib.recipe.schema import is_light_file
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced, as_it_is
-from factorlib.report.png import data_uri
+from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs
 from factorlib.yamlfile import convert
