@@ -31,6 +31,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.images.write import write_hdr
 from factorlib.light.latlong import turned_map
+from factorlib.reading import check_plain
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
@@ -163,6 +164,7 @@ class Result:
         """
         light = self._solved.lights[self._photo(name)].illumination
         path = self.folder / "export" / "illumination" / f"{light}.exr"
+        check_plain(path, "an environment map", most_bytes=None)
         return Environment(read_rgb_exr(path).astype(float))
 
     def render(

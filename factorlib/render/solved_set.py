@@ -18,6 +18,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.reading import check_plain
 from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file
 from factorlib.recipe.table import read_table
 from factorlib.render.ground import Plane, resting_plane
@@ -28,6 +29,8 @@ from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.stage import Inputs
+
+LEAST_HEIGHT = 1e-6  # of a mesh to insert, in its radii
 
 log = logging.getLogger("factorlib.render")
 
@@ -45,7 +48,12 @@ class SolvedSet:
         self.lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
         self.grounds = msgspec.convert(inputs.facts["dataset.ground"], dict[str, GroundSlice])
         self.poses: dict[str, PhotoPoses] = read_poses(inputs["align"] / "poses.json")
-        self.table: MaterialTable = read_materials(inputs["export"] / "materials.json")
+        file = inputs["export"] / "materials.json"
+        self.table: MaterialTable = read_materials(file)
+        for name, material in self.table.materials.items():
+            if material.total > 1:
+                found = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
+                raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         self._meshes = MeshesOnce(inputs.file, self.names, crease_deg)
@@ -126,7 +134,17 @@ class SolvedSet:
         return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
     def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo."""
+        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
+
+        Raises InputError for a mesh without height.
+        """
+        mesh, materials, upward = self._mesh(name, material, up)
+        if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
+            cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
+            raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
+        return mesh, materials, upward
+
+    def _mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         axis = np.eye(3)["xyz".index(up)]
         if name == BALL:
             return sphere(1.0), (material or self.names[0],), axis
@@ -166,5 +184,11 @@ class SolvedSet:
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:
-            self._pixels = {photo: read_exr(self.inputs["masks"] / f"{photo}.exr")}  # one at a time: photos are large
+            file = self.inputs["masks"] / f"{photo}.exr"
+            check_plain(file, "an EXR", most_bytes=None)
+            self._pixels = {photo: read_exr(file)}  # one at a time: photos are large
+            for channel in (*"RGB", "label", "left_out"):
+                if channel not in self._pixels[photo]:
+                    cure = "run the stage `masks` again"
+                    raise InputError(f"has no channel {channel}", file=file, key=channel, cure=cure)
         return self._pixels[photo]
