@@ -67,13 +67,8 @@ class SolvedSet:
             raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
-                doubts = "; ".join(poses.objects[obj.name].doubts)
-                log.warning(
-                    "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s",
-                    photo,
-                    obj.name,
-                    doubts,
-                )
+                words = "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s"
+                log.warning(words, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
         height, width = self._masks(photo)["label"].shape
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
@@ -119,10 +114,8 @@ class SolvedSet:
         """The solved materials, and those of a table of one's own, which go before."""
         if table is None:
             return self.materials
-        own = read_table(self.inputs.file(f"recipe file:{table}"))
-        return self.materials | {
-            name: Reflectance(one.diffuse, one.specular, one.roughness) for name, one in own.items()
-        }
+        own = read_table(self.inputs.file(f"recipe file:{table}")).items()
+        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
 
     def ground(self, photo: str, neighbour: Placed) -> Ground:
         """Given with the photo, or what the neighbour rests on."""
@@ -149,12 +142,8 @@ class SolvedSet:
         if name == BALL:
             return sphere(1.0), (material or self.names[0],), axis
         if is_mesh_file(name):
-            wanted = material or self.names[0]
-            return (
-                read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], wanted, {}, self._meshes.crease_deg),
-                (wanted,),
-                axis,
-            )
+            wanted, file = material or self.names[0], self.inputs.file(f"recipe file:{name}")
+            return read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg), (wanted,), axis
         photo, obj = next((photo, obj) for photo, o in self.objects.items() for obj in o.objects if obj.mesh == name)
         placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
         upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
@@ -162,25 +151,17 @@ class SolvedSet:
 
     def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
         """The upward axes of the cameras of all objects of that mesh, in its frame."""
-        seen = [
-            self.poses[photo].objects[obj.name]
-            for photo, o in self.objects.items()
-            for obj in o.objects
-            if obj.mesh == mesh
-        ]
-        trusted = [pose for pose in seen if not pose.left_out] or seen
+        objects = [(photo, obj) for photo, each in self.objects.items() for obj in each.objects if obj.mesh == mesh]
+        poses = [self.poses[photo].objects[obj.name] for photo, obj in objects]
+        trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
         pose = poses.objects[obj.name]
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = np.array(pose.rotation), pose.translation
-        return Placed(
-            obj.name,
-            scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale),
-            tuple(self.names),
-            world_from_camera_frame(matrix),
-        )
+        mesh = scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale)
+        return Placed(obj.name, mesh, tuple(self.names), world_from_camera_frame(matrix))
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:
