@@ -31,12 +31,13 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.images.write import write_hdr
 from factorlib.light.latlong import turned_map
+from factorlib.reading import check_plain
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced, as_it_is
-from factorlib.report.png import data_uri
+from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs
 from factorlib.yamlfile import convert
@@ -52,29 +53,18 @@ def load_result(folder: str | Path) -> Result:
 
     Raises InputError where there is none, it is not whole, or its data set is no longer where it was or has other names in it.
     """
-    places = [
-        Path(*k * [".."]) for k in range(len(Path.cwd().parts))
-    ]  # those above too: a notebook runs in its own folder
-    found = next(
-        (
-            path
-            for place in places
-            for path in (place / folder, place / "build" / folder)
-            if os.path.isfile(path / MARK)
-        ),
-        None,
-    )
+    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # a notebook runs in its own folder
+    candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
+    found = next((path for path in candidates if os.path.isfile(path / MARK)), None)
     if found is None:
-        known = next(
-            filter(None, (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)), None
-        )
+        results = (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)
+        known = next(filter(None, results), None)
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
         raise InputError("there is no result here", file=folder, cure=cure)
     missing = [stage for stage in STAGES if not (found / stage).is_dir()]
     if missing:
-        raise InputError(
-            f"the result is not whole: {missing[0]} is missing", file=found, cure=f"make export DATASET={found.name}"
-        )
+        cure = f"make export DATASET={found.name}"
+        raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
     dataset = read_dataset(_dataset_of(found))
     solved = SolvedSet(_inputs(found, dataset))
     _check_names(dataset, solved, found)
@@ -106,9 +96,8 @@ def _check_names(dataset: Dataset, solved: SolvedSet, folder: Path) -> None:
         if photo not in solved.poses:
             missing.append(f"photo {photo!r}")
         else:
-            missing += [
-                f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in solved.poses[photo].objects
-            ]
+            posed = solved.poses[photo].objects
+            missing += [f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in posed]
     if missing:
         found = f"the result is of an earlier {FILE}: it has no {', no '.join(missing)}"
         raise InputError(found, file=folder, cure=f"make all DATASET={dataset.folder.name}")
@@ -163,6 +152,7 @@ class Result:
         """
         light = self._solved.lights[self._photo(name)].illumination
         path = self.folder / "export" / "illumination" / f"{light}.exr"
+        check_plain(path, "an environment map", most_bytes=None)
         return Environment(read_rgb_exr(path).astype(float))
 
     def render(
@@ -183,10 +173,8 @@ class Result:
         photo = self._photo(view)
         _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
-        return Picture(
-            traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom)),
-            self._solved.tone(photo),
-        )
+        traced = traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom))
+        return Picture(traced, self._solved.tone(photo))
 
     def relight(
         self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES
@@ -201,9 +189,8 @@ class Result:
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        return Picture(
-            traced, self._solved.tone(light) if isinstance(light, str) and light in self.photos else as_it_is
-        )
+        of_photo = isinstance(light, str) and light in self.photos
+        return Picture(traced, self._solved.tone(light) if of_photo else as_it_is)
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
@@ -241,16 +228,11 @@ def _check(kind: type, **numbers: float | None) -> None:
 
 def _row(name: str, material: Solved) -> str:
     def numbers(values: tuple[float, ...], errors: tuple[float, ...]) -> str:
-        """With their standard errors."""
         return ", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True))
 
-    stderr = material.stderr
-    cells = (
-        html.escape(name),
-        numbers(material.diffuse, stderr.diffuse),
-        numbers(material.specular, stderr.specular),
-        numbers((material.roughness,), (stderr.roughness,)),
-    )
+    of, stderr = material, material.stderr
+    colours = numbers(of.diffuse, stderr.diffuse), numbers(of.specular, stderr.specular)
+    cells = html.escape(name), *colours, numbers((of.roughness,), (stderr.roughness,))
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
@@ -261,9 +243,8 @@ class Environment(msgspec.Struct, frozen=True):
 
     def rotate(self, degrees: float) -> Environment:
         """Turned about the upright axis: what was toward the viewer goes to the right (+x) at 90°."""
-        return Environment(
-            turned_map(self.lat_long, rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0])))
-        )
+        rotation = rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))
+        return Environment(turned_map(self.lat_long, rotation))
 
     def to_exr(self, path: str | Path) -> None:
         """Write it as OpenEXR's lat-long environment."""

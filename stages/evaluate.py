@@ -18,8 +18,7 @@ from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.materials import compare_materials
-from factorlib.evaluate.relighting import compare_relighting
-from factorlib.evaluate.relit_set import compare_relit_set
+from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
 from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr

@@ -12,10 +12,9 @@ from pathlib import Path
 import msgspec
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
-from factorlib.report.appearance import exposures
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
-from factorlib.report.photos import material_tags, overview, photo_row, strip
+from factorlib.report.pictures import exposures, material_tags, overview, photo_row, strip
 from factorlib.report.viewer import viewed
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text

@@ -1,5 +1,6 @@
 """`factorlib.load_result`: what was solved, in Python."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -9,9 +10,10 @@ import pytest
 
 import factorlib
 from factorlib.errors import InputError
-from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
+from factorlib.jsonfile import read_json, write_json
 from tests.export import made_export
 
 
@@ -45,7 +47,7 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
         (lambda: result.scene("sid"), "did you mean 'side'"),
         (lambda: result.materials[["red"]], "did you mean 'red'"),
         (lambda: result.render("front", width=0), "width: expected `int` >= 8"),
-        (lambda: result.render("front", zoom=np.float64(0)), "zoom: expected `float` > 0"),
+        (lambda: result.render("front", zoom=np.float64(0)), "zoom: expected `float` >= 0.01"),
         (lambda: result.relight("chair", "side", samples=0), "samples: expected `int` >= 1"),
         (lambda: factorlib.load_result(tmp_path), "there is no result here"),
         (lambda: factorlib.load_result("a\0b"), "there is no result here"),
@@ -165,6 +167,39 @@ def test_a_notebook_shows_tables_and_pictures_and_names_are_names(result):
     assert "0.350 ± 0.100" in shown and "front, side" in shown
     assert result.render("front", samples=1)._repr_html_().startswith('<img src="data:image/png;base64,')
     assert result.environment("front")._repr_html_().startswith("<img")
+
+
+def a_pipe(file):
+    file.unlink()
+    os.mkfifo(file)
+
+
+def too_bright(file):
+    content = read_json(file)
+    content["materials"]["red"]["diffuse"][0] = 1e308
+    write_json(file, content)
+
+
+def without_label(file):
+    channels = read_exr(file)
+    del channels["label"]
+    write_exr(file, channels)
+
+
+@pytest.mark.parametrize(
+    "file, break_, ask, words",
+    [
+        ("export/illumination/front.exr", a_pipe, lambda r: r.environment("front"), ["is a pipe"]),
+        ("masks/front.exr", a_pipe, lambda r: r.render("front"), ["is a pipe"]),
+        ("masks/front.exr", without_label, lambda r: r.render("front"), ["no channel label", "stage `masks`"]),
+        ("export/materials.json", too_bright, lambda r: r, ["more light is reflected"]),
+    ],
+)
+def test_a_damaged_file_of_a_result_is_named(copy, file, break_, ask, words):
+    break_(copy / "build/set" / file)
+    with pytest.raises(InputError) as error:
+        ask(factorlib.load_result(copy / "build/set"))
+    assert all(word in str(error.value) for word in [file, *words]), str(error.value)
 
 
 def test_importing_the_package_imports_nothing_heavy():

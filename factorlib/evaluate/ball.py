@@ -69,10 +69,7 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
 
 
 class Lookup(msgspec.Struct, frozen=True):
-    """Which texels of a light's pyramid each direction reads: one of a finer and one of the next coarser level, and the coarser one's share.
-
-    Texels are numbered over all levels, the finest first; the numbers are the same for every light.
-    """
+    """Which texels of any light's pyramid each direction reads, numbered over all levels, the finest first; share: the coarser one's."""
 
     finer: Int[np.ndarray, "*n"]
     coarser: Int[np.ndarray, "*n"]
@@ -85,7 +82,7 @@ class Lookup(msgspec.Struct, frozen=True):
 
 
 def lookup_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Lookup:
-    """Of unit directions, each the mean of about so many steradians around it: between the two nearest levels."""
+    """The look-up of unit directions, each the mean of about so many steradians around it: between the two nearest levels."""
     finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
     below = np.minimum(level.astype(int), last - 1)
@@ -93,7 +90,6 @@ def lookup_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.nd
     offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last)])
 
     def at(k: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-        """The numbers of the texels of level k that the directions fall in."""
         return (offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32)
 
     return Lookup(at(below), at(below + 1), level - below)
@@ -148,7 +144,7 @@ class NarrowLobe(msgspec.Struct, frozen=True):
 
 
 def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> WideLobe | NarrowLobe:
-    """All of `glossy_ball` that is the same in every light, which is most of its work."""
+    """What `glossy_ball` computes alike for every light, which is most of its work."""
     alpha = max(float(alpha_of_roughness(roughness)), 1e-3)
     return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
 

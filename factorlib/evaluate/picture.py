@@ -60,7 +60,6 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
     total = np.maximum(_blurred(inside), 1e-12)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        """Over the window, of pixels inside the mask."""
         return _blurred(values * inside) / total
 
     a, b = a.astype(np.float32), b.astype(np.float32)

@@ -7,11 +7,23 @@ null_mean_colour    a flat disc of the true ball's mean colour
 
 Balls are seen along the light frame's own z axis (for a light fixed to a photo's camera: as that camera sees them).
 A ball is a "photo" for the gauge `channel_per_photo`.
+
+The relit set score: every pair of a recovered material and a recovered light counts, whether or not a photo shows it.
+
+    factor    f_c = exp(median over materials and over k_d, k_s of log(true / recovered)), one for each channel c of the whole set;
+              the materials are multiplied and the lights divided by it.  Reflectances of 0, true or recovered, have no logarithm
+              and are left out; 1 where none is left.
+    shown     s(L) = clip(e L, 0, 1)^(1/2.2), e = .5 / mean of the true ball's radiance over pixels and channels, for both balls
+    score     PSNR = −10 log₁₀ mean (s(recovered) − s(true))², dB over the ball's pixels and channels, at most 120
+    null      the same of a flat disc of the true ball's mean radiance, RGB
+
+A pair's radiance is linear in its reflectances and in its light, so the factor cancels in each of them: (f k_d) (E / f) = k_d E.
+So balls are made without it, and it is stated for what is compared apart: materials × factor, lights / factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,29 +31,30 @@ from jaxtyping import Float
 
 from factorlib.evaluate.ball import Light, NarrowLobe, WideLobe, ball_normals, diffuse_ball, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.evaluate.picture import mean_error, picture_error, white_of
-from factorlib.results.materials import Reflectance
-from factorlib.results.metrics import Kinds, Relighting, RelitBall
+from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
+from factorlib.results.materials import Reflectance, Vec3
+from factorlib.results.metrics import Kinds, Relighting, RelitBall, RelitSet
 
 BALL_SIZE = 32
+NORMALS, INSIDE = ball_normals(BALL_SIZE)
 KINDS = ("in_true_light", "in_estimated_light", "null_grey", "null_mean_colour")
 GREY = 0.5
+MEAN_SHOWN = 0.5  # of the true ball of the relit set score, linear, before it is clipped
 
 Samples = Float[np.ndarray, "_ 3"]
 
 
 @lru_cache(maxsize=16)
 def lobe_of(roughness: float) -> WideLobe | NarrowLobe:
-    """Of a ball; kept, for materials are shown in many lights.  16 take 200 MB at most."""
-    return glossy_lobe(ball_normals(BALL_SIZE)[0], roughness)
+    """The lobe of a ball, cached, for materials are shown in many lights.  16 take 200 MB at most."""
+    return glossy_lobe(NORMALS, roughness)
 
 
 class Appearances:
     """Balls of many materials in one light: each part of the reflection is rendered once."""
 
     def __init__(self, light: Light):
-        self.light, (self.normals, self.inside) = light, ball_normals(BALL_SIZE)
-        self.diffuse = diffuse_ball(light, self.normals)
+        self.light, self.diffuse = light, diffuse_ball(light, NORMALS)
         self.glossy: dict[float, Samples] = {}
 
     def ball(self, material: Reflectance) -> Samples:
@@ -85,26 +98,71 @@ def compare_relighting(
 
 
 def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]) -> list[RelitBall]:
-    _, inside = ball_normals(BALL_SIZE)
     whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
     factors = [gauge_factors(pictures, true, whites, below_white=True) for pictures in kinds]
 
-    def gauged(i: int, gauge: str) -> Kinds:
-        """The errors of ball i in one gauge."""
-        shown = zip(KINDS, kinds, factors)
-        return {
-            k: picture_error(_disc(p[i] * f[gauge][i], inside), _disc(true[i], inside), inside, whites[i])
-            for k, p, f in shown
-        }
+    def error(i: int, gauge: str, kind: int) -> Kinds:
+        pictures = _disc(kinds[kind][i] * factors[kind][gauge][i]), _disc(true[i])
+        return picture_error(*pictures, INSIDE, whites[i])
 
-    return [RelitBall(o, 1 / w, {g: gauged(i, g) for g in GAUGES}) for i, (o, w) in enumerate(zip(observed, whites))]
+    return [
+        RelitBall(o, 1 / w, {g: {name: error(i, g, k) for k, name in enumerate(KINDS)} for g in GAUGES})
+        for i, (o, w) in enumerate(zip(observed, whites))
+    ]
 
 
-def _disc(samples: Samples, inside: np.ndarray) -> Float[np.ndarray, "h w 3"]:
-    picture = np.zeros((*inside.shape, 3))
-    picture[inside] = samples
+def _disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
+    picture = np.zeros((*INSIDE.shape, 3))
+    picture[INSIDE] = samples
     return picture
 
 
 def _mean(balls: list[RelitBall]) -> dict[str, Kinds]:
     return {g: {k: mean_error([b.gauges[g][k] for b in balls]) for k in KINDS} for g in GAUGES}
+
+
+# ── The relit set score ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def compare_relit_set(
+    estimates: Mapping[str, Reflectance],
+    truths: Mapping[str, Reflectance],
+    estimated_lights: Mapping[str, Light],
+    true_lights: Mapping[str, Light],
+) -> RelitSet | None:
+    """The score over every material and every light that has both a truth and an estimate; None where there is no such pair."""
+    names, scores, nulls = [m for m in truths if m in estimates], {}, []
+    for light in [li for li in true_lights if li in estimated_lights]:
+        true, estimated = Appearances(true_lights[light]), Appearances(estimated_lights[light])
+        for m in names:
+            ball = true.ball(truths[m])
+            scores[m, light] = shown_psnr(estimated.ball(estimates[m]), ball)
+            nulls.append(shown_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
+    if not scores:
+        return None
+    worst = min(scores, key=scores.__getitem__)
+    mean, null = (round(float(np.mean(v)), 6) for v in (list(scores.values()), nulls))
+    factor = set_factor((estimates[m], truths[m]) for m in names)
+    return RelitSet(len(scores), mean, scores[worst], null, *worst, factor)
+
+
+def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
+    """The factor on the recovered reflectances, of (recovered, true) materials.
+
+    >>> true = Reflectance((0.4, 0.4, 0.1), (0.2, 0.1, 0.0), 0.3)
+    >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
+    (2.0, 1.0, 1.0)
+    """
+    both = np.array(
+        [[(m.diffuse, m.specular) for m in pair] for pair in pairs], float
+    )  # [m, pair, k_d or k_s, channel]
+    recovered, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
+    logs = [np.log(t[k]) - np.log(r[k]) for r, t in zip(recovered, true) for k in [(r > 0) & (t > 0)]]
+    return tuple(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
+
+
+def shown_psnr(recovered: Samples, true: Samples) -> float:
+    """PSNR in dB of two balls at the exposure of the true one, which is 1 where that is black."""
+    mean = float(np.mean(true, dtype=float))
+    exposure = MEAN_SHOWN / mean if mean > np.finfo(np.float32).tiny else 1.0
+    return psnr(tone_mapped(recovered, exposure), tone_mapped(true, exposure), 1.0)

@@ -103,7 +103,6 @@ def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.n
     found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
-        """Of one region, gauge by gauge."""
         return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
 
     return PhotoErrors(

@@ -37,9 +37,8 @@ class ExposedMap(msgspec.Struct, frozen=True):
 
 def write_script(folder: str | Path) -> None:
     """Write blender.py, which builds the scenes that `write_scene_json` writes to the same folder."""
-    write_text(
-        Path(folder) / "blender.py", files("factorlib.export").joinpath("blender.py.txt").read_text(encoding="utf-8")
-    )
+    script = files("factorlib.export").joinpath("blender.py.txt").read_text(encoding="utf-8")
+    write_text(Path(folder) / "blender.py", script)
 
 
 def write_scene_json(
@@ -52,24 +51,12 @@ def write_scene_json(
 ) -> None:
     """Write a photo's scene; of `materials` those that shapes name."""
     used = sorted({shape.material for shape in shapes})
-    scene = {
-        "camera": view,
-        "shapes": [_shape(shape) for shape in shapes],
-        "materials": {name: materials[name] for name in used},
-        "light": {
-            "file": light.file,
-            "exposure": light.exposure.tolist(),
-            "camera_from_light": light.camera_from_light.tolist(),
-        },
-        "max_depth": max_depth,
-    }
+    placed = [_plain(shape, "name", "file", "material", "cam_from_object") for shape in shapes]
+    lit, named = _plain(light, "file", "exposure", "camera_from_light"), {name: materials[name] for name in used}
+    scene = {"camera": view, "shapes": placed, "materials": named, "light": lit, "max_depth": max_depth}
     write_json(path, scene)
 
 
-def _shape(shape: Shape) -> dict[str, Any]:
-    return {
-        "name": shape.name,
-        "file": shape.file,
-        "material": shape.material,
-        "cam_from_object": shape.cam_from_object.tolist(),
-    }
+def _plain(of: Shape | ExposedMap, *names: str) -> dict[str, Any]:
+    values = {name: getattr(of, name) for name in names}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

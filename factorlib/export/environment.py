@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.light.lobes import Lobes, lobe_integral
+from factorlib.tracing.scene import node_directions
 
 NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: narrower ones would fall between them
 ROWS_AT_ONCE = 16
@@ -23,14 +24,6 @@ def sharpened(lobes: Lobes, spacing: float) -> Lobes:
     variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
     kept = lobe_integral(lobes.sharpness) / lobe_integral(1 / variance)
     return Lobes(lobes.axis, 1 / variance, lobes.weight * kept[:, None])
-
-
-def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
-    """Directions of the nodes of Mitsuba's `envmap`, in its own (y-up) frame."""
-    theta = np.arange(height) / (height - 1) * np.pi
-    phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
-    sin = np.sin(theta)[:, None]
-    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
 
 
 def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w 3"]:

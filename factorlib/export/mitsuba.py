@@ -56,10 +56,15 @@ class Environment(msgspec.Struct, frozen=True):
     camera_from_light: Float[np.ndarray, "3 3"]
 
 
-def scene_xml(
-    view: View, shapes: Sequence[Shape], materials: dict[str, Reflectance], light: Environment, max_depth: int = DIRECT
-) -> str:
-    """The scene as XML; `materials` are those that shapes name, by name."""
+def write_scene(
+    path: str | Path,
+    view: View,
+    shapes: Sequence[Shape],
+    materials: dict[str, Reflectance],
+    light: Environment,
+    max_depth: int = DIRECT,
+) -> None:
+    """Write the scene as XML; of `materials`, by name, those that shapes name."""
     scene = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": max_depth}.items():
         ET.SubElement(scene, "default", name=name, value=str(value))
@@ -72,19 +77,7 @@ def scene_xml(
     for shape in shapes:
         _add_shape(scene, shape)
     ET.indent(scene, " ")
-    return ET.tostring(scene, encoding="unicode") + "\n"
-
-
-def write_scene(
-    path: str | Path,
-    view: View,
-    shapes: Sequence[Shape],
-    materials: dict[str, Reflectance],
-    light: Environment,
-    max_depth: int = DIRECT,
-) -> None:
-    """Write the text of `scene_xml` to `path`."""
-    write_text(path, scene_xml(view, shapes, materials, light, max_depth))
+    write_text(path, ET.tostring(scene, encoding="unicode") + "\n")
 
 
 def material_xml(name: str, material: Reflectance) -> str:

@@ -9,18 +9,8 @@ from pathlib import Path
 from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError, did_you_mean
-from factorlib.recipe.schema import (
-    BALL,
-    KINDS,
-    AnyRecipe,
-    Grid,
-    Insert,
-    OfPhotos,
-    Relight,
-    Transfer,
-    is_light_file,
-    is_mesh_file,
-)
+from factorlib.recipe import schema
+from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file
 from factorlib.recipe.table import read_table
 from factorlib.yamlfile import load_yaml, read_yaml
 
@@ -39,46 +29,34 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
         if not is_plain_file(file):
             cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
-    if isinstance(recipe, OfPhotos):
+    if isinstance(recipe, schema.OfPhotos):
         _check(recipe.photos, photos, "photo", path, "photos")
         _check_once(recipe.photos, "photo", path, "photos")
-    if isinstance(recipe, Relight | Grid):
+    if isinstance(recipe, schema.Relight | schema.Grid):
         _check([name for name in recipe.lights if not is_light_file(name)], photos, "photo", path, "lights")
-    if isinstance(recipe, Relight):
+    if isinstance(recipe, schema.Relight):
         _check_once([Path(name).stem for name in recipe.lights], "light", path, "lights")
         if not recipe.lights and len(photos) == 1:
             fault = "there is no other photo whose light could be used"
             raise InputError(fault, file=path, key="lights", cure="name a file (.hdr, .exr)")
-    if isinstance(recipe, Transfer | Grid):
+    if isinstance(recipe, schema.Transfer | schema.Grid):
         _check(recipe.materials, dataset.spec.materials, "material", path, "materials")
-    if isinstance(recipe, Transfer | Insert):
-        own = read_table(path.parent / recipe.table) if recipe.table is not None else {}
-        wanted = (
-            recipe.materials.values()
-            if isinstance(recipe, Transfer)
-            else [recipe.material]
-            if recipe.material is not None
-            else []
-        )
-        _check(
-            wanted,
-            [*dataset.spec.materials, *own],
-            "material",
-            path,
-            "materials" if isinstance(recipe, Transfer) else "material",
-        )
-    if isinstance(recipe, Insert):
+    if isinstance(recipe, schema.Transfer | schema.Insert):
+        known = [*dataset.spec.materials, *(read_table(path.parent / recipe.table) if recipe.table is not None else [])]
+    if isinstance(recipe, schema.Transfer):
+        _check(recipe.materials.values(), known, "material", path, "materials")
+    if isinstance(recipe, schema.Insert):
+        _check([recipe.material] if recipe.material is not None else [], known, "material", path, "material")
         _check_insert(recipe, meshes, dataset, path)
     return recipe
 
 
-def _check_insert(recipe: Insert, meshes: list[str], dataset: Dataset, path: Path) -> None:
+def _check_insert(recipe: schema.Insert, meshes: list[str], dataset: Dataset, path: Path) -> None:
     if not is_mesh_file(recipe.mesh):
         _check([recipe.mesh], [BALL, *meshes], "mesh", path, "mesh")
     elif Path(recipe.mesh).suffix.lower() not in MESHES:
-        raise InputError(
-            f"{recipe.mesh!r} is no mesh that is read here", file=path, key="mesh", cure=f"one of {', '.join(MESHES)}"
-        )
+        found = f"{recipe.mesh!r} is no mesh that is read here"
+        raise InputError(found, file=path, key="mesh", cure=f"one of {', '.join(MESHES)}")
     if recipe.beside is not None:
         for photo in recipe.photos or [photo.name for photo in dataset.spec.photos]:
             objects = [obj.name for obj in dataset.photo(photo).objects]

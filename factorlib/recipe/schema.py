@@ -21,8 +21,8 @@ Samples = Annotated[int, msgspec.Meta(ge=1, le=65536)]
 Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-Factor = Annotated[float, msgspec.Meta(gt=0, le=100)]
-Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
+Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
+Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
 Backdrop = Literal["none", "light"]
 
 

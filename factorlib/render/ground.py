@@ -15,9 +15,7 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.render.photo_scene import Placed
 
-MOST_TILT_DEG = (
-    50.0  # of the upright axis against the cameras', on the mean: photos look down on things, and are held askew
-)
+MOST_TILT_DEG = 50.0  # of the upright axis against the cameras', on the mean: photos look down, and are held askew
 
 
 class Plane(msgspec.Struct, frozen=True):

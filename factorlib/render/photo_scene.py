@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.export.environment import mitsuba_map
 from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
@@ -22,11 +23,11 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, lobes_envmap, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, rendered, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # of the objects' distance
-MAP_ROWS = 1024  # of the lattice that Mitsuba is handed of a map
+LOBE_ROWS, MAP_ROWS = 256, 1024  # of the lattice that Mitsuba is handed of lobes, and of a map
 
 Light = Lobes | Float[np.ndarray, "h w 3"]
 
@@ -75,7 +76,9 @@ def world_from_camera_frame(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarra
 
 def light_entry(light: Light) -> dict[str, Any]:
     """The light as Mitsuba's `envmap`."""
-    return lobes_envmap(light) if isinstance(light, Lobes) else envmap(light, finer=max(1, MAP_ROWS // len(light)))
+    if isinstance(light, Lobes):
+        return envmap_of_nodes(mitsuba_map(light, LOBE_ROWS, 2 * LOBE_ROWS))
+    return envmap(light, finer=max(1, MAP_ROWS // len(light)))
 
 
 def shapes(
@@ -93,10 +96,7 @@ def shapes(
 
 
 def traced_photo(
-    scene: PhotoScene,
-    samples: int,
-    world_from_camera: Float[np.ndarray, "4 4"] | None = None,
-    with_light: bool = False,
+    scene: PhotoScene, samples: int, world_from_camera: Float[np.ndarray, "4 4"] | None = None, with_light: bool = False
 ) -> Float[np.ndarray, "h w 4"]:
     """Linear radiance times coverage, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
 

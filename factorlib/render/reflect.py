@@ -71,12 +71,8 @@ class Reflector:
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
-                some = None if shadows is None else shadows.take(rows)
-                result[rows] = (
-                    self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), some)
-                    .double()
-                    .numpy()
-                )
+                some, geometry = None if shadows is None else shadows.take(rows), (normals[rows], views[rows])
+                result[rows] = self._radiance(material, *map(self._tensor, geometry), some).double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
@@ -94,22 +90,15 @@ class Reflector:
         radiance = kd * ((diffuse_seen * self._diffuse(nz)) @ self.weight)
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)
-            radiance = radiance + ks * (
-                (specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)) @ self.weight
-            )
+            specular = specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)
+            radiance = radiance + ks * (specular @ self.weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
 
     def _seen(self, shadows: Shadows, normals: Tensor, views: Tensor, roughness: float) -> tuple[Tensor, Tensor]:
         """Shares of the diffuse and of the specular reflection of each lobe, [n, p]."""
-        visibility, directions = (
-            torch.from_numpy(shadows.visibility).float() / 255,
-            torch.from_numpy(shadows.directions).float(),
-        )
-        normals, views, lobes = (
-            normals.float(),
-            views.float(),
-            kernel(directions, self.axis.float(), self.sharpness.float()),
-        )
+        visibility, directions = (torch.from_numpy(each).float() for each in (shadows.visibility, shadows.directions))
+        visibility, normals, views = visibility / 255, normals.float(), views.float()
+        lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
         return tuple(seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
 

@@ -18,6 +18,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.reading import check_plain
 from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file
 from factorlib.recipe.table import read_table
 from factorlib.render.ground import Plane, resting_plane
@@ -28,6 +29,8 @@ from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.stage import Inputs
+
+LEAST_HEIGHT = 1e-6  # of a mesh to insert, in its radii
 
 log = logging.getLogger("factorlib.render")
 
@@ -45,7 +48,12 @@ class SolvedSet:
         self.lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
         self.grounds = msgspec.convert(inputs.facts["dataset.ground"], dict[str, GroundSlice])
         self.poses: dict[str, PhotoPoses] = read_poses(inputs["align"] / "poses.json")
-        self.table: MaterialTable = read_materials(inputs["export"] / "materials.json")
+        file = inputs["export"] / "materials.json"
+        self.table: MaterialTable = read_materials(file)
+        for name, material in self.table.materials.items():
+            if material.total > 1:
+                found = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
+                raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         self._meshes = MeshesOnce(inputs.file, self.names, crease_deg)
@@ -59,13 +67,8 @@ class SolvedSet:
             raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
-                doubts = "; ".join(poses.objects[obj.name].doubts)
-                log.warning(
-                    "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s",
-                    photo,
-                    obj.name,
-                    doubts,
-                )
+                words = "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s"
+                log.warning(words, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
         height, width = self._masks(photo)["label"].shape
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
@@ -111,10 +114,8 @@ class SolvedSet:
         """The solved materials, and those of a table of one's own, which go before."""
         if table is None:
             return self.materials
-        own = read_table(self.inputs.file(f"recipe file:{table}"))
-        return self.materials | {
-            name: Reflectance(one.diffuse, one.specular, one.roughness) for name, one in own.items()
-        }
+        own = read_table(self.inputs.file(f"recipe file:{table}")).items()
+        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
 
     def ground(self, photo: str, neighbour: Placed) -> Ground:
         """Given with the photo, or what the neighbour rests on."""
@@ -126,17 +127,23 @@ class SolvedSet:
         return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
     def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo."""
+        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
+
+        Raises InputError for a mesh without height.
+        """
+        mesh, materials, upward = self._mesh(name, material, up)
+        if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
+            cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
+            raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
+        return mesh, materials, upward
+
+    def _mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         axis = np.eye(3)["xyz".index(up)]
         if name == BALL:
             return sphere(1.0), (material or self.names[0],), axis
         if is_mesh_file(name):
-            wanted = material or self.names[0]
-            return (
-                read_mesh(self.inputs.file(f"recipe file:{name}"), [wanted], wanted, {}, self._meshes.crease_deg),
-                (wanted,),
-                axis,
-            )
+            wanted, file = material or self.names[0], self.inputs.file(f"recipe file:{name}")
+            return read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg), (wanted,), axis
         photo, obj = next((photo, obj) for photo, o in self.objects.items() for obj in o.objects if obj.mesh == name)
         placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
         upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
@@ -144,27 +151,25 @@ class SolvedSet:
 
     def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
         """The upward axes of the cameras of all objects of that mesh, in its frame."""
-        seen = [
-            self.poses[photo].objects[obj.name]
-            for photo, o in self.objects.items()
-            for obj in o.objects
-            if obj.mesh == mesh
-        ]
-        trusted = [pose for pose in seen if not pose.left_out] or seen
+        objects = [(photo, obj) for photo, each in self.objects.items() for obj in each.objects if obj.mesh == mesh]
+        poses = [self.poses[photo].objects[obj.name] for photo, obj in objects]
+        trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
         pose = poses.objects[obj.name]
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = np.array(pose.rotation), pose.translation
-        return Placed(
-            obj.name,
-            scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale),
-            tuple(self.names),
-            world_from_camera_frame(matrix),
-        )
+        mesh = scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale)
+        return Placed(obj.name, mesh, tuple(self.names), world_from_camera_frame(matrix))
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:
-            self._pixels = {photo: read_exr(self.inputs["masks"] / f"{photo}.exr")}  # one at a time: photos are large
+            file = self.inputs["masks"] / f"{photo}.exr"
+            check_plain(file, "an EXR", most_bytes=None)
+            self._pixels = {photo: read_exr(file)}  # one at a time: photos are large
+            for channel in (*"RGB", "label", "left_out"):
+                if channel not in self._pixels[photo]:
+                    cure = "run the stage `masks` again"
+                    raise InputError(f"has no channel {channel}", file=file, key=channel, cure=cure)
         return self._pixels[photo]

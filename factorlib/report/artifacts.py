@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.reading import check_plain
 from factorlib.results.exposures import read_exposures
 from factorlib.results.materials import Channels as Factors
 from factorlib.results.materials import MaterialTable, Solved, read_materials
@@ -21,31 +22,27 @@ from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.urm.observations import Observations, read_observations
 
+STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
+
 T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]
 Picture = Float[np.ndarray, "h w 3"]
 
 
-@runtime_checkable
-class PhotoSet(Protocol):
-    """The set as a whole (`SetSlice` of the dataset's schema), in the order of dataset.yaml."""
-
-    name: str
-    materials: list[str]
-    photos: list[str]
-
-
 class Artifacts(msgspec.Struct, frozen=True):
-    """The folders of the stages by name, the set, and the run log."""
+    """folders: of the stages, by name;  set: `SetSlice` of the dataset's schema, in the order of dataset.yaml;  log: of the run"""
 
     folders: Mapping[str, Path]
-    set: PhotoSet
+    set: Any
     log: Path | None = None
 
     def read(self, reader: Callable[[Path], T], stage: str, name: str) -> T | None:
-        """The file `name` of a stage's result, as `reader` reads it."""
+        """The file `name` of a stage's result, as `reader` reads it; InputError for what is no plain file."""
         path = self.folders[stage] / name
-        return reader(path) if path.exists() else None
+        if not path.exists():
+            return None
+        check_plain(path, "a result", most_bytes=None)
+        return reader(path)
 
     def rgb(self, stage: str, name: str) -> Picture | None:
         """Linear radiance of <name>.exr."""

@@ -2,109 +2,106 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from typing import Any
 
-import jinja2
 import msgspec
 
+from factorlib.export.gltf import EXTENSION, gltf_material
+from factorlib.export.materialx import materialx
+from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import read_png
-from factorlib.report import text
-from factorlib.report.appearance import Cell, balls, exposures, light_row, reflectance_maps
-from factorlib.report.artifacts import Artifacts
-from factorlib.report.choices import choices
-from factorlib.report.errors import error_tables
-from factorlib.report.forms import forms
-from factorlib.report.headlines import LOW_IOU, cautions, headlines
-from factorlib.report.photos import AMPLIFICATION, PhotoRow, longest_side
-from factorlib.report.plot import Series, line_plot
-from factorlib.report.png import box_of, data_uri, reduced
-from factorlib.report.training import training_of
-from factorlib.report.viewer import Viewed
+from factorlib.jsonfile import read_json
+from factorlib.report import pictures
+from factorlib.report.artifacts import STAGES, Artifacts
+from factorlib.report.headlines import headlines
+from factorlib.report.plot import line_plot
+from factorlib.report.template import rendered, sentences
+from factorlib.results.materials import Reflectance
+from factorlib.results.metrics import Metrics
 from factorlib.results.poses import AS_IT_IS
 
-STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
-FILTERS = ("number", "significant", "percent", "duration", "css_colour")
-CONTENTS = {
-    "summary": "Summary",
-    "relight": "Relight",
-    "photos": "Photos",
-    "materials": "Materials",
-    "appearance": "Materials × lights",
-    "reflectance": "Reflectance maps",
-    "lights": "Environment maps",
-    "errors": "Errors",
-    "solve": "Solve",
-    "poses": "Poses",
-    "training": "Reflection operator",
-    "cost": "Cost",
-}
+LOW_IOU = 0.85
+MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}  # fmt: skip
+CURVES = {"held_out_median_error": "median", "held_out_p95_error": "95th percentile"}  # columns of training.parquet
+ERROR = "relative error, %"
+Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 
 
-def page(run: Artifacts, rows: list[PhotoRow], tags: dict[str, str], viewed: Viewed | None) -> str:
+def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], viewed: dict[str, Any] | None) -> str:
     """The page as HTML, from the artifacts, the photos' rows, the materials' colours and what can be relit."""
-    metrics, exposure, facts, solved = run.metrics(), exposures(run), run.photo_facts(), run.solved()
-    cells = balls(run, {p: [m for m, n in f.pixels.items() if n > 0] for p, f in facts.items()}, exposure)
+    metrics, exposure, facts, solved = run.metrics(), pictures.exposures(run), run.photo_facts(), run.solved()
+    photos, poses = run.set.photos, run.poses()
+    pixels = {p: fact.pixels for p, fact in facts.items()}
+    cells = [
+        [pictures.ball_cell(run, m, p, pixels[p].get(m, 0) > 0, exposure[p]) for p in photos] for m in run.set.materials
+    ]
     errors = metrics.light.lights if metrics.light else {}
-    lights = [light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
+    lights = [pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
     reasons = sorted((why, section) for section, why in metrics.reasons.items())
     return rendered(
         "index.html",
-        contents=list(CONTENTS.items()),
         set=run.set,
         metrics=metrics,
         headlines=headlines(metrics),
         cautions=cautions(run, metrics),
         rows=rows,
-        amplification=AMPLIFICATION,
+        amplification=pictures.AMPLIFICATION,
         tags=tags,
         materials=_materials(run, cells),
         cells=cells,
-        maps=[(p, reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
+        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
         lights=[row for row in lights if row],
         missing={why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])},
-        errors=error_tables(metrics, run.set.photos, run.set.materials),
         gauge=msgspec.to_builtins(solved.gauge, order="sorted"),
-        choices=choices(solved.model),
+        choices=sentences("choices.txt", model=solved.model),
         model=msgspec.to_builtins(solved.model, order="sorted"),
         exposures={p: f for p, f in run.exposures().items() if any(abs(c - 1) > 1e-9 for c in f)},
         plots=_plots(run.table("solve", "convergence")),
-        poses=[(p, _overlay(run, p), entry, facts.get(p)) for p in run.set.photos if (entry := run.poses().get(p))],
+        poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
         low_iou=LOW_IOU,
         as_it_is=AS_IT_IS,
-        training=training_of(run),
+        training=_training(run),
         cost=cost_of(run.events(), STAGES),
         viewed=viewed,
     )
 
 
-def rendered(template: str, **context: Any) -> str:
-    """A template of this package with what it is about filled in; text is escaped."""
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
+    """Sentences about what should be distrusted, and about what is no better than a guess."""
+    errors, poses, facts = metrics.resynthesis.photos, run.poses(), run.photo_facts().values()
+    return sentences(
+        "cautions.txt",
+        metrics=metrics,
+        errors={name: errors[name] for name in run.set.photos if name in errors},
+        poses={name: poses[name] for name in run.set.photos if name in poses},
+        low_iou=LOW_IOU,
+        lights=len(run.illuminations()),
+        pixels={name: sum(photo.pixels.get(name, 0) for photo in facts) for name in run.set.materials},
     )
-    folder = files("factorlib.report") / "templates"
-    environment.loader = jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
-    environment.filters |= {name: getattr(text, name) for name in FILTERS} | {"in_script": _in_script}
-    environment.tests["of_a_parameter"] = lambda change: ": parameter " in change or ": default of parameter " in change
-    environment.globals["grouped"] = _grouped
-    return environment.get_template(template).render(context)
 
 
-def _in_script(value: msgspec.Struct) -> str:
-    """JSON that no `</script>` in a name can end."""
-    text = msgspec.json.encode(value).decode("utf-8")
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+def forms(name: str, material: Reflectance) -> dict[str, str]:
+    """A material by program, as text to paste there; numbers are linear, and docs/formats.md says what each makes of them."""
+    numbers = {key: getattr(material, key) for key in ("diffuse", "specular", "roughness", "alpha")}
+    gltf = gltf_material(material)
+    plain, specular = gltf["pbrMetallicRoughness"], gltf["extensions"][EXTENSION]
+    base, roughness = plain["baseColorFactor"][:3], plain["roughnessFactor"]
+    return {
+        "numbers": json.dumps({name: numbers}),
+        "Mitsuba": material_xml(name, material),
+        "Blender": rendered("blender.txt", name=repr(name), material=material) + "\n",
+        "MaterialX": materialx({name: material}),
+        "glTF": json.dumps({"name": name, **gltf}),
+        "three.js": rendered("three.txt", base=base, roughness=roughness, specular=specular),
+    }
 
 
-def _grouped(head: list[str]) -> list[tuple[str, int]]:
-    """The second line of a table's head, "what|group": groups and their widths, in order."""
-    groups = [title.partition("|")[2] for title in head]
-    return [(name, len(list(run))) for name, run in groupby(groups)]
-
-
-def _materials(run: Artifacts, cells: list[list[Cell]]) -> list[dict[str, Any]]:
+def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[str, Any]]:
     """What the table says of each material that was solved; ball: in the light of the photo that shows it most."""
     solved, exported, facts = run.solved().materials, run.exported(), run.photo_facts()
     rows = []
@@ -123,66 +120,103 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     if pixels is None:
         return None
     label = run.exr("masks", photo)["label"] > 0.5
-    crop = pixels[box_of(label, 0.15)] if label.shape == pixels.shape[:2] else pixels
-    return data_uri(reduced(crop.astype("f4"), longest_side(len(run.set.photos))).round().astype("u1"))
+    crop = pixels[pictures.box_of(label, 0.15)] if label.shape == pixels.shape[:2] else pixels
+    return pictures.data_uri(
+        pictures.reduced(crop.astype("f4"), pictures.longest_side(len(run.set.photos))).round().astype("u1")
+    )
 
 
-def _plots(history: dict[str, list]) -> list[tuple[str, list[str]]]:
-    """(SVG, names of its lines) of the solve's history."""
+def _plots(history: dict[str, list]) -> list[Plot]:
+    """Losses and number of lobes by accepted step of the solve."""
     if not history:
         return []
     steps = list(range(len(history["loss"])))
-    rounds = [k for k in steps[1:] if history["round"][k] != history["round"][k - 1]]
+    rules = [k for k in steps[1:] if history["round"][k] != history["round"][k - 1]]
     named = {"loss": "loss", "held out": "held_out"}
-    losses = [Series(name, steps, history[column]) for name, column in named.items() if column in history]
-    count = [Series("lobes", steps, history["lobes"])]
+    losses = {name: (steps, history[column]) for name, column in named.items() if column in history}
+    count = {"lobes": (steps, history["lobes"])}
     return [
-        (line_plot(losses, "accepted step", "loss", log_y=True, steps=rounds), [s.name for s in losses]),
-        (line_plot(count, "accepted step", "light lobes, all lights", steps=rounds), ["lobes"]),
+        (line_plot(losses, "accepted step", "loss", log_y=True, rules=rules), list(losses)),
+        (line_plot(count, "accepted step", "light lobes, all lights", rules=rules), list(count)),
     ]
+
+
+# ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _training(run: Artifacts) -> dict[str, Any] | None:
+    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}, and training.parquet.
+
+    columns: the measures that occur;  lines: (level, name, numbers), level 0 a network, 1 a quantity, 2 a bin of it
+    """
+    accuracy = run.read(read_json, "train", "accuracy.json")
+    if accuracy is None:
+        return None
+    columns = {key: title for key, title in MEASURES.items() if f"'{key}'" in str(accuracy)}
+    lines = [line for part, table in sorted(accuracy.items(), reverse=True) for line in _lines(part, table, 0)]
+    bins = [_binned(*item) for item in accuracy.get("specular", {}).items() if isinstance(item[1], dict)]
+    curve = _curve(run.table("train", "training"))
+    return {"columns": columns, "lines": lines, "curve": curve, "bins": [plot for plot in bins if plot[0]]}
+
+
+def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
+    yield level, name, table
+    for key in _in_order(key for key, value in table.items() if isinstance(value, dict)):
+        yield from _lines(key, table[key], level + 1)
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Bins in the order of what they hold, by their leading numbers: "3 to 30" before "30 to 300"."""
+    leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
+    return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
+
+
+def _binned(quantity: str, bins: Mapping[str, Mapping[str, float]]) -> Plot:
+    """The specular error by bins of a quantity."""
+    names = _in_order(bins)
+    values = {MEASURES[k]: [100 * bins[name].get(k, math.nan) for name in names] for k in ("median", "p95")}
+    lines = {title: (range(len(names)), errors) for title, errors in values.items()}
+    return line_plot(lines, quantity, ERROR, log_y=True, names=names), list(lines)
+
+
+def _curve(table: dict[str, list]) -> Plot:
+    """Errors of each network by step; columns are part, step and `CURVES`."""
+    lines = {}
+    for part in sorted(set(table.get("part", [])), reverse=True):
+        rows = [k for k, name in enumerate(table["part"]) if name == part]
+        for column in [column for column in CURVES if column in table]:
+            errors = [100 * table[column][k] for k in rows]
+            lines[f"{part}, {CURVES[column]}"] = [table["step"][k] for k in rows], errors
+    return line_plot(lines, "training step", ERROR, log_y=True), list(lines)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class StageCost(msgspec.Struct, frozen=True):
-    """seconds: wall time summed over the stage's steps;  longest: of its longest step;  memory_mb: largest peak of any."""
-
-    stage: str
-    steps: int
-    seconds: float
-    longest: float
-    cpu_seconds: float | None
-    memory_mb: float | None
-
-
-class Cost(msgspec.Struct, frozen=True):
-    """machines: the different ones that steps ran on, in words;  warnings: in the order of the stages, each once."""
-
-    stages: list[StageCost]
-    machines: list[str]
-    warnings: list[tuple[str, str]]
-
-
-def cost_of(events: list[dict], order: list[str]) -> Cost:
+def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
     """What each stage cost, the last time each step ran: the only part of the page that differs from run to run.
 
     A line of the log is {"event": "done", "stage", "photo", "seconds", "cpu_seconds", "memory_mb", "machine", …} for a step, or
-    {"event": "warning", "stage", "photo", "text"}; stages in the order given.
+    {"event": "warning", "stage", "photo", "text"}.
+    stages: in the order given, with seconds of all steps and of the longest, and the largest peak of memory
+    machines: those that steps ran on, in words;  warnings: (stage, text) in the order of the stages, each once
     """
     last = {(e["stage"], e.get("photo")): e for e in events if e.get("event") == "done" and "seconds" in e}
     by_stage = {s: [e for (stage, _), e in last.items() if stage == s] for s in order}
     machines = sorted({_machine(e["machine"]) for e in last.values() if e.get("machine")})
     warned = {(e.get("stage") or "", e["text"]) for e in events if e.get("event") == "warning" and e.get("text")}
     ranked = sorted(warned, key=lambda w: (order.index(w[0]) if w[0] in order else len(order), w[1]))
-    return Cost([_stage_cost(stage, steps) for stage, steps in by_stage.items() if steps], machines, ranked)
+    stages = [_stage_cost(stage, steps) for stage, steps in by_stage.items() if steps]
+    return {"stages": stages, "machines": machines, "warnings": ranked}
 
 
-def _stage_cost(stage: str, steps: list[dict]) -> StageCost:
+def _stage_cost(stage: str, steps: list[dict]) -> dict[str, Any]:
     names = ("seconds", "cpu_seconds", "memory_mb")
     seconds, cpu, memory = ([float(e[name]) for e in steps if e.get(name) is not None] for name in names)
-    busy, peak = sum(cpu) if cpu else None, max(memory, default=None)
-    return StageCost(stage, len(steps), sum(seconds), max(seconds), busy, peak)
+    peak, busy = max(memory, default=None), sum(cpu) if cpu else None
+    return {
+        "stage": stage, "steps": len(steps), "seconds": sum(seconds), "longest": max(seconds), "cpu_seconds": busy, "memory_mb": peak
+    }  # fmt: skip
 
 
 def _machine(machine: dict) -> str:

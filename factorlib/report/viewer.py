@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import open3d as o3d
 import trimesh
@@ -23,93 +22,57 @@ from factorlib.export.environment import sharpened
 from factorlib.light.lobes import Lobes
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Reflectance
 
 MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
 FACES = (32, 64, 128, 256)  # texels across a face of the cube map
 FINE_ENOUGH = 0.7  # texel over the width 1/√λ of the sharpest lobe
 
 
-class Part(msgspec.Struct, frozen=True):
-    """The triangles of one material, base64 of little-endian numbers.
-
-    vertices: uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle;  normals: int16, times 32767;  triangles: uint32
-    """
-
-    material: str
-    vertices: str
-    normals: str
-    triangles: str
-
-
-class ViewedMesh(msgspec.Struct, frozen=True):
-    """A mesh, and how a photo shows it.
-
-    rotation: y-up camera from object, row by row;  eye: unit, from the object to that camera;  simplified_from: its triangles, where fewer are shown
-    """
-
-    name: str
-    photo: str | None
-    rotation: list[float]
-    eye: list[float]
-    parts: list[Part]
-    simplified_from: int | None = None
-
-
-class ViewedLight(msgspec.Struct, frozen=True):
-    """lobes: base64 float32, 7 a lobe: axis (y-up), sharpness, weight;  face: texels across a face of the cube map they are drawn into"""
-
-    face: int
-    lobes: str
-
-
-class ViewedPhoto(msgspec.Struct, frozen=True):
-    """A photo's light. rotation: y-up light from y-up camera, row by row;  gain: on the light, per channel;  exposure: shows the photo well"""
-
-    name: str
-    light: str
-    rotation: list[float]
-    gain: list[float]
-    exposure: float
-
-
-class Viewed(msgspec.Struct, frozen=True):
-    """All that can be chosen."""
-
-    meshes: list[ViewedMesh]
-    materials: dict[str, Reflectance]
-    lights: dict[str, ViewedLight]
-    photos: list[ViewedPhoto]
-
-
 def viewed(
     run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]
-) -> Viewed | None:
-    """lights, objects: slices of the photos;  exposure: by photo.  None where no light or no material was exported."""
+) -> dict[str, Any] | None:
+    """All that can be chosen, as the viewer's script reads it; None where no light or no material was exported.
+
+    lights, objects: slices of the photos;  exposure: by photo, shows it well.  Strings of numbers are base64, little-endian.
+
+    meshes     see `_mesh`
+    materials  by name
+    lights     by name: face, texels across a face of the cube map they are drawn into; lobes, float32, 7 a lobe: axis (y-up),
+               sharpness, weight
+    photos     name, light, rotation: y-up light from y-up camera, row by row; gain on the light, per channel; exposure
+    """
     lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported()
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None
-    photos = [
-        _photo(run, name, lights[name], exposure[name]) for name in run.set.photos if lights[name].illumination in lobes
-    ]
-    return Viewed(_meshes(run, objects), materials, {name: _light(found) for name, found in lobes.items()}, photos)
+    photos, gains = [name for name in run.set.photos if lights[name].illumination in lobes], run.exposures()
+    return {
+        "meshes": _meshes(run, objects),
+        "materials": materials,
+        "lights": {name: _light(each) for name, each in lobes.items()},
+        "photos": [
+            {
+                "name": name,
+                "light": lights[name].illumination,
+                "rotation": _turn(lights[name]),
+                "gain": gains.get(name, (1.0,) * 3),
+                "exposure": exposure[name],
+            }
+            for name in photos
+        ],
+    }
 
 
-def _photo(run: Artifacts, name: str, light: LightSlice, exposure: float) -> ViewedPhoto:
+def _turn(light: LightSlice) -> list[float]:
     world_from_camera = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera)
-    rotation = YUP_FROM_CAMERA @ world_from_camera @ YUP_FROM_CAMERA.T
-    return ViewedPhoto(
-        name, light.illumination, rotation.ravel().tolist(), list(run.exposures().get(name, (1.0,) * 3)), exposure
-    )
+    return (YUP_FROM_CAMERA @ world_from_camera @ YUP_FROM_CAMERA.T).ravel().tolist()
 
 
-def _light(lobes: Lobes) -> ViewedLight:
+def _light(lobes: Lobes) -> dict[str, Any]:
     texel = FINE_ENOUGH / np.sqrt(lobes.sharpness.max(initial=1.0))
     face = next((n for n in FACES if spacing_of(n) <= texel), FACES[-1])
-    found = sharpened(lobes, spacing_of(face)).turned(YUP_FROM_CAMERA)
-    table = np.column_stack([found.axis, found.sharpness, found.weight])
-    return ViewedLight(face, _base64(table.astype("<f4")))
+    lobes = sharpened(lobes, spacing_of(face)).turned(YUP_FROM_CAMERA)
+    return {"face": face, "lobes": _base64(np.column_stack([lobes.axis, lobes.sharpness, lobes.weight]), "<f4")}
 
 
 def spacing_of(face: int) -> float:
@@ -124,23 +87,25 @@ def spacing_of(face: int) -> float:
 # ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _meshes(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[ViewedMesh]:
+def _meshes(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[dict[str, Any]]:
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
-    parts = {name: _parts(file) for name, file in files.items()}
-    triangles = {name: sum(len(part.faces) for part in found.values()) for name, found in parts.items()}
-    share = min(1.0, MOST_TRIANGLES / max(1, sum(triangles.values())))
-    return [_mesh(run, name, found, share, objects) for name, found in parts.items()]
-
-
-def _parts(file: Path) -> dict[str, trimesh.Trimesh]:
-    """By material, as `export` names them; vertices and normals as they stand in the file."""
-    geometry = trimesh.load_scene(file, process=False).geometry
-    return {name: geometry[name] for name in sorted(geometry)}
+    loaded = {name: trimesh.load_scene(file, process=False).geometry for name, file in files.items()}
+    parts = {name: {material: each[material] for material in sorted(each)} for name, each in loaded.items()}
+    triangles = sum(len(part.faces) for each in parts.values() for part in each.values())
+    share = min(1.0, MOST_TRIANGLES / max(1, triangles))
+    return [_mesh(run, name, each, share, objects) for name, each in parts.items()]
 
 
 def _mesh(
     run: Artifacts, name: str, parts: Mapping[str, trimesh.Trimesh], share: float, objects: Mapping[str, ObjectsSlice]
-) -> ViewedMesh:
+) -> dict[str, Any]:
+    """A mesh, and how a photo shows it.
+
+    rotation: y-up camera from object, row by row;  eye: unit, from the object to that camera
+    parts: by material; vertices uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle; normals int16, times 32767;
+           triangles uint32
+    simplified_from: its triangles, where fewer are handed over
+    """
     photo, rotation, translation, scale = _pose(run, name, objects)
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -148,12 +113,25 @@ def _mesh(
     toward = -(YUP_FROM_CAMERA @ (rotation @ centre + translation))
     length = np.linalg.norm(toward)
     eye = toward / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    found, count = [], sum(len(part.faces) for part in parts.values())
+    packed, count = [], sum(len(part.faces) for part in parts.values())
     for material, part in parts.items():
         vertex, normal, faces = _simplified(part, share)
-        found.append(_packed(material, (vertex * scale - centre) / radius, normal / scale, faces))
-    turned = YUP_FROM_CAMERA @ rotation
-    return ViewedMesh(name, photo, turned.ravel().tolist(), eye.tolist(), found, count if share < 1 else None)
+        unit, normal = (vertex * scale - centre) / radius, normal / scale
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        packed.append({
+            "material": material,
+            "vertices": _base64(np.rint((np.clip(unit, -1, 1) + 1) * 32767.5), "<u2"),
+            "normals": _base64(np.rint(32767 * normal), "<i2"),
+            "triangles": _base64(faces, "<u4"),
+        })  # fmt: skip
+    return {
+        "name": name,
+        "photo": photo,
+        "rotation": (YUP_FROM_CAMERA @ rotation).ravel().tolist(),
+        "eye": eye.tolist(),
+        "parts": packed,
+        "simplified_from": count if share < 1 else None,
+    }
 
 
 def _pose(run: Artifacts, mesh: str, objects: Mapping[str, ObjectsSlice]) -> tuple:
@@ -179,16 +157,5 @@ def _simplified(
     return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), np.asarray(mesh.triangles)
 
 
-def _packed(
-    material: str, unit: Float[np.ndarray, "v 3"], normal: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Part:
-    """unit: positions within [−1, 1]"""
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    vertices = np.rint((np.clip(unit, -1, 1) + 1) * 32767.5).astype("<u2")
-    return Part(
-        material, _base64(vertices), _base64(np.rint(32767 * normal).astype("<i2")), _base64(faces.astype("<u4"))
-    )
-
-
-def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+def _base64(values: np.ndarray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values.astype(kind)).tobytes()).decode("ascii")

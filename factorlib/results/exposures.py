@@ -21,7 +21,6 @@ def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
     exposures = read_result(path, dict[str, Channels], "solve", cure)
     for photo, channels in exposures.items():
         if min(channels) <= 0:
-            raise InputError(
-                "an exposure is not a positive number", file=path, key=photo, cure=cure or "run the stage `solve` again"
-            )
+            cure = cure or "run the stage `solve` again"
+            raise InputError("an exposure is not a positive number", file=path, key=photo, cure=cure)
     return exposures

@@ -27,9 +27,8 @@ def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
     rows = [np.column_stack([lights[n].axis, lights[n].sharpness, lights[n].weight]) for n in names]
     table = np.concatenate([np.zeros((0, len(COLUMNS))), *rows]).astype(float)
     illumination = [name for name, part in zip(names, rows, strict=True) for _ in range(len(part))]
-    columns = {"illumination": pa.array(illumination, pa.string())} | {
-        c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)
-    }
+    columns = {"illumination": pa.array(illumination, pa.string())}
+    columns |= {c: pa.array(table[:, k]) for k, c in enumerate(COLUMNS)}
     about = {"frame": FRAME, "lobe": "weight * exp(sharpness * (dot(direction, axis) - 1))", "illuminations": names}
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
     with writing(path):
@@ -41,9 +40,8 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
     columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=cure)
     with reading(WHAT, path, cure=cure):
         names = msgspec.convert(about["illuminations"], list[str])
-        values = np.column_stack(
-            [columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]
-        ).reshape(-1, len(COLUMNS))
+        values = [columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]
+        values = np.column_stack(values).reshape(-1, len(COLUMNS))
         illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
         if not set(illumination) <= set(names):
             raise ValueError("a lobe of an illumination that its metadata do not name")

@@ -158,7 +158,6 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
     """The materials called `names`; InputError where one is missing in the table, which was read from `path`."""
     for name in names:
         if name not in table.materials:
-            raise InputError(
-                f"not the materials of this set: {name!r} is missing", file=path, cure="run the stage `solve` again"
-            )
+            found = f"not the materials of this set: {name!r} is missing"
+            raise InputError(found, file=path, cure="run the stage `solve` again")
     return [table.materials[name] for name in names]

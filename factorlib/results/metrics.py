@@ -6,7 +6,7 @@ set          counts of photos, materials, illuminations and of the connected com
 resynthesis  always there: `factorlib.evaluate.resynthesis`
 materials    `factorlib.evaluate.materials`
 relighting   `factorlib.evaluate.relighting`
-relit_set    `factorlib.evaluate.relit_set`: the relit set score
+relit_set    `factorlib.evaluate.relighting`: the relit set score
 light        `factorlib.evaluate.lights`
 normals      photo -> `NormalError`; see `factorlib.evaluate.geometry`
 poses        photo -> object -> `PoseError`

@@ -148,6 +148,5 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
-                raise InputError(
-                    "a pose that is no rotation and translation", file=path, key=f"{key}.{name}", cure=cure
-                )
+                found = "a pose that is no rotation and translation"
+                raise InputError(found, file=path, key=f"{key}.{name}", cure=cure)

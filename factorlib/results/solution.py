@@ -36,9 +36,7 @@ class Earlier(msgspec.Struct, frozen=True):
 
     def beside(self, relative: dict[str, float]) -> Earlier:
         """With exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
-        exposures = {
-            photo: tuple(e / relative.get(photo, 1.0) for e in channels) for photo, channels in self.exposures.items()
-        }
+        exposures = {p: tuple(e / relative.get(p, 1.0) for e in each) for p, each in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)
 
 
@@ -50,19 +48,12 @@ def read_earlier(folder: Path) -> Earlier:
     """Raises InputError for files that the stage `solve` did not write."""
     table, lobes, exposures = (folder / name for name in FILES)
     earlier = Earlier(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
-    _check(
-        set(earlier.table.gauge.component) == set(earlier.table.materials),
-        table,
-        "`gauge.component` names other materials",
-    )
+    same = set(earlier.table.gauge.component) == set(earlier.table.materials)
+    _check(same, table, "`gauge.component` names other materials")
     for name, light in earlier.lights.items():
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
-        good = (
-            finite
-            and (light.weight >= 0).all()
-            and (light.sharpness > 0).all()
-            and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
-        )
+        shaped = (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
+        good = finite and shaped and (light.weight >= 0).all()
         _check(good, lobes, f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis")
     return earlier
 

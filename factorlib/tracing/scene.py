@@ -19,16 +19,13 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
-from factorlib.export.environment import mitsuba_map
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
-from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 from factorlib.tracing.variant import mitsuba
 
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
-LOBE_ROWS = 256  # of the map that lobes are drawn on
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
@@ -53,12 +50,8 @@ def bsdf(material: Material) -> dict[str, Any]:
     lambertian = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
     if share == 0:
         return lambertian
-    return {
-        "type": "blendbsdf",
-        "weight": float(share),
-        "bsdf_0": lambertian,
-        "bsdf_1": _conductor(specular / share, material.roughness),
-    }
+    conductor = _conductor(specular / share, material.roughness)
+    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": conductor}
 
 
 def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
@@ -84,11 +77,6 @@ def rigid(
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix
-
-
-def lobes_envmap(lobes: Lobes, height: int = LOBE_ROWS) -> dict[str, Any]:
-    """An emitter of lobes given in OpenCV's camera axes, in the world that is the y-up turn of these."""
-    return {"type": "envmap", "bitmap": mitsuba().Bitmap(mitsuba_map(lobes, height, 2 * height).astype(np.float32))}
 
 
 def shape(
@@ -118,28 +106,19 @@ def sensor(
     """
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
-    (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
-    offset = {
-        "principal_point_offset_x": (w / 2 - cx) / w,
-        "principal_point_offset_y": (h / 2 - cy) / h,
-    }  # as its pictures, not its x axis
+    (cx, cy), (w, h), kind = camera.centre, (camera.width, camera.height), "rgba" if alpha else "rgb"
+    offset = {"x": (w / 2 - cx) / w, "y": (h / 2 - cy) / h}  # as its pictures, not its x axis
+    film = {"type": "hdrfilm", "width": w, "height": h, "rfilter": {"type": "box"}, "pixel_format": kind, **crop}
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal))),
         "near_clip": near,
         "far_clip": 1e7 * near,
-        **{name: value for name, value in offset.items() if value},
+        **{f"principal_point_offset_{axis}": value for axis, value in offset.items() if value},
         "to_world": transform(world_from_camera @ MITSUBA_FROM_CAMERA),
         "sampler": {"type": SAMPLER},
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgba" if alpha else "rgb",
-            **crop,
-        },
+        "film": film,
     }
 
 
@@ -166,10 +145,8 @@ def rendered(
     """
     mi = mitsuba()
     # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
-    loaded = {
-        name: mi.load_dict(entry, parallel=False) if isinstance(entry, dict) else entry
-        for name, entry in entries.items()
-    }
+    plain = {name: entry for name, entry in entries.items() if isinstance(entry, dict)}
+    loaded = entries | {name: mi.load_dict(entry, parallel=False) for name, entry in plain.items()}
     integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
@@ -180,13 +157,20 @@ def rendered(
 def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
     """An emitter of a lat-long map in the world's frame: bilinear between the map's texel centres."""
     height, width = lat_long.shape[:2]
-    rows, columns = finer * height + 1, finer * width
-    theta = np.arange(rows) / (rows - 1) * np.pi
-    phi = (0.5 - (np.arange(columns) + 0.5) / columns) * 2 * np.pi
+    return envmap_of_nodes(sampled(lat_long, node_directions(finer * height + 1, finer * width)))
+
+
+def envmap_of_nodes(radiance: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
+    """An emitter of radiance at `node_directions`."""
+    return {"type": "envmap", "bitmap": mitsuba().Bitmap(radiance.astype(np.float32))}
+
+
+def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
+    """Directions of the nodes of Mitsuba's `envmap`, in its own (y-up) frame: row i at i/(H−1), column j at (j+½)/W."""
+    theta = np.arange(height) / (height - 1) * np.pi
+    phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     sin = np.sin(theta)[:, None]
-    directions = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
-    bitmap = mitsuba().Bitmap(sampled(lat_long, directions).astype(np.float32))
-    return {"type": "envmap", "bitmap": bitmap}
+    return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
 
 
 def light_seen(
@@ -219,14 +203,12 @@ def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
 
 
 def _texel_means(faces: dict[str, np.ndarray], height: int, finer: int = 8) -> Float[np.ndarray, "h w 3"]:
-    directions = lat_long_directions(finer * height, finer * 2 * height)
-    weight = np.broadcast_to(
-        lat_long_solid_angles(finer * height, finer * 2 * height)[:, None, None], (*directions.shape[:2], 1)
-    )
+    size = finer * height, finer * 2 * height
+    directions, weight = lat_long_directions(*size), lat_long_solid_angles(*size)[:, None, None]
+    weight = np.broadcast_to(weight, (*size, 1))
     values = looked_up(faces, directions) * weight
 
     def cells(array: np.ndarray) -> np.ndarray:
-        """Sums over the finer texels of each texel."""
         return array.reshape(height, finer, 2 * height, finer, -1).sum(axis=(1, 3))
 
     return cells(values) / cells(weight)

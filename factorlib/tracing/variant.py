@@ -45,9 +45,8 @@ def _fastest() -> str:
         if library and _runs(library):
             os.environ[LIBRARY] = library
             return "llvm_ad_rgb"
-    log.warning(
-        "no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19): rendering with scalar_rgb, about 3 times slower"
-    )
+    needed = "no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19)"
+    log.warning("%s: rendering with scalar_rgb, about 3 times slower", needed)
     return "scalar_rgb"
 
 
@@ -65,12 +64,8 @@ def _version(library: Path) -> int:
 
 def _runs(library: str) -> bool:
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", PROBE],
-            env={**os.environ, LIBRARY: library},
-            capture_output=True,
-            timeout=PROBE_SECONDS,
-        )
+        command, variables = [sys.executable, "-c", PROBE], {**os.environ, LIBRARY: library}
+        done = subprocess.run(command, env=variables, capture_output=True, timeout=PROBE_SECONDS)
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from factorlib.evaluate.ball import Light, constant_light, light_of_lat_long
-from factorlib.evaluate.relighting import Appearances
-from factorlib.evaluate.relit_set import compare_relit_set, shown_psnr
+from factorlib.evaluate.relighting import Appearances, compare_relit_set, shown_psnr
 from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE as ALL
 from tests.evaluate.made_artifacts import light_map, perturbed

@@ -72,6 +72,8 @@ def test_every_kind_has_a_recipe_that_comes_with_the_project(dataset):
         ("kind: relight\nphotos: [kitchen, kitchen]", ["photos", "'kitchen' is named twice"]),
         ("kind: relight\nlights: [hall, hall]", ["lights", "'hall' is named twice"]),
         ("kind: turntable\nseconds: .inf", ["one.yaml:2: seconds"]),
+        ("kind: turntable\nseconds: 3600", ["one.yaml:2: seconds", "<= 1200"]),
+        ("kind: view\nzoom: 1e-300", ["one.yaml:2: zoom", ">= 0.01"]),
         ("kind: insert\ntable: one.yaml", ["one.yaml", "a table of materials"]),
         ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
         ("kind: transfer\nmaterials: {yellow: gold}", ["there is no material 'gold'"]),

@@ -1,7 +1,12 @@
 """What the solve chose, in sentences."""
 
-from factorlib.report.choices import choices
+from factorlib.report.template import sentences
 from factorlib.results.materials import Decision, Model, Tone
+
+
+def choices(model):
+    return sentences("choices.txt", model=model)
+
 
 LOSSES = {"held_out_loss_with": 0.974, "held_out_loss_without": 1.184}
 

@@ -1,6 +1,6 @@
 """Whatever is no better than its null has a sentence on the page, and nothing else has."""
 
-from factorlib.report.headlines import GAUGE, no_better_than_a_guess
+from factorlib.report.template import sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import (
     AngleError,
@@ -19,8 +19,13 @@ from factorlib.results.metrics import (
     ScoredLight,
 )
 
+GAUGE = "channel_per_photo"
 GREY = Reflectance((0.5,) * 3, (0.05,) * 3, 0.5)
 VIEWS = ("mirror", "glossy", "lambertian", "map_all", "map_mirrored", "map_unmirrored")
+
+
+def no_better_than_a_guess(metrics):
+    return sentences("guesses.txt", metrics=metrics)
 
 
 def metrics_of(error: float) -> Metrics:

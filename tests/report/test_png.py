@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorlib.images.picture import png_bytes
-from factorlib.report.png import box_of, data_uri, outline, reduced
+from factorlib.report.pictures import box_of, data_uri, outline, reduced
 
 
 def test_the_data_uri_holds_the_file():

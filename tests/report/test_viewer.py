@@ -22,9 +22,9 @@ from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_rgb_exr
 from factorlib.images.picture import picture
 from factorlib.report import viewer
-from factorlib.report.appearance import light_row
 from factorlib.report.artifacts import Artifacts
-from factorlib.report.forms import forms
+from factorlib.report.page import forms
+from factorlib.report.pictures import light_row
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
 from tests.report.test_page import page_of, run
 
@@ -65,28 +65,31 @@ def numbers(text: str, kind: str, columns: int) -> np.ndarray:
 
 
 def test_meshes_keep_their_shape_and_stand_as_in_the_photo(made):
-    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0}).meshes[0]
-    assert (found.name, found.photo, found.simplified_from) == ("ball", "day", None)
-    assert np.allclose(np.reshape(found.rotation, (3, 3)), YUP_FROM_CAMERA) and np.allclose(found.eye, [0, 0, 1])
-    assert sum(len(numbers(part.triangles, "<u4", 3)) for part in found.parts) == len(sphere().faces)
-    for part in found.parts:
-        vertices, normals = numbers(part.vertices, "<u2", 3) / 32767.5 - 1, numbers(part.normals, "<i2", 3) / 32767
+    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0})["meshes"][0]
+    assert (found["name"], found["photo"], found["simplified_from"]) == ("ball", "day", None)
+    assert np.allclose(np.reshape(found["rotation"], (3, 3)), YUP_FROM_CAMERA) and np.allclose(found["eye"], [0, 0, 1])
+    assert sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"]) == len(sphere().faces)
+    for part in found["parts"]:
+        vertices, normals = (
+            numbers(part["vertices"], "<u2", 3) / 32767.5 - 1,
+            numbers(part["normals"], "<i2", 3) / 32767,
+        )
         assert np.allclose(np.linalg.norm(vertices, axis=1), 1, atol=2e-3)  # the corners of a sphere, about its middle
         assert np.allclose(vertices, normals, atol=0.01)
 
 
 def test_lights_are_sharpened_by_what_the_cube_map_widens_them():
     light = viewer._light(lobes_of(0))
-    lobes = numbers(light.lobes, "<f4", 7)
-    assert light.face == 64  # the sharpest lobe is 1/√400 = 2.9° wide, a texel 1.3°
+    lobes = numbers(light["lobes"], "<f4", 7)
+    assert light["face"] == 64  # the sharpest lobe is 1/√400 = 2.9° wide, a texel 1.3°
     assert np.allclose(1 / lobes[:, 3], 1 / lobes_of(0).sharpness - viewer.spacing_of(64) ** 2 / 6)
 
 
 def test_large_meshes_are_simplified_and_the_page_says_so(made, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_TRIANGLES", 2000)
-    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0}).meshes[0]
-    triangles = sum(len(numbers(part.triangles, "<u4", 3)) for part in found.parts)
-    assert found.simplified_from == len(sphere().faces) and triangles <= 2100
+    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0})["meshes"][0]
+    triangles = sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"])
+    assert found["simplified_from"] == len(sphere().faces) and triangles <= 2100
     assert "is simplified for this page" in page_of(made[0], tmp_path / "simplified")
 
 
@@ -280,6 +283,6 @@ def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
     grey = light.mean(axis=-1)
     bright = grey > 2 * (grey * area).sum() / (4 * np.pi)
     assert (
-        light_row(run_, "day", ["day"], None).known == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3)
+        light_row(run_, "day", ["day"], None)["known"] == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3)
         and bright.any()
     )

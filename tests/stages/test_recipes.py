@@ -138,3 +138,11 @@ def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
     below = Inputs(made.folders, {**made.facts, "dataset.ground": grounds}, made.files)
     with pytest.raises(InputError, match="'front' was taken from below"):
         drawn(below, tmp_path / "out", schema.Insert(photos=["front"], samples=1))
+
+
+def test_a_mesh_without_height_is_refused(made, tmp_path):
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
+    recipe = schema.Insert(photos=["front"], mesh="flat.obj", samples=1)
+    with pytest.raises(InputError, match="'flat.obj' has no height") as error:
+        drawn(made, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
+    assert "up: z" in error.value.cure

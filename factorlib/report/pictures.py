@@ -1,0 +1,312 @@
+"""Pictures inside the page: each photo beside its re-synthesis, balls, reflectance maps, lights, and one of the whole run."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from factorlib.conventions import lat_long_solid_angles
+from factorlib.evaluate.resynthesis import agreeing_pixels
+from factorlib.images.palette import nearest_tags, rgb_of
+from factorlib.images.picture import exposure_of, picture, png_bytes
+from factorlib.images.transfer import srgb_encode
+from factorlib.report.artifacts import Artifacts, Channels, Picture
+from factorlib.results.materials import Reflectance
+from factorlib.results.metrics import PhotoErrors, ScoredLight
+from factorlib.urm.observations import Observations
+
+AMPLIFICATION = 4  # of the difference between photo and re-synthesis
+UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
+DISAGREES = np.array([0.92, 1.0, 0.0])
+MAGENTA = (214, 40, 120)
+COLUMN, GAP, MOST_PHOTOS = 200, 8, 8  # of the overview: pixels, pixels, photos
+UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # of a material that was not solved
+MAP_SIZE = 64
+LEAST_OBSERVED = 0.002  # of a disc: fewer normals than this are not ringed
+
+Pixels = UInt8[np.ndarray, "h w c"]
+
+
+def data_uri(pixels: Pixels) -> str:
+    """Pixels as a PNG in a `data:` URI, for the `src` of an image."""
+    return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
+
+
+def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "H W c"]:
+    """Area averages, so that no side is longer than `longest` pixels; a small picture stays as it is."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, longest / max(height, width))
+    if scale == 1.0:
+        return picture
+    rows, columns = (_averaging(n, max(1, round(n * scale))) for n in (height, width))
+    return np.einsum("Hh,hwc->Hwc", rows, np.einsum("Ww,hwc->hWc", columns, picture, optimize=True), optimize=True)
+
+
+def _averaging(source: int, target: int) -> Float[np.ndarray, "target source"]:
+    """Row t holds the share of each source cell in target cell t."""
+    edges, cells = np.arange(target + 1) * (source / target), np.arange(source)
+    overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
+    return (np.maximum(overlap, 0) * (target / source)).astype(np.float32)
+
+
+def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
+    """Rows and columns of the mask, with a margin of that fraction of its longer side; everything for an empty mask."""
+    if not mask.any():
+        return slice(0, mask.shape[0]), slice(0, mask.shape[1])
+    spans = [np.nonzero(mask.any(axis=1 - axis))[0][[0, -1]] for axis in (0, 1)]
+    extra = int(np.ceil(margin * max(b - a + 1 for a, b in spans)))
+    return tuple(slice(max(0, a - extra), min(n, b + 1 + extra)) for (a, b), n in zip(spans, mask.shape, strict=True))
+
+
+def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the mask that touch its outside; the picture's border is not outside."""
+    p = np.pad(mask, 1, mode="edge")
+    return mask & ~(p[:-2, 1:-1] & p[2:, 1:-1] & p[1:-1, :-2] & p[1:-1, 2:])
+
+
+def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
+    """Display values, transparent outside the disc that fills the picture."""
+    height, width = radiance.shape[:2]
+    y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
+    alpha = np.clip((1 - np.hypot(x[None], y[:, None])) * height / 2 + 0.5, 0, 1)
+    return np.concatenate([picture(radiance, exposure), np.rint(255 * alpha)[..., None].astype(np.uint8)], axis=-1)
+
+
+def exposures(run: Artifacts) -> dict[str, float]:
+    """One exposure per photo for all balls and reflectance maps in its light: the one its own picture is shown with."""
+    photos = metrics.resynthesis.photos if (metrics := run.metrics()) else {}
+    return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
+
+
+# ── Photos ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class PhotoRow(msgspec.Struct, frozen=True):
+    """A photo: panels of one crop by title, as sRGB pixels and as `data:` URIs, and its errors, where there are any."""
+
+    name: str
+    illumination: str
+    panels: dict[str, Pixels]
+    uris: dict[str, str]
+    errors: PhotoErrors | None
+
+
+def material_tags(run: Artifacts) -> dict[str, str]:
+    """A colour "#rrggbb" of each material of the set, near to its diffuse one (to its specular one, for a metal)."""
+    reflectances = [run.solved().materials.get(name, UNKNOWN) for name in run.set.materials]
+    colours = [np.add(m.diffuse, np.multiply(0.15, m.specular)) for m in reflectances]
+    return nearest_tags(run.set.materials, np.array(colours))
+
+
+def longest_side(photos: int) -> int:
+    """Pixels of a panel's longer side: smaller where there are many photos, so that the page stays light."""
+    return 440 if photos <= 12 else 300
+
+
+def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErrors | None) -> PhotoRow:
+    """`tags`: the colour of each material in masks; `errors`: the photo's entry of the metrics."""
+    masks, geometry = run.exr("masks", name), run.exr("align", name)
+    again, exposure = run.rgb("render", f"resynthesis/{name}"), errors.exposure if errors else 1.0
+    box = box_of(np.rint(masks["label"]) > 0)
+    masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
+    photo = np.nan_to_num(np.stack([masks[c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
+    display, in_mask = picture(photo, exposure).astype(np.float32) / 255, masks["label"] > 0.5
+    panels = {"photo": display, "materials": _labels(masks, geometry, photo * exposure, list(tags.values()))}
+    if again is not None:
+        again = picture(np.nan_to_num(again[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
+        explained = in_mask & (np.rint(masks["label"]) == np.rint(geometry["label"]))
+        panels["re-synthesis"] = np.concatenate([again, explained[..., None]], axis=-1)
+        difference = 0.5 + AMPLIFICATION * (again - display)  # grey where equal
+        clipped = np.any([masks[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
+        difference[~agreeing_pixels(masks, geometry) | clipped] = UNCOUNTED
+        panels["difference"] = np.concatenate([np.clip(difference, 0, 1), in_mask[..., None]], axis=-1)
+    longest = longest_side(len(run.set.photos))
+    pixels = {k: np.rint(255 * np.clip(reduced(v, longest), 0, 1)).astype(np.uint8) for k, v in panels.items()}
+    return PhotoRow(name, run.illumination_of(name), pixels, {k: data_uri(v) for k, v in pixels.items()}, errors)
+
+
+def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]) -> Picture:
+    """Materials tinted on a grey photo (already exposed); yellow where mesh and mask name different ones."""
+    grey = srgb_encode(np.clip(photo.mean(axis=-1), 0, 1))[..., None] * np.ones(3)
+    label = np.rint(masks["label"]).astype(int)
+    colours = np.array([(0, 0, 0), *(rgb_of(tag) for tag in tags)]) / 255
+    display = np.where((label > 0)[..., None], 0.45 * grey + 0.55 * colours[label], 0.3 + 0.5 * grey)
+    display[(np.rint(geometry["label"]) != label) & (masks.get("left_out", 0 * label) < 0.5)] = DISAGREES
+    return display
+
+
+def strip(row: PhotoRow) -> bytes:
+    """A row's panels side by side on white, as a PNG."""
+    return png_bytes(np.concatenate([_on_white(pixels) for pixels in row.panels.values()], axis=1))
+
+
+def _on_white(pixels: Pixels) -> UInt8[np.ndarray, "h w 3"]:
+    alpha = pixels[..., 3:].astype(np.float32) / 255 if pixels.shape[2] == 4 else 1.0
+    return np.rint(pixels[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+
+
+def _whitened(pixels: Pixels, down: int, right: int) -> Pixels:
+    return np.pad(pixels, ((0, down), (0, right), (0, 0)), constant_values=255)
+
+
+def overview(run: Artifacts, rows: Sequence[PhotoRow]) -> bytes:
+    """A PNG on white for a README: a column per photo (the first eight), with photo, re-synthesis, light, and balls."""
+    exposure, rows = exposures(run), rows[:MOST_PHOTOS]
+    tallest = max(round(COLUMN * p.shape[0] / p.shape[1]) for row in rows for p in row.panels.values())
+    columns = [_column(run, row, exposure[row.name], min(COLUMN * 3 // 2, tallest)) for row in rows]
+    height = max(len(column) for column in columns)
+    return png_bytes(np.concatenate([_whitened(c, height - len(c), GAP) for c in columns], axis=1)[:, :-GAP])
+
+
+def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixels:
+    cells = [_fitted(row.panels[k], height, COLUMN) for k in ("photo", "re-synthesis") if k in row.panels]
+    light = run.rgb("export", f"illumination/{row.illumination}")
+    if light is not None:
+        cells.append(_fitted(picture(light, exposure_of(light, percentile=95.0)), COLUMN // 2, COLUMN))
+    balls = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
+    size = COLUMN // 2 - GAP, COLUMN // 2 - GAP // 2
+    balls = [_fitted(disc(ball, exposure), *size) for ball in balls if ball is not None]
+    for k in range(0, len(balls), 2):
+        pair = np.concatenate(balls[k : k + 2], axis=1)
+        cells.append(_whitened(pair, 0, COLUMN - pair.shape[1]))
+    return np.concatenate([_whitened(cell, GAP, 0) for cell in cells])[:-GAP]
+
+
+def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
+    """In the middle of a white cell, as large as fits; what is smaller than the cell is enlarged by whole pixels."""
+    pixels = _on_white(pixels).astype(np.float32)
+    times = max(1, -(-max(height, width) // min(pixels.shape[:2])))
+    pixels = np.repeat(np.repeat(pixels, times, axis=0), times, axis=1)
+    scale = min(height / pixels.shape[0], width / pixels.shape[1])
+    pixels = reduced(pixels, max(1, int(scale * max(pixels.shape[:2]))))
+    cell = np.full((height, width, 3), 255, np.uint8)
+    top, left = (height - pixels.shape[0]) // 2, (width - pixels.shape[1]) // 2
+    cell[top : top + pixels.shape[0], left : left + pixels.shape[1]] = np.rint(pixels)
+    return cell
+
+
+# ── Materials in lights ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Cell(msgspec.Struct, frozen=True):
+    """A material in a photo's light; `uri` is None where nothing was rendered, `measured` where nothing was seen."""
+
+    material: str
+    photo: str
+    observed: bool
+    uri: str | None
+    measured: str | None = None
+
+
+def ball_cell(run: Artifacts, material: str, photo: str, observed: bool, exposure: float) -> Cell:
+    """The ball of a material in a photo's light; observed: whether the photo shows the material."""
+    radiance = run.rgb("render", f"materials/{photo}/{material}")
+    uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
+    return Cell(material, photo, observed, uri)
+
+
+def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
+    """One cell per material: solved, with the observed normals ringed, and beside it what the photo measured."""
+    cells, observations = [], run.observations(photo)
+    for index, name in enumerate(run.set.materials):
+        channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
+        rows = observations.material == index if observations is not None else np.zeros(0, bool)
+        measured = data_uri(measured_map(observations.take(rows), exposure)) if rows.any() else None
+        uri = None if channels is None else data_uri(_ringed(channels, exposure))
+        cells.append(Cell(name, photo, bool(rows.any()), uri, measured))
+    return cells
+
+
+def _ringed(channels: Channels, exposure: float) -> Pixels:
+    """The solved map; the line about the observed normals is white on dark and black on bright."""
+    pixels = disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
+    observed = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
+    if observed.mean() > LEAST_OBSERVED:
+        line = outline(observed | ~(pixels[..., 3] > 0))
+        pixels[line, :3] = np.where(pixels[line, :3].mean(axis=-1, keepdims=True) > 127.5, 0, 255)
+    return pixels
+
+
+def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarray, "s s 4"]:
+    """Mean radiance by normal, seen from the front, as RGBA; transparent where no normal was seen.
+
+    The disc is as many cells across as leave about two observations to a cell, at most `MAP_SIZE`.
+    """
+    n, side = observations.normal, int(np.clip(np.sqrt(len(observations) * 2 / np.pi), 8, MAP_SIZE))
+    column, row = (np.clip(((n[:, k] + 1) / 2 * side).astype(int), 0, side - 1) for k in (0, 1))  # x right, y down
+    cell = row * side + column
+    weight = np.bincount(cell, minlength=side**2)
+    total = np.stack([np.bincount(cell, c, side**2) for c in observations.radiance.T], axis=-1)
+    mean = (total / np.maximum(weight, 1)[:, None]).reshape(side, side, 3)
+    alpha = np.where(weight > 0, 255, 0).astype(np.uint8).reshape(side, side, 1)
+    return np.concatenate([picture(mean, exposure), alpha], axis=-1)
+
+
+# ── Lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def light_row(
+    run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None
+) -> dict[str, Any] | None:
+    """What the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
+
+    uri, dark_uri, true_uri, spheres: the map, 4 stops darker, the true one, three spheres;  white: the radiance shown as white
+    peak: the brightest texel in units of it;  overflow: share of the sphere that is brighter, outlined;  energy: its share of the light
+    known: share of the sphere where the standard error is below the radiance, or below the mean radiance where that is larger
+    known_uri: that error as grey: white where it is nil, mid-grey where it is as large, black where it is many times that
+    """
+    radiance = run.rgb("export", f"illumination/{name}")
+    if radiance is None:
+        return None
+    exposure = exposure_of(radiance, percentile=95.0)
+    brightest, area = radiance.max(axis=-1) * exposure, _areas(radiance)
+    over, energy = brightest > 1, radiance.sum(axis=-1) * area
+    true, known = run.rgb("evaluate", f"illumination/{name}"), run.rgb("export", f"coverage/{name}")
+    row = {
+        "name": name, "photos": photos, "errors": errors, "white": 1 / exposure, "peak": float(brightest.max()),
+        "uri": data_uri(_outlined(picture(radiance, exposure), over)),
+        "dark_uri": data_uri(picture(radiance, exposure / 16)),
+        "overflow": float((over * area).sum() / (4 * np.pi)),
+        "energy": float((energy * over).sum() / max(energy.sum(), 1e-30)),
+        "true_uri": None if true is None else data_uri(_true_map(true, radiance, exposure)),
+        "known_uri": None, "known": None, "spheres": _spheres(run, name),
+    }  # fmt: skip
+    if known is not None:
+        mean = float((radiance * area[..., None]).sum() / (3 * area.sum() * radiance.shape[1]))
+        error = known.mean(axis=-1) / np.maximum(1, radiance.mean(axis=-1) / max(mean, 1e-30))
+        row["known"] = float(((error < 1) * area).sum() / (4 * np.pi))
+        row["known_uri"] = data_uri(np.rint(255 / (1 + np.repeat(error[..., None], 3, -1))).astype(np.uint8))
+    return row
+
+
+def _areas(lat_long: Picture) -> Float[np.ndarray, "h 1"]:
+    return lat_long_solid_angles(*lat_long.shape[:2])[:, None]
+
+
+def _outlined(pixels: Pixels, over: Bool[np.ndarray, "h w"]) -> Pixels:
+    pixels[outline(over)] = MAGENTA
+    return pixels
+
+
+def _true_map(true: Picture, estimate: Picture, exposure: float) -> Pixels:
+    """The true map, scaled to the mean of the estimate: the overall scale is a matter of gauge."""
+    means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
+    small = reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30))
+    return _outlined(picture(small, exposure), (small * exposure).max(axis=-1) > 1)
+
+
+def _spheres(run: Artifacts, name: str) -> str | None:
+    """Truth above, estimate below, the estimate scaled to the truth's mean."""
+    truth, estimate = (run.rgb("evaluate", f"spheres/{name}_{which}") for which in ("truth", "estimate"))
+    if truth is None or estimate is None:
+        return None
+    exposure = exposure_of(truth, truth.max(-1) > 0, 97.0)
+    rows = [truth, estimate * (truth.mean() / max(float(estimate.mean()), 1e-30))]
+    balls = [[np.repeat(np.repeat(ball, 2, 0), 2, 1) for ball in np.split(row, 3, axis=1)] for row in rows]
+    discs = [[np.pad(disc(ball, exposure), ((4, 4), (0, 8), (0, 0))) for ball in row] for row in balls]
+    return data_uri(np.concatenate([np.concatenate(row, axis=1) for row in discs]))
