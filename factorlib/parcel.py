@@ -13,7 +13,7 @@ import io
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cloudpickle
 import numpy as np
@@ -21,61 +21,44 @@ import numpy as np
 from factorlib.wholefile import write_bytes
 
 LEAST = 16_384  # bytes of an array that is worth a place on the shelf
-FORGOTTEN = 20  # maps in which nothing of a file was used, after which it is deleted
-
-
-class Place(NamedTuple):
-    """Where an array's bytes lie."""
-
-    file: Path
-    offset: int
-    size: int
+FORGOTTEN = 20  # maps in which an array was not used, after which its file is deleted
 
 
 class Shelf:
-    """Arrays in files of a folder, each content once.  written: bytes of all of them so far"""
+    """A folder of arrays, each content once.  written: bytes of all of them so far"""
 
     def __init__(self, folder: Path):
         self.folder, self.maps, self.written = folder, 0, 0
-        self._places: dict[bytes, Place] = {}
         self._used: dict[Path, int] = {}
-        self._new: list[bytes] = []
 
     def pack(self, values: list[Any]) -> list[bytes]:
         """Each value as bytes for `unpack`, what is large among them on the shelf when this returns."""
         self.maps += 1
-        file = self.folder / f"{self.maps}.arrays"
-        packed = [pack(value, lambda body: self._put(body, file)) for value in values]
-        if self._new:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_bytes(file, data := b"".join(self._new))
-            self.written += len(data)
-            self._new = []
-        for old in [file for file, last in self._used.items() if self.maps - last >= FORGOTTEN]:
-            del self._used[old]
-            self._places = {content: place for content, place in self._places.items() if place.file != old}
-            old.unlink(missing_ok=True)
+        packed = [pack(value, self._put) for value in values]
+        for file in [file for file, last in self._used.items() if self.maps - last >= FORGOTTEN]:
+            del self._used[file]
+            file.unlink(missing_ok=True)
         return packed
 
-    def _put(self, body: memoryview, file: Path) -> Place:
-        content = hashlib.blake2b(body, digest_size=20).digest()
-        if content not in self._places:
-            self._places[content] = Place(file, sum(map(len, self._new)), len(body))
-            self._new.append(bytes(body))
-        place = self._places[content]
-        self._used[place.file] = self.maps
-        return place
+    def _put(self, body: memoryview) -> Path:
+        file = self.folder / hashlib.blake2b(body, digest_size=20).hexdigest()
+        if file not in self._used:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(file, body)
+            self.written += body.nbytes
+        self._used[file] = self.maps
+        return file
 
 
-def pack(value: Any, put: Callable[[memoryview], Place] | None = None) -> bytes:
+def pack(value: Any, put: Callable[[memoryview], Path] | None = None) -> bytes:
     """A value as bytes for `unpack`; put: where an array of LEAST bytes or more is laid, else it is part of them."""
-    places: list[Place] = []
+    places: list[tuple[Path, int]] = []
 
     def inside(buffer: pickle.PickleBuffer) -> bool:
         """Whether pickle keeps the array's bytes itself."""
         if put is None or (body := buffer.raw()).nbytes < LEAST:
             return True
-        places.append(put(body))
+        places.append((put(body), body.nbytes))
         return False
 
     stream = io.BytesIO()
@@ -86,15 +69,13 @@ def pack(value: Any, put: Callable[[memoryview], Place] | None = None) -> bytes:
 def unpack(data: bytes) -> Any:
     """The value again.  Raises OSError where its shelf cannot be read."""
     places, body = pickle.loads(data)
-    return pickle.loads(body, buffers=map(_read, places))
+    return pickle.loads(body, buffers=[_read(*place) for place in places])
 
 
-def _read(place: Place) -> bytearray:
-    data = bytearray(place.size)
-    with open(place.file, "rb") as stream:
-        stream.seek(place.offset)
-        if (count := stream.readinto(data)) != place.size:
-            raise OSError(f"{place.file}: cut at {place.offset + count} bytes")
+def _read(file: Path, size: int) -> bytearray:
+    data = bytearray(file.read_bytes())
+    if len(data) != size:
+        raise OSError(f"{file}: cut at {len(data)} bytes")
     return data
 
 

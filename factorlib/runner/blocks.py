@@ -78,25 +78,21 @@ def _version(package: str) -> str:
 # ── in the child of a step ───────────────────────────────────────────────────────────────────────────────────────────
 
 
-def step_at(scheduler: str, site: Site, task: Task) -> Outcome:
-    """Run a step here; where it may spread over several cores, its independent work goes to the cluster.
+def outcome_at(scheduler: str, site: Site, work: Task | Code) -> Outcome:
+    """Run a step here, or check the parameters of one; a step's independent work goes to the cluster.
 
-    Each try has a temporary folder of its own: another may still be ending elsewhere.
+    Each try of a step has a temporary folder of its own: another may still be ending elsewhere.
     """
-    if fault := site.fault(task.record):
+    if fault := site.fault(work.record if isinstance(work, Task) else None):
         return Outcome(error=str(fault))
-    temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
-    task = msgspec.structs.replace(task, temporary=temporary)
-    if task.code.cores == 1:
-        return run_step(task)
-    with contextlib.closing(Blocks(scheduler, site, task)) as blocks:
-        return run_step(task, blocks)
-
-
-def params_at(scheduler: str, site: Site, code: Code) -> Outcome:
-    """`check_params` here."""
-    fault = site.fault()
-    return Outcome(error=str(fault)) if fault else check_params(code)
+    if isinstance(work, Code):
+        return check_params(work)
+    temporary = work.temporary.with_name(f"{work.temporary.name}.{uuid.uuid4().hex[:8]}")
+    work = msgspec.structs.replace(work, temporary=temporary)
+    if work.code.cores == 1:
+        return run_step(work)
+    with contextlib.closing(Blocks(scheduler, site, work)) as blocks:
+        return run_step(work, blocks)
 
 
 class Blocks:
@@ -139,15 +135,15 @@ class Blocks:
         return self._client.gather(self._client.map(here, work, **options))
 
     def _taken(self, back: bytes) -> list:
-        done = parcel().unpack(back)
+        values, records, error, cost = parcel().unpack(back)
         self.spent["bytes_back"] += len(back)
-        self.spent["cpu_seconds"] += done.cpu_seconds
-        self.spent["memory_mb"] = max(self.spent["memory_mb"], done.memory_mb)
-        for record in done.warnings:
+        self.spent["cpu_seconds"] += cost["cpu_seconds"]
+        self.spent["memory_mb"] = max(self.spent["memory_mb"], cost["memory_mb"])
+        for record in records:
             logging.getLogger(record.name).handle(record)
-        if done.error is not None:
-            raise done.error
-        return done.values
+        if error is not None:
+            raise error
+        return values
 
 
 def _pieces(items: list, count: int) -> list[list]:
@@ -162,18 +158,11 @@ def _pieces(items: list, count: int) -> list[list]:
 # ── in the child of a block ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Done(msgspec.Struct):
-    """What a piece gave, warned of and cost; error: what the first block raised that failed."""
-
-    values: list[Any]
-    warnings: list[logging.LogRecord]
-    error: BaseException | None
-    cpu_seconds: float
-    memory_mb: float
-
-
 def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
-    """The function of every item of a piece, all of it packed; work: the project's root, and the piece."""
+    """What the function gave of each item of a piece, what was warned of, the first error and the cost, packed.
+
+    work: the project's root, and the packed function and items
+    """
     if fault := site.fault():
         raise fault
     root, data = work
@@ -188,8 +177,7 @@ def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
         except Exception as caught:
             caught.add_note(traceback.format_exc())
             error = caught
-    cost = meter.read(1, 1)
-    return parcel().pack(Done(values, records, error, cost["cpu_seconds"], cost["memory_mb"]))
+    return parcel().pack((values, records, error, meter.read(1, 1)))
 
 
 @contextlib.contextmanager

@@ -32,14 +32,6 @@ WATCH = 0.3  # seconds between two looks at whether the work is still wanted
 MAIN = f"import sys; sys.path.insert(0, {str(LIBRARY)!r}); from factorlib.runner.child import main; main()"
 
 
-class Died(BrokenProcessPool):
-    """The child was killed from outside, or for want of memory, or crashed in a library."""
-
-
-class Unwanted(Exception):
-    """Nobody waits for the result any more."""
-
-
 class Child:
     """A child of this process with `threads` threads in every library; run: a folder with which it ends."""
 
@@ -55,20 +47,20 @@ class Child:
     def call(self, function: Callable, *arguments: Any, wanted: Callable[[], bool] = lambda: True) -> Any:
         """`function(*arguments)`, computed in the child, which is free again afterwards.
 
-        Raises what the function raises, and having ended the child: `Died`; `Unwanted` once `wanted()` is false.
+        Raises what the function raises.  Raises BrokenProcessPool, and the child is no more, where it was killed from
+        outside, or for want of memory, or crashed in a library, and once `wanted()` is false.
         """
         try:
             self.connection.send((function, arguments))
             while not self.connection.poll(WATCH):
-                if not wanted():
-                    raise Unwanted
-                if self.process.poll() is not None and not self.connection.poll():
+                died = self.process.poll() is not None and not self.connection.poll()
+                if died or not wanted():
                     raise EOFError
             good, value = self.connection.recv()
         except BaseException as error:
             self.end(kill=True)
             if isinstance(error, EOFError | OSError):
-                raise Died("its process died") from error
+                raise BrokenProcessPool("its process died, or nobody waited for it") from error
             raise
         self.busy = False
         if not good:
@@ -119,14 +111,11 @@ def main() -> None:
     with contextlib.suppress(EOFError, OSError):
         while True:
             function, arguments = connection.recv()
-            connection.send(_answer(function, arguments))
-
-
-def _answer(function: Callable, arguments: tuple) -> tuple[bool, Any]:
-    try:
-        return True, function(*arguments)
-    except BaseException as error:  # whatever it is, it is the caller's
-        return False, error
+            try:
+                answer = True, function(*arguments)
+            except BaseException as error:  # whatever it is, it is the caller's
+                answer = False, error
+            connection.send(answer)
 
 
 def _end_with(parent: int, run: Path) -> None:

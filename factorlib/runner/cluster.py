@@ -23,15 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from factorlib.errors import InputError
-from factorlib.runner.blocks import CORES, TRIES, Site, params_at, started_by, step_at
-from factorlib.runner.child import Children, Unwanted
-from factorlib.runner.executors import machine_cores
+from factorlib.runner.blocks import CORES, TRIES, Site, outcome_at, started_by
+from factorlib.runner.child import Children
+from factorlib.runner.executors import Pools, machine_cores
 from factorlib.runner.pipeline import ADDRESS
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
-from factorlib.runner.worker import check_params, run_step
 
-AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for the next
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
 QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
@@ -39,15 +37,16 @@ QUIET = {  # what Dask does by itself between tasks: without these, a worker tha
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
 }
-AT = {run_step: step_at, check_params: params_at}  # what a child calls in place of it
 
 
-class Cluster:
-    """The executor of a Dask cluster, with the interface of `factorlib.runner.executors.Pools`.
+class Cluster(Pools):
+    """The executor of a Dask cluster.
 
     scheduler: its address; None for a cluster of this machine's cores
     run: folder of the run, in the store
     """
+
+    AHEAD = 2  # so that no worker waits for its next step
 
     def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
         _require_dask("executor")
@@ -71,26 +70,18 @@ class Cluster:
         """Those of all workers that are there now; 1 where none is."""
         return max(1, sum(self._declared().values()))
 
-    def free(self, cores: int) -> bool:
-        """Whether a step of `cores` cores may be handed out now."""
-        return not self._busy or sum(self._busy.values()) + cores <= AHEAD * self.cores
-
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
-        """Hand out `function(argument)`; its future.
+        """Hand out a step or a check of parameters, by its argument; its future.
 
-        One that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
+        A step that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
         """
         spreads, most = cores > threads, max(self._declared().values(), default=threads)
         resources = {} if spreads else {CORES: min(threads, most)}
         with whole():
-            task = hosted, self.site, threads, spreads, AT[function], argument
+            task = hosted, self.site, threads, spreads, outcome_at, argument
             future = _in_our_words(self._executor.submit(*task, resources=resources))
             self._busy[future] = cores
             return future
-
-    def done(self, future: Future) -> None:
-        """Take note that a future is finished."""
-        del self._busy[future]
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster; `kill`: tasks that are not finished are cancelled, and their processes killed."""
@@ -211,8 +202,7 @@ def _in_our_words(asked: Future) -> Future:
         try:
             answer.set_result(asked.result())
         except BaseException as error:
-            died = isinstance(error, Unwanted) or type(error).__name__ == "KilledWorker"
-            answer.set_exception(BrokenProcessPool(str(error)) if died else error)
+            answer.set_exception(BrokenProcessPool(str(error)) if type(error).__name__ == "KilledWorker" else error)
 
     asked.add_done_callback(take_over)
     return answer

@@ -19,6 +19,8 @@ from factorlib.runner.stop import whole
 class Pools:
     """Children that compute, each waited for by a thread.  cores: how many they may keep busy, default this machine's"""
 
+    AHEAD = 1  # steps are handed out for so many times the cores
+
     def __init__(self, cores: int | None = None):
         self.cores = cores or machine_cores()
         self._children, self._threads = Children(), ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
@@ -26,7 +28,7 @@ class Pools:
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
-        return not self._busy or sum(self._busy.values()) + cores <= self.cores
+        return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
 
     def submit(self, cores: int, threads: int, function: Callable, *arguments: Any) -> Future:
         """Start `function(*arguments)` in a process of `threads` threads, which takes `cores` cores; its future."""

@@ -22,7 +22,7 @@ class LiveCluster(contextlib.AbstractContextManager):
         self.folder, self.environment = folder, environment or {}
         self.processes: list[subprocess.Popen] = []
         options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-        self.start("distributed.cli.dask_scheduler", *options, says="Scheduler at:")
+        self.start("distributed.cli.dask_scheduler", *options, says="Scheduler at")
         self.address = re.search(r"tcp://\S+", self.log(0))[0]
         for _ in range(workers):
             self.add_worker()
@@ -30,16 +30,16 @@ class LiveCluster(contextlib.AbstractContextManager):
     def add_worker(self) -> subprocess.Popen:
         """One more, of one core; returns when the scheduler knows it."""
         options = f"--cores 1 --host 127.0.0.1 --local-directory {tempfile.gettempdir()}".split()
-        return self.start("factorlib", "worker", self.address, *options, says="Registered to:")
+        return self.start("factorlib", "worker", self.address, *options, says="Registered to")
 
     def start(self, *words: str, says: str) -> subprocess.Popen:
-        """A process `python -m <words>` that has written `says` into its log."""
+        """A process `python -m <words>` that has written `says`, a colon and a word into its log."""
         more = {"PYTHONPATH": str(LIBRARY), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "60s", **self.environment}
         number, end = len(self.processes), time.monotonic() + 120
         with open(self.folder / f"{number}.log", "wb") as log:
             outer = {"env": {**os.environ, **more}, "stdout": log, "stderr": log, "cwd": self.folder}
             self.processes.append(subprocess.Popen([sys.executable, "-m", *words], start_new_session=True, **outer))
-        while not re.search(rf"{says}\s+\S", self.log(number)):
+        while not re.search(rf"{says}:\s+\S", self.log(number)):
             assert time.monotonic() < end, self.log(number)
             time.sleep(0.05)
         return self.processes[-1]
