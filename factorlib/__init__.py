@@ -7,7 +7,7 @@ load what they need, and `factorlib.load_result` does so when it is first asked 
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

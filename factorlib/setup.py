@@ -19,6 +19,7 @@ import time
 import tomllib
 import urllib.request
 import venv
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,19 +27,14 @@ LOCK, VENV = ROOT / "requirements.lock", ROOT / ".venv"
 READY, PYTHON = VENV / "ready", VENV / "bin" / "python"
 TORCH = "torch==2.13.0"
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux draw in gigabytes of CUDA
-PROBE_SECONDS = 5
 BEAT = 3.0  # seconds between two signs of life
 LOADED = (
     "torch, scipy.optimize, mitsuba, pytest",
     "open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress",
 )
 ALONE = ("blender", "interchange")  # extras: .venv has what they need, and bpy would ask for an older NumPy
-NEEDED = {  # system libraries of Open3D, and the Debian packages that have them
-    "libGL.so.1": "libgl1",
-    "libX11.so.6": "libx11-6",
-    "libudev.so.1": "libudev1",
-    "libgomp.so.1": "libgomp1",
-}
+# System libraries of Open3D, and the Debian packages that have them.
+NEEDED = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}
 FASTER = {"libLLVM.so.19.1": "libllvm19"}  # of Mitsuba, which renders three times faster with it
 
 
@@ -48,8 +44,13 @@ def main() -> None:
     digest = hashlib.sha256(state).hexdigest()
     if not READY.exists() or READY.read_text() != digest:
         started = time.monotonic()
-        for step in (check_python, check_system, make_venv, install_packages, load_packages):
-            step()
+        make_venv()
+        check_system()
+        install_packages()
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what is loaded stays compiled; pip would compile all
+        commands = [[str(PYTHON), "-c", f"import {names}"] for names in LOADED]
+        if not run(commands, "loading the packages for the first time"):
+            sys.exit("set-up: the packages are installed, but one does not load: see above")
         READY.write_text(digest)
         say(f"the environment is ready, after {time.monotonic() - started:.0f} s")
     READY.touch()
@@ -77,25 +78,16 @@ def ended(well: bool) -> None:
         sys.exit("set-up: the packages could not be installed: see above; run make again when that is mended")
 
 
-# ── Python ───────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def check_python() -> None:
-    """Refuse a Python that the pinned packages do not know, or that cannot make environments."""
+def make_venv() -> None:
+    """Create .venv with pip; one of another Python version is replaced.  Refuses a Python that cannot have the packages."""
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if version not in ("3.11", "3.12"):
         cure = "the pinned packages need 3.11 or 3.12: make PYTHON=python3.11 …"
         sys.exit(f"set-up: Python {platform.python_version()} will not do, {cure}")
-    try:
-        import ensurepip  # noqa: F401  (Debian keeps it in a package of its own)
-    except ImportError:
+    if find_spec("ensurepip") is None:  # Debian keeps it in a package of its own
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
-
-
-def make_venv() -> None:
-    """Create .venv with pip; one of another Python version is replaced."""
     READY.unlink(missing_ok=True)
-    if not PYTHON.exists() or not (VENV / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}").is_dir():
+    if not PYTHON.exists() or not (VENV / "lib" / f"python{version}").is_dir():
         say(f"making .venv with Python {platform.python_version()}")
         shutil.rmtree(VENV, ignore_errors=True)
         venv.create(VENV, with_pip=True, symlinks=True)
@@ -109,13 +101,11 @@ def install_packages() -> None:
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
     torch = [TORCH, *(["--index-url", index] if index else [])]
     locked, pinned = ["--no-deps", "-r", str(LOCK)], ["--no-deps", *torch]
-    words = f"installing about 400 MB of packages; PyTorch from {index or 'the default package index'}"
-    say(words)
-    uv = shutil.which("uv") or (
-        str(VENV / "bin" / "uv") if run([with_pip(["--no-deps", "uv"])], "installing uv") else None
-    )
-    torch_by_uv = uv and index  # pip alone knows wheels of a user's own
-    if not uv or not run([with_uv(uv, locked), with_uv(uv, pinned) if torch_by_uv else with_pip(pinned)], words):
+    say(words := f"installing about 400 MB of packages; PyTorch from {index or 'the default package index'}")
+    uv = shutil.which("uv") or (run([with_pip(["--no-deps", "uv"])], "installing uv") and str(VENV / "bin" / "uv"))
+    with_uv = [str(uv), "pip", "install", "-q", "--python", str(PYTHON)]
+    by_uv = [[*with_uv, *locked], [*with_uv, *pinned] if index else with_pip(pinned)]  # pip knows a user's own wheels
+    if not uv or not run(by_uv, words):
         ended(run([with_pip(locked), with_pip(pinned)], words))
     if index != TORCH_CPU:
         ended(run([with_pip(["-c", str(LOCK), *torch])], "installing what PyTorch needs"))
@@ -123,21 +113,9 @@ def install_packages() -> None:
     site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
 
 
-def load_packages() -> None:
-    """Load what the project loads: Python keeps it compiled, which pip would do for much that is never used."""
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    if not run([[str(PYTHON), "-c", f"import {names}"] for names in LOADED], "loading the packages for the first time"):
-        sys.exit("set-up: the packages are installed, but one does not load: see above")
-
-
 def with_pip(words: list[str]) -> list[str]:
     """Return pip's command, which shows errors alone and compiles nothing."""
     return [str(PYTHON), "-m", "pip", "install", "--no-compile", "-qq", "--disable-pip-version-check", *words]
-
-
-def with_uv(uv: str, words: list[str]) -> list[str]:
-    """Return the same for uv."""
-    return [uv, "pip", "install", "-q", "--python", str(PYTHON), *words]
 
 
 def run(commands: list[list[str]], words: str) -> bool:
@@ -159,15 +137,12 @@ def site_packages() -> Path:
 
 
 def answers(url: str) -> bool:
-    """Whether a HEAD request to `url` succeeds within PROBE_SECONDS."""
+    """Whether a HEAD request to `url` succeeds within five seconds."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=PROBE_SECONDS) as reply:
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5) as reply:
             return reply.status == 200
     except (OSError, ValueError):
         return False
-
-
-# ── system libraries ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def check_system() -> None:
@@ -176,14 +151,14 @@ def check_system() -> None:
     Ends the program where one is missing still that is NEEDED; what makes it FASTER is only recommended.
     """
     for libraries, why in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
-        missing = missing_of(libraries)
+        missing = [name for name in libraries if not loads(name)]
         packages = [libraries[name] for name in missing]
         if missing and os.geteuid() == 0 and shutil.which("apt-get"):
             say(f"installing {' '.join(packages)}{f': {why}' if why else ''}")
             quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
             for words in (["update"], ["install", "-y", "--no-install-recommends", *packages]):
                 subprocess.run(["apt-get", "-qq", *words], env=quiet, check=False, stdout=subprocess.DEVNULL)
-            missing = missing_of(libraries)
+            missing = [name for name in missing if not loads(name)]
         if missing and why:
             say(f"{', '.join(missing)} is not there, and {why}; to install it:\n  {command_for(missing, packages)}")
         elif missing:
@@ -191,15 +166,10 @@ def check_system() -> None:
             sys.exit(f"set-up: {words}:\n  {command_for(missing, packages)}")
 
 
-def missing_of(libraries: dict[str, str]) -> list[str]:
-    """Return the names of system libraries that the dynamic linker of this Linux does not load; nothing elsewhere."""
-    return [name for name in libraries if sys.platform == "linux" and not loads(name)]
-
-
 def loads(library: str) -> bool:
-    """Whether the dynamic linker finds and loads a shared library."""
+    """Whether the dynamic linker finds and loads a shared library; on Linux alone, what is not asked for elsewhere."""
     try:
-        return bool(ctypes.CDLL(library))
+        return sys.platform != "linux" or bool(ctypes.CDLL(library))
     except OSError:
         return False
 
@@ -208,9 +178,8 @@ def command_for(missing: list[str], packages: list[str]) -> str:
     """Return the command that installs missing libraries on this system."""
     if shutil.which("apt-get"):
         return f"sudo apt-get update && sudo apt-get install -y {' '.join(packages)}"
-    if shutil.which("dnf"):
-        return "sudo dnf install " + " ".join(f"'{name}()(64bit)'" for name in missing)
-    return "(the packages of your system that hold these files)"
+    by_dnf = "sudo dnf install " + " ".join(f"'{name}()(64bit)'" for name in missing)
+    return by_dnf if shutil.which("dnf") else "(the packages of your system that hold these files)"
 
 
 if __name__ == "__main__":

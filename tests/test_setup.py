@@ -47,10 +47,12 @@ def test_root_installs_what_is_missing_and_says_so(lacking, capsys):
     )
 
 
-def test_another_python_is_refused(monkeypatch):
+def test_another_python_is_refused(monkeypatch, tmp_path):
+    for name in ("READY", "VENV", "PYTHON"):  # so that no failure of this test takes the environment away
+        monkeypatch.setattr(setup, name, tmp_path / name)
     monkeypatch.setattr(setup.sys, "version_info", (3, 9, 1))
     with pytest.raises(SystemExit, match=r"3\.11 or 3\.12"):
-        setup.check_python()
+        setup.make_venv()
 
 
 def test_an_index_that_does_not_answer_is_not_used():

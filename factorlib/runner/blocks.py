@@ -1,7 +1,7 @@
 """A step in a child of a cluster's worker, and its `Inputs.map`: independent blocks of work as tasks of the same cluster.
 
-Blocks are sent in pieces, a few for each core, and their results come back in order.  What a block warns of is warned of in the step,
-and the first error in the blocks' order is the step's, as if it had computed them itself.
+Blocks are sent in pieces, a few for each core, and their results come back in order.  What a block warns of is warned of
+in the step, and the first error in the blocks' order is the step's, as if it had computed them itself.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import traceback
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from types import ModuleType
 from typing import Any
 
@@ -32,39 +35,32 @@ PIECES = 4  # for each core: small enough that no core waits long for the last o
 TRIES = 3  # of a task whose process dies
 CORES = "cores"  # the resource that workers declare
 FIRST = 10  # priority of blocks: a step waits for them
+PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
 
 
 class Site(msgspec.Struct, frozen=True):
-    """What a worker must share with the run: its folder, the files of the library, the version of Python.
-
-    run: the run's folder in the store;  mark: a file there
-    """
+    """What a worker must share with a run: its folder in the store, the files of the library, the version of Python."""
 
     run: Path
-    mark: Path
     library: Path = LIBRARY
-    python: str = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    python: str = PYTHON
 
-    def check(self, record: Record | None = None) -> None:
-        """InputError where this process is not at that site, or has not the versions of a step's record."""
-        here = f"the worker on {os.uname().nodename}"
-        if not self.mark.is_file():
+    def fault(self, record: Record | None = None) -> InputError | None:
+        """What hinders this process from working for the run; a step's record asks for the versions that it names, too."""
+        here, start = f"the worker on {os.uname().nodename}", started_by("<scheduler>", self.library)
+        if not self.run.is_dir():
             cure = "keep build/ and the data on a file system that all machines mount at the same path"
-            raise InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
+            return InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
         if self.library != LIBRARY:
-            raise InputError(
-                f"{here} runs the code in {LIBRARY}", file=self.library, cure=started_by("<scheduler>", self.library)
-            )
-        if self.python != (python := f"{sys.version_info[0]}.{sys.version_info[1]}"):
-            raise InputError(
-                f"{here} has Python {python}, the run has {self.python}", cure=started_by("<scheduler>", self.library)
-            )
+            return InputError(f"{here} runs the code in {LIBRARY}", file=self.library, cure=start)
+        if self.python != PYTHON:
+            return InputError(f"{here} has Python {PYTHON}, the run has {self.python}", cure=start)
         for name, wanted in (record or {}).items():
             package = name.removeprefix("package:")
-            if package != name and (found := _version(package)) != wanted:
-                raise InputError(
-                    f"{here} has {package} {found}, the run has {wanted}", cure="make setup, in the same checkout"
-                )
+            if package != name and (installed := _version(package)) != wanted:
+                cure = "make setup, in the same checkout"
+                return InputError(f"{here} has {package} {installed}, the run has {wanted}", cure=cure)
+        return None
 
 
 def started_by(scheduler: str, library: Path = LIBRARY) -> str:
@@ -82,30 +78,21 @@ def _version(package: str) -> str:
 # ── in the child of a step ───────────────────────────────────────────────────────────────────────────────────────────
 
 
-def step_at(scheduler: str, site: Site, task: Task) -> Outcome:
-    """Run a step here; where it may spread over several cores, its independent work goes to the cluster.
+def outcome_at(scheduler: str, site: Site, work: Task | Code) -> Outcome:
+    """Run a step here, or check the parameters of one; a step's independent work goes to the cluster.
 
-    Each try has a temporary folder of its own: another may still be ending elsewhere.
+    Each try of a step has a temporary folder of its own: another may still be ending elsewhere.
     """
-    try:
-        site.check(task.record)
-    except InputError as error:
-        return Outcome(error=str(error))
-    temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
-    task = msgspec.structs.replace(task, temporary=temporary)
-    if task.code.cores == 1:
-        return run_step(task)
-    with contextlib.closing(Blocks(scheduler, site, task)) as blocks:
-        return run_step(task, blocks)
-
-
-def params_at(scheduler: str, site: Site, code: Code) -> Outcome:
-    """`check_params` here."""
-    try:
-        site.check()
-    except InputError as error:
-        return Outcome(error=str(error))
-    return check_params(code)
+    if fault := site.fault(work.record if isinstance(work, Task) else None):
+        return Outcome(error=str(fault))
+    if isinstance(work, Code):
+        return check_params(work)
+    temporary = work.temporary.with_name(f"{work.temporary.name}.{uuid.uuid4().hex[:8]}")
+    work = msgspec.structs.replace(work, temporary=temporary)
+    if work.code.cores == 1:
+        return run_step(work)
+    with contextlib.closing(Blocks(scheduler, site, work)) as blocks:
+        return run_step(work, blocks)
 
 
 class Blocks:
@@ -114,15 +101,8 @@ class Blocks:
     def __init__(self, scheduler: str, site: Site, task: Task):
         self.scheduler, self.site, self.code = scheduler, site, task.code
         self.shelf = parcel().Shelf(task.temporary.with_name(f"{task.temporary.name}.shelf"))
-        self.spent = {
-            "maps": 0,
-            "tasks": 0,
-            "cpu_seconds": 0.0,
-            "memory_mb": 0.0,
-            "bytes_sent": 0,
-            "bytes_shelved": 0,
-            "bytes_back": 0,
-        }
+        sizes = dict.fromkeys(("maps", "tasks", "bytes_sent", "bytes_shelved", "bytes_back"), 0)
+        self.spent: dict[str, Any] = {**sizes, "cpu_seconds": 0.0, "memory_mb": 0.0}
         self._client: Any = None
 
     def __call__(self, function: Callable, items: Iterable) -> list:
@@ -131,12 +111,12 @@ class Blocks:
         if sum(map(len, pieces)) <= 1:
             return [function(item) for piece in pieces for item in piece]
         packed = self.shelf.pack([(function, piece) for piece in pieces])
-        found = [value for back in self._computed(packed) for value in self._taken(back)]
+        values = [value for back in self._computed(packed) for value in self._taken(back)]
         self.spent["maps"] += 1
         self.spent["tasks"] += len(pieces)
         self.spent["bytes_sent"] += sum(map(len, packed))
         self.spent["bytes_shelved"] = self.shelf.written
-        return found
+        return values
 
     def close(self) -> None:
         """Leave the cluster; tasks that are still there are cancelled."""
@@ -146,56 +126,50 @@ class Blocks:
     def _computed(self, packed: list[bytes]) -> list[bytes]:
         from distributed import Client
 
-        from factorlib.runner.host import hosted
+        from factorlib.runner.cluster import hosted
 
-        if self._client is None:
-            self._client = Client(self.scheduler, set_as_default=False)
-        options = {"pure": False, "priority": FIRST, "retries": TRIES - 1, "resources": {CORES: self.code.threads}}
-        task = self.site.run, self.code.threads, False, block_at, self.site, self.code.root
-        return self._client.gather([self._client.submit(hosted, *task, data, **options) for data in packed])
+        self._client = self._client or Client(self.scheduler, set_as_default=False)
+        here = partial(hosted, self.site, self.code.threads, False, block_at)
+        options = {"priority": FIRST, "retries": TRIES - 1, "resources": {CORES: self.code.threads}, "pure": False}
+        work = [(self.code.root, data) for data in packed]
+        return self._client.gather(self._client.map(here, work, **options))
 
     def _taken(self, back: bytes) -> list:
-        done = parcel().unpack(back)
+        values, records, error, cost = parcel().unpack(back)
         self.spent["bytes_back"] += len(back)
-        self.spent["cpu_seconds"] += done.cpu_seconds
-        self.spent["memory_mb"] = max(self.spent["memory_mb"], done.memory_mb)
-        for record in done.said:
+        self.spent["cpu_seconds"] += cost["cpu_seconds"]
+        self.spent["memory_mb"] = max(self.spent["memory_mb"], cost["memory_mb"])
+        for record in records:
             logging.getLogger(record.name).handle(record)
-        if done.error is not None:
-            raise done.error
-        return done.values
+        if error is not None:
+            raise error
+        return values
 
 
 def _pieces(items: list, count: int) -> list[list]:
     """
-    >>> _pieces([1, 2, 3, 4, 5], 2), _pieces([1], 4)
-    ([[1, 2], [3, 4, 5]], [[1]])
+    >>> _pieces([1, 2, 3, 4, 5], 2), _pieces([1], 4), _pieces([], 4)
+    ([[1, 2], [3, 4, 5]], [[1]], [])
     """
     count = min(count, len(items))
-    ends = [len(items) * k // count for k in range(count + 1)] if items else []
-    return [items[first:last] for first, last in zip(ends, ends[1:])]
+    return [items[len(items) * k // count : len(items) * (k + 1) // count] for k in range(count)]
 
 
 # ── in the child of a block ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Done(msgspec.Struct):
-    """What a piece gave, warned of and cost; error: what the first block raised that failed."""
+def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
+    """What the function gave of each item of a piece, what was warned of, the first error and the cost, packed.
 
-    values: list[Any]
-    said: list[logging.LogRecord]
-    error: BaseException | None
-    cpu_seconds: float
-    memory_mb: float
-
-
-def block_at(scheduler: str, site: Site, root: Path, data: bytes) -> bytes:
-    """The function of every item of a piece, all of it packed."""
-    site.check()
+    work: the project's root, and the packed function and items
+    """
+    if fault := site.fault():
+        raise fault
+    root, data = work
     if str(root) not in sys.path:
         sys.path.insert(0, str(root))
     meter, values, error = Meter(), [], None
-    with _recorded() as said:
+    with _recorded() as records:
         function, items = parcel().unpack(data)
         try:
             for item in items:
@@ -203,16 +177,16 @@ def block_at(scheduler: str, site: Site, root: Path, data: bytes) -> bytes:
         except Exception as caught:
             caught.add_note(traceback.format_exc())
             error = caught
-    cost = meter.read(1, 1)
-    return parcel().pack(Done(values, said, error, cost["cpu_seconds"], cost["memory_mb"]))
+    return parcel().pack((values, records, error, meter.read(1, 1)))
 
 
 @contextlib.contextmanager
 def _recorded() -> Iterator[list[logging.LogRecord]]:
-    """What is warned of within, as a step's `Events` would see it."""
-    said: list[logging.LogRecord] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: said.append(_plain(record))
+    """What is warned of within, as a step's `Events` would see it, with its text put together."""
+    records: list[logging.LogRecord] = []
+    handler = QueueHandler(SimpleQueue())
+    handler.setLevel(logging.WARNING)
+    handler.enqueue = records.append
     loggers = [logging.getLogger(name) for name in ("factorlib", "py.warnings")]
     logging.captureWarnings(True)
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -220,16 +194,10 @@ def _recorded() -> Iterator[list[logging.LogRecord]]:
         logger.addHandler(handler)
         logger.propagate = False
     try:
-        yield said
+        yield records
     finally:
         for logger in loggers:
             logger.removeHandler(handler)
-
-
-def _plain(record: logging.LogRecord) -> logging.LogRecord:
-    """The record with its text put together: its arguments may be anything."""
-    record.msg, record.args, record.exc_info = record.getMessage(), None, None
-    return record
 
 
 def parcel() -> ModuleType:

@@ -1,9 +1,10 @@
-"""A process that computes for a worker of a cluster, which itself computes nothing.
+"""A process that computes: whatever runs a step does so in one, whether on this machine or as a worker of a cluster.
 
 How many threads a library uses, which instructions it may use, and in which order sets are walked, is fixed when a
-process starts.  A worker of a cluster was started by others, in whatever environment, and stays for days.  So it starts a
-child for the steps of one run and one number of threads, in the environment that the runner's own workers have, with the
-modules that are on disk now.  A library that crashes, or a step that is killed for want of memory, ends the child alone.
+process starts, and results depend on it.  So each child is started for one number of threads, in an environment of its
+own, with the modules that are on disk now.  A worker of a cluster was started by others, in whatever environment, and
+stays for days: it computes nothing itself.  A library that crashes, or a step that is killed for want of memory, ends the
+child alone.
 """
 
 from __future__ import annotations
@@ -26,65 +27,81 @@ from factorlib import arithmetic
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
-TRIM = "MALLOC_TRIM_THRESHOLD_"
+TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
 MAIN = f"import sys; sys.path.insert(0, {str(LIBRARY)!r}); from factorlib.runner.child import main; main()"
 
 
-class Died(BrokenProcessPool):
-    """The child was killed from outside, or for want of memory, or crashed in a library."""
-
-
-class Unwanted(Exception):
-    """Nobody waits for the result any more."""
-
-
-def environment(threads: int) -> dict[str, str]:
-    """What a process that computes is started with: `threads` threads of every library, the same order of sets and the same instructions.
-
-    Dask's nanny has its workers give memory back at once, and glibc then asks the system for each large array anew: sums of
-    700 × 700 numbers take three times as long.  Children are started without that.
-    """
-    fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
-    return {name: value for name, value in os.environ.items() if name != TRIM} | fixed
-
-
 class Child:
-    """A child of this process; run: the folder of its run, with which it ends."""
+    """A child of this process with `threads` threads in every library; run: a folder with which it ends."""
 
     def __init__(self, threads: int, run: Path):
+        self.threads, self.run, self.busy = threads, run, False
         self.connection, theirs = Pipe()
         command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
-        handle = theirs.fileno()
-        self.process = subprocess.Popen(command, env=environment(threads), stdin=subprocess.DEVNULL, pass_fds=[handle])
+        fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+        environment = {name: value for name, value in os.environ.items() if name != TRIM} | fixed
+        self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
         theirs.close()
 
-    def call(self, wanted: Callable[[], bool], function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)`, computed in the child.  Raises what it raises; `Died`; `Unwanted` once `wanted()` is false."""
+    def call(self, function: Callable, *arguments: Any, wanted: Callable[[], bool] = lambda: True) -> Any:
+        """`function(*arguments)`, computed in the child, which is free again afterwards.
+
+        Raises what the function raises.  Raises BrokenProcessPool, and the child is no more, where it was killed from
+        outside, or for want of memory, or crashed in a library, and once `wanted()` is false.
+        """
         try:
             self.connection.send((function, arguments))
             while not self.connection.poll(WATCH):
-                if not wanted():
-                    raise Unwanted
+                died = self.process.poll() is not None and not self.connection.poll()
+                if died or not wanted():
+                    raise EOFError
             good, value = self.connection.recv()
-        except (EOFError, OSError) as error:
-            raise Died("its process died") from error
+        except BaseException as error:
+            self.end(kill=True)
+            if isinstance(error, EOFError | OSError):
+                raise BrokenProcessPool("its process died, or nobody waited for it") from error
+            raise
+        self.busy = False
         if not good:
             raise value
         return value
 
-    def kill(self) -> None:
-        """End it at once, whatever it does."""
-        self.process.kill()
+    def end(self, kill: bool) -> None:
+        """End it: `kill`: at once, whatever it does."""
+        if kill:
+            self.process.kill()
+        self.connection.close()  # it ends by itself at that
         self.process.wait()
-        self.connection.close()
+
+
+class Children:
+    """The children of this process.  One that is free is taken again by the next call for the same run and threads."""
+
+    def __init__(self) -> None:
+        self.all: list[Child] = []
+        self._lock = threading.Lock()
+
+    def take(self, threads: int, run: Path) -> Child:
+        """A child that is alive and free, or a new one; it is busy until a call of it has returned."""
+        with self._lock:
+            self.all = [child for child in self.all if child.process.poll() is None]
+            free = (child for child in self.all if not child.busy and (child.threads, child.run) == (threads, run))
+            if (child := next(free, None)) is None:
+                self.all.append(child := Child(threads, run))
+            child.busy = True
+            return child
+
+    def at_work(self, run: Path) -> bool:
+        """Whether a child of that run is busy."""
+        return any(child.busy and child.run == run and child.process.poll() is None for child in self.all)
 
 
 # ── in the child ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def main() -> None:
-    """Answer calls until the parent is gone."""
+    """Answer calls until the parent is gone, or wants no more."""
     handle, threads, parent, run = sys.argv[1:]
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent ends it
         signal.signal(number, signal.SIG_IGN)
@@ -94,18 +111,15 @@ def main() -> None:
     with contextlib.suppress(EOFError, OSError):
         while True:
             function, arguments = connection.recv()
-            connection.send(_answer(function, arguments))
-
-
-def _answer(function: Callable, arguments: tuple) -> tuple[bool, Any]:
-    try:
-        return True, function(*arguments)
-    except BaseException as error:  # whatever it is, it is the caller's
-        return False, error
+            try:
+                answer = True, function(*arguments)
+            except BaseException as error:  # whatever it is, it is the caller's
+                answer = False, error
+            connection.send(answer)
 
 
 def _end_with(parent: int, run: Path) -> None:
-    """Nobody waits for a child whose worker was killed, or whose run is over."""
+    """Nobody waits for a child whose parent was killed, or whose run is over."""
     while os.getppid() == parent and run.is_dir():
         time.sleep(WATCH)
     os._exit(1)

@@ -1,7 +1,7 @@
 """Steps on a Dask cluster: each is a task with keys and paths, its result lands in the store, which all workers see.
 
-The cluster is that of a scheduler that is running, or one of this machine that lives as long as the run.  A task is handed
-to a child process of its worker (`factorlib.runner.host`), so that bits do not depend on how workers were started.  A task
+The cluster is that of a scheduler that is running, or one in this process that lives as long as the run.  A worker hands
+its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
 whose worker or child dies is tried again, on its own: nothing else is lost.
 """
 
@@ -12,59 +12,57 @@ import contextlib
 import logging
 import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+import warnings
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from factorlib.errors import InputError
-from factorlib.runner.blocks import CORES, TRIES, Site, params_at, started_by, step_at
-from factorlib.runner.executors import machine_cores
+from factorlib.runner.blocks import CORES, TRIES, Site, outcome_at, started_by
+from factorlib.runner.child import Children
+from factorlib.runner.executors import Pools, machine_cores
 from factorlib.runner.pipeline import ADDRESS
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
-from factorlib.runner.worker import check_params, run_step
-from factorlib.wholefile import write_text
 
-AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for the next
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
-PATIENCE = 10  # seconds to reach a scheduler, and for steps to end that are cancelled
+PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
 QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
 }
-AT = {run_step: step_at, check_params: params_at}  # what a child calls in place of it
 
 
-class Cluster:
-    """The executors of a Dask cluster, with the interface of `factorlib.runner.executors.Pools`.
+class Cluster(Pools):
+    """The executor of a Dask cluster.
 
     scheduler: its address; None for a cluster of this machine's cores
     run: folder of the run, in the store
     """
 
+    AHEAD = 2  # so that no worker waits for its next step
+
     def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
-        if find_spec("distributed") is None:
-            raise InputError(
-                "Dask is not installed", key="executor", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-            )
-        self.site = Site(run, run / "mark")
-        write_text(self.site.mark, "")
-        self._executors: dict[int | None, Executor] = {}
+        _require_dask("executor")
+        self.site = Site(run)
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
         self._busy: dict[Future, int] = {}
-        self._ends = contextlib.ExitStack()
-        with whole(), contextlib.ExitStack() as ends:
-            self.client = ends.enter_context(_client(scheduler))
-            self._ends = ends.pop_all()
+        self._over = threading.Event()
+        with whole():
+            self.client = _client(scheduler) if scheduler else _client_of_this_machine()
         try:
-            self._check(scheduler, say)
+            if scheduler:
+                self._check(scheduler, say)
+                threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+            self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
         except BaseException:
-            self._ends.close()
+            self.client.close()
             raise
 
     @property
@@ -72,123 +70,102 @@ class Cluster:
         """Those of all workers that are there now; 1 where none is."""
         return max(1, sum(self._declared().values()))
 
-    def free(self, cores: int) -> bool:
-        """Whether a step of `cores` cores may be handed out now."""
-        busy = sum(self._busy.values())
-        return busy == 0 or busy + cores <= AHEAD * self.cores
-
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
-        """Hand out `function(argument)`; one that takes more cores than threads hands out blocks itself, and holds no core meanwhile."""
-        from factorlib.runner.host import hosted
+        """Hand out a step or a check of parameters, by its argument; its future.
 
-        spreads = cores > threads
-        executor = self._executor(None if spreads else min(threads, max(self._declared().values(), default=threads)))
+        A step that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
+        """
+        spreads, most = cores > threads, max(self._declared().values(), default=threads)
+        resources = {} if spreads else {CORES: min(threads, most)}
         with whole():
-            future = _known(executor.submit(hosted, self.site.run, threads, spreads, AT[function], self.site, argument))
+            task = hosted, self.site, threads, spreads, outcome_at, argument
+            future = _in_our_words(self._executor.submit(*task, resources=resources))
             self._busy[future] = cores
             return future
 
-    def done(self, future: Future) -> None:
-        """Take note that a future is finished."""
-        del self._busy[future]
-
     def close(self, kill: bool = False) -> None:
         """Leave the cluster; `kill`: tasks that are not finished are cancelled, and their processes killed."""
-        for executor in self._executors.values():
-            executor.shutdown(wait=not kill)
-        if kill:
-            with contextlib.suppress(Exception):  # of a cluster that is gone
-                self._wait_until_nothing_runs()
-        self._ends.close()
-
-    def _executor(self, cores: int | None) -> Executor:
-        if cores not in self._executors:
-            resources = {} if cores is None else {"resources": {CORES: cores}}
-            self._executors[cores] = self.client.get_executor(pure=False, retries=TRIES - 1, **resources)
-        return self._executors[cores]
+        self._over.set()
+        self._executor.shutdown(wait=not kill)
+        end = time.monotonic() + PATIENCE * kill
+        with contextlib.suppress(Exception):  # of a cluster that is gone
+            while time.monotonic() < end and any(self.client.run(at_work, self.site.run).values()):
+                time.sleep(0.1)
+        self.client.close()
 
     def _declared(self) -> dict[str, int]:
         """The cores that each worker declares, by its address, as the scheduler said not long ago."""
         asked, known = self._known
         if time.monotonic() - asked >= FRESH:
-            workers = self.client.scheduler_info(n_workers=-1)["workers"]
-            known = {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
+            with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
+                # not `client.scheduler_info`, whose answer a look of Dask's own that asks for no workers may replace
+                workers = self.client.sync(self.client.scheduler.identity, n_workers=-1)["workers"]
+                known = {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
             self._known = time.monotonic(), known
         return known
 
-    def _check(self, scheduler: str | None, say: Callable[[str], None]) -> None:
+    def _check(self, scheduler: str, say: Callable[[str], None]) -> None:
         """Wait for a worker; InputError where any of those that are there cannot do what it must."""
         if not self._declared():
-            say(f"waiting: no worker yet at {scheduler}; {started_by(str(scheduler))}")
+            say(f"waiting: no worker yet at {scheduler}; {started_by(scheduler)}")
             while not self._declared():
                 time.sleep(FRESH)
         if lacking := [address for address, cores in self._declared().items() if not cores]:
-            cure = f"{started_by(str(scheduler))}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
+            cure = f"{started_by(scheduler)}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
             raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="scheduler", cure=cure)
-        for found in self.client.run(_fault, self.site).values():
-            if found is not None:
-                raise found
+        for fault in filter(None, self.client.run(Site.fault, self.site).values()):
+            raise fault
 
-    def _wait_until_nothing_runs(self) -> None:
-        from factorlib.runner.host import busy
-
-        end = time.monotonic() + PATIENCE
-        while time.monotonic() < end and any(self.client.run(busy, self.site.run).values()):
-            time.sleep(0.1)
-
-
-def _fault(site: Site) -> InputError | None:
-    """What is wrong with a worker."""
-    try:
-        site.check()
-        return None
-    except InputError as error:
-        return error
+    def _miss_workers(self, scheduler: str, say: Callable[[str], None]) -> None:
+        """Say once that the last worker is gone.  Dask keeps its tasks for those that come."""
+        last = time.monotonic()
+        while not self._over.wait(FRESH):
+            if self._declared():
+                last = time.monotonic()
+            elif time.monotonic() - last >= PATIENCE:
+                say(f"waiting: no worker is left at {scheduler}; {started_by(scheduler)}")
+                last = float("inf")
 
 
-@contextlib.contextmanager
-def _client(scheduler: str | None) -> Iterator[Any]:
+def _require_dask(key: str) -> None:
+    if find_spec("distributed") is None:
+        raise InputError(
+            "Dask is not installed", key=key, cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        )
+
+
+def _client_of_this_machine() -> Any:
+    """A client of a cluster in this process, of one worker with all cores."""
     import dask
-    from distributed import Client, LocalCluster
-    from distributed.deploy.utils import nprocesses_nthreads
+    from distributed import Client
 
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    cores = machine_cores()
+    place = {"processes": False, "protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None, "memory_limit": 0}
+    size = {"n_workers": 1, "threads_per_worker": cores, "resources": {CORES: cores}}
+    with dask.config.set(dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))):
+        return Client(**place, **size, silence_logs=logging.CRITICAL, set_as_default=False)
+
+
+def _client(scheduler: str) -> Any:
+    """A client of the scheduler at an address.  InputError where none answers there."""
+    from distributed import Client
+
+    _check_protocol(scheduler, "client", "scheduler")
     for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
-    if scheduler is None:
-        workers, threads = nprocesses_nthreads(machine_cores())
-        with (
-            dask.config.set(
-                dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))
-            ),  # `set` replaces whole branches
-            LocalCluster(
-                workers,
-                threads,
-                host="127.0.0.1",
-                dashboard_address=None,
-                memory_limit=0,
-                resources={CORES: threads},
-                silence_logs=logging.CRITICAL,
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
-            yield client
-        return
     try:
         with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
             beside.submit(asyncio.run, _answered(scheduler)).result()
-        client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except (
-        Exception
-    ) as error:  # what answers there may be anything: garbage, an HTTP server, a protocol that is not installed
+        return Client(scheduler, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # what answers there may be anything: an HTTP server, garbage
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
-        said = str(error) or f"nothing in {PATIENCE} s"
-        raise InputError(f"no Dask scheduler answers at {scheduler} ({said})", key="scheduler", cure=cure) from error
-    with client:
-        yield client
+        words = str(error) or f"nothing in {PATIENCE} s"
+        raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="scheduler", cure=cure) from error
 
 
 async def _answered(scheduler: str) -> None:
-    """Ask what listens there who it is; TimeoutError where it says nothing in time, for which a client would wait without end."""
+    """Ask what listens there who it is; TimeoutError where it says nothing, for which a client would wait without end."""
     from distributed.core import rpc
     from distributed.security import Security
 
@@ -199,46 +176,82 @@ async def _answered(scheduler: str) -> None:
         await remote.close_rpc()
 
 
-def _known(asked: Future) -> Future:
+def _check_protocol(address: str, role: str, key: str) -> None:
+    """InputError where a client or a worker cannot speak the protocol of an address here."""
+    from distributed.comm.registry import get_backend
+    from distributed.security import Security
+
+    protocol = address.partition("://")[0]
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            get_backend(protocol).get_connector()
+    except Exception as error:  # which one is its own affair: ucx is an abstract class
+        cure = "install what Dask speaks it with (distributed-ucxx-cu12 for ucxx), or write tcp://<host>:<port>"
+        raise InputError(f"{protocol}:// cannot be spoken here ({error})", key=key, cure=cure) from error
+    if protocol in ("tls", "wss") and Security().get_connection_args(role).get("ssl_context") is None:
+        cure = "name them in Dask's configuration (distributed.comm.tls, or DASK_DISTRIBUTED__COMM__TLS__CA_FILE and others)"
+        raise InputError(f"{protocol}:// asks for certificates, and there are none", key=key, cure=cure)
+
+
+def _in_our_words(asked: Future) -> Future:
     """A future with what Dask says of dead workers in the words of `concurrent.futures`."""
     answer: Future = Future()
 
     def take_over(asked: Future) -> None:
         """The outcome, once it is there."""
-        if asked.cancelled():
-            answer.set_exception(BrokenProcessPool("the task was cancelled"))
-        elif (error := asked.exception()) is None:
+        try:
             answer.set_result(asked.result())
-        else:
-            died = type(error).__name__ in ("KilledWorker", "Unwanted")
-            answer.set_exception(BrokenProcessPool(str(error)) if died else error)
+        except BaseException as error:
+            answer.set_exception(BrokenProcessPool(str(error)) if type(error).__name__ == "KilledWorker" else error)
 
     asked.add_done_callback(take_over)
     return answer
 
 
+# ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+_children = Children()
+
+
+def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: Any) -> Any:
+    """`function(address of the scheduler, site, argument)` in a child of this worker, which ends if nobody waits any more.
+
+    waits: it mostly waits for other tasks, so the worker takes on others meanwhile
+    """
+    from distributed import get_worker, secede
+
+    worker = get_worker()
+    key = worker.get_current_task()
+
+    def wanted() -> bool:
+        """False once the task is cancelled, which for Dask is a change of its state, no interruption; or the worker closes."""
+        task, status = worker.state.tasks.get(key), worker.status.name
+        open_ = status in ("running", "paused", "closing_gracefully")
+        return task is not None and task.state != "cancelled" and open_
+
+    if waits:
+        secede()
+    child = _children.take(threads, site.run)
+    return child.call(function, worker.scheduler.address, site, argument, wanted=wanted)
+
+
+def at_work(run: Path) -> bool:
+    """Whether a task of that run has a child here."""
+    return _children.at_work(run)
+
+
 def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
-    """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), started as steps need it."""
-    if find_spec("distributed") is None:
-        raise InputError(
-            "Dask is not installed", key="worker", cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-        )
+    """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), as steps need it.
+
+    Raises InputError where that is no address, or its protocol cannot be spoken here.
+    """
+    _require_dask("worker")
     if not ADDRESS.fullmatch(scheduler):
-        raise InputError(
-            f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        )
-    count = str(cores or machine_cores())
-    options = [
-        "--nthreads",
-        count,
-        "--nworkers",
-        "1",
-        "--resources",
-        f"{CORES}={count}",
-        "--memory-limit",
-        "0",
-        "--no-dashboard",
-    ]
+        cure = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+        raise InputError(f"{scheduler!r} is no address", key="worker", cure=cure)
+    _check_protocol(scheduler, "worker", "worker")
+    count = cores or machine_cores()
+    options = f"--nthreads {count} --nworkers 1 --resources {CORES}={count} --memory-limit 0 --no-dashboard".split()
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
     os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})

@@ -1,108 +1,57 @@
-"""Where steps run: `concurrent.futures` executors of one process each, all within the machine's cores.
+"""Where steps run: child processes of this machine, one for each step that runs, all within the machine's cores.
 
-The number of threads of a step's numerics is part of its spec, for sums depend on it; how many steps run at once, and
-over how many cores a step spreads independent work, is the machine's affair.  A process pool whose process is killed gives up all its work, so each has one process and one step:
-what is killed is that step's affair alone.  Any executor with `submit` will do in place of a pool.
+The number of threads of a step's numerics is part of its spec, for sums depend on it; how many steps run at once, and over
+how many cores a step spreads independent work, is the machine's affair.  `factorlib.runner.cluster` has the same interface.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
-import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from typing import Any, ClassVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
-from factorlib import arithmetic
+from factorlib.runner.child import Children
 from factorlib.runner.stop import whole
-from factorlib.runner.worker import limit_threads
 
 
 class Pools:
-    """Executors by number of threads; `free` says whether a step that needs so many cores may start now."""
+    """Children that compute, each waited for by a thread.  cores: how many they may keep busy, default this machine's"""
+
+    AHEAD = 1  # steps are handed out for so many times the cores
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or machine_cores()
-        self._spare: dict[int, list[Executor]] = {}
-        self._busy: dict[Future, tuple[int, Executor]] = {}
+        self._children, self._threads = Children(), ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
+        self._busy: dict[Future, int] = {}
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
-        busy = sum(taken for taken, _, _ in self._busy.values())
-        return busy == 0 or busy + cores <= self.cores
+        return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
 
     def submit(self, cores: int, threads: int, function: Callable, *arguments: Any) -> Future:
-        """Start `function(*arguments)` in a worker process of `threads` threads, which takes `cores` cores; returns its future."""
-        with whole(), _OfWorkers():
-            spare = self._spare.setdefault(threads, [])
-            executor = spare.pop() if spare else _executor(threads)
-            try:
-                future = executor.submit(function, *arguments)
-            except BrokenProcessPool:  # its process was killed while it had nothing to do
-                executor.shutdown()
-                return self.submit(cores, threads, function, *arguments)
-            self._busy[future] = cores, threads, executor
+        """Start `function(*arguments)` in a process of `threads` threads, which takes `cores` cores; its future."""
+        with whole():
+            child = self._children.take(threads, Path("/"))
+            future = self._threads.submit(child.call, function, *arguments)
+            self._busy[future] = cores
             return future
 
     def done(self, future: Future) -> None:
-        """Take a finished future's worker back, for the next step of as many threads."""
-        _, threads, executor = self._busy.pop(future)
-        self._spare[threads].append(executor)
+        """Take note that a future is finished."""
+        del self._busy[future]
 
     def close(self, kill: bool = False) -> None:
-        """End all worker processes; `kill`: at once, whatever they do."""
-        executors = [e for spare in self._spare.values() for e in spare] + [
-            executor for _, _, executor in self._busy.values()
-        ]
+        """End all processes; `kill`: at once, whatever they do."""
         if kill:
-            for process in multiprocessing.active_children():
-                process.kill()
-        # Each executor is shut down by one call that waits.  After `shutdown(wait=False)` a second call would not wait, and its thread could
-        # still be closing pipes when Python ends, which prints a traceback.
-        with ThreadPoolExecutor(max(1, len(executors))) as enders:
-            list(enders.map(lambda executor: executor.shutdown(cancel_futures=True), executors))
+            for child in self._children.all:
+                child.process.kill()
+        self._threads.shutdown()
+        for child in self._children.all:
+            child.end(kill)
 
 
 def machine_cores() -> int:
     """The processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _executor(threads: int) -> Executor:
-    return ProcessPoolExecutor(
-        1, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid())
-    )
-
-
-class _OfWorkers:
-    """The environment of workers that start meanwhile: they walk their sets in the same order, and compute the same bits, every time."""
-
-    VARIABLES: ClassVar = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES}
-
-    def __enter__(self) -> None:
-        self.before = {name: os.environ.get(name) for name in self.VARIABLES}
-        os.environ.update(self.VARIABLES)
-
-    def __exit__(self, *exception: object) -> None:
-        for name, value in self.before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start(threads: int, parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    limit_threads(threads)
-    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
-
-
-def _die_with(parent: int) -> None:
-    """Nobody waits for a worker whose parent was killed."""
-    while os.getppid() == parent:
-        time.sleep(0.3)
-    os._exit(1)

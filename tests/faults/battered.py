@@ -94,7 +94,7 @@ def workers(group: int) -> list[int]:
     found = []
     for pid in members(group):
         with contextlib.suppress(OSError):
-            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if b"runner.child" in Path(f"/proc/{pid}/cmdline").read_bytes():
                 found.append(pid)
     return found
 

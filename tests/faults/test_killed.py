@@ -52,7 +52,7 @@ def workers(parent):
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             of_parent = (folder / "stat").read_text().rpartition(")")[2].split()[1] == str(parent)
-            if of_parent and b"spawn_main" in (folder / "cmdline").read_bytes():
+            if of_parent and b"runner.child" in (folder / "cmdline").read_bytes():
                 found.append(int(folder.name))
         except OSError:
             continue

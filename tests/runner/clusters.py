@@ -15,69 +15,60 @@ from pathlib import Path
 from factorlib.runner.project import LIBRARY
 
 
-class LiveCluster:
+class LiveCluster(contextlib.AbstractContextManager):
     """A scheduler in a process of its own, and its workers, each started by `python -m factorlib worker`."""
 
-    def __init__(self, workers: int, folder: Path, *options: str):
-        self.folder = folder
+    def __init__(self, workers: int, folder: Path, environment: dict[str, str] | None = None):
+        self.folder, self.environment = folder, environment or {}
         self.processes: list[subprocess.Popen] = []
-        scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-        self.address = self._said(self._start("scheduler", *scheduler), r"Scheduler at:\s+(tcp://\S+)")
+        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+        self.start("distributed.cli.dask_scheduler", *options, says="Scheduler at")
+        self.address = re.search(r"tcp://\S+", self.log(0))[0]
         for _ in range(workers):
-            self.add_worker(*options)
+            self.add_worker()
 
-    def add_worker(self, *options: str) -> subprocess.Popen:
+    def add_worker(self) -> subprocess.Popen:
         """One more, of one core; returns when the scheduler knows it."""
-        name = f"worker{len(self.processes)}"
-        command = (
-            "factorlib",
-            "worker",
-            self.address,
-            "--cores",
-            "1",
-            "--host",
-            "127.0.0.1",
-            "--local-directory",
-            tempfile.gettempdir(),
-        )
-        process = self._start(name, *command, *options)
-        self._said(name, r"(Registered to):\s")
-        return process
+        options = f"--cores 1 --host 127.0.0.1 --local-directory {tempfile.gettempdir()}".split()
+        return self.start("factorlib", "worker", self.address, *options, says="Registered to")
 
-    def _start(self, name: str, *words: str) -> str | subprocess.Popen:
-        environment = {**os.environ, "PYTHONPATH": str(LIBRARY), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "60s"}
-        with open(self.folder / f"{name}.log", "wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", *words],
-                env=environment,
-                stdout=log,
-                stderr=log,
-                cwd=self.folder,
-                start_new_session=True,
-            )
-        self.processes.append(process)
-        return name if name == "scheduler" else process
-
-    def _said(self, name: str, pattern: str) -> str:
-        end = time.monotonic() + 120
-        while not (found := re.search(pattern, self.log(name))):
-            assert time.monotonic() < end, self.log(name)
+    def start(self, *words: str, says: str) -> subprocess.Popen:
+        """A process `python -m <words>` that has written `says`, a colon and a word into its log."""
+        more = {"PYTHONPATH": str(LIBRARY), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "60s", **self.environment}
+        number, end = len(self.processes), time.monotonic() + 120
+        with open(self.folder / f"{number}.log", "wb") as log:
+            outer = {"env": {**os.environ, **more}, "stdout": log, "stderr": log, "cwd": self.folder}
+            self.processes.append(subprocess.Popen([sys.executable, "-m", *words], start_new_session=True, **outer))
+        while not re.search(rf"{says}:\s+\S", self.log(number)):
+            assert time.monotonic() < end, self.log(number)
             time.sleep(0.05)
-        return found[1]
+        return self.processes[-1]
 
-    def log(self, name: str) -> str:
-        return (self.folder / f"{name}.log").read_text()
+    def log(self, number: int) -> str:
+        return (self.folder / f"{number}.log").read_text()
 
     @property
     def settings(self) -> list[str]:
         """The words that make a run use it."""
         return ["executor=dask", f"scheduler={self.address}"]
 
+    def kill_workers(self) -> None:
+        """SIGKILL to all but the scheduler."""
+        while len(self.processes) > 1:
+            self._kill(self.processes.pop())
+
     def close(self) -> None:
-        for process in reversed(self.processes):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        """SIGKILL to all."""
+        self.kill_workers()
+        self._kill(self.processes[0])
+
+    def _kill(self, process: subprocess.Popen) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 def offspring(pid: int) -> list[int]:
@@ -86,10 +77,10 @@ def offspring(pid: int) -> list[int]:
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             below.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
-    found = [pid]
-    for one in found:
-        found += below.get(one, [])
-    return found[1:]
+    pids = [pid]
+    for one in pids:
+        pids += below.get(one, [])
+    return pids[1:]
 
 
 def doing(pid: int, word: str) -> bool:
