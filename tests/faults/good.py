@@ -104,15 +104,9 @@ def glb(header: dict | str | None = None, data: bytes = DATA) -> bytes:
 
 
 MESHES = {
-    "a.obj": OBJ.encode(),
-    "a.off": OFF.encode(),
-    "a.stl": STL_TEXT.encode(),
-    "b.stl": STL,
-    "a.ply": PLY_TEXT.encode(),
-    "b.ply": PLY,
-    "a.gltf": gltf_text().encode(),
-    "a.glb": glb(),
-}
+    "a.obj": OBJ.encode(), "a.off": OFF.encode(), "a.stl": STL_TEXT.encode(), "b.stl": STL, "a.ply": PLY_TEXT.encode(),
+    "b.ply": PLY, "a.gltf": gltf_text().encode(), "a.glb": glb(),
+}  # fmt: skip
 
 # ── masks ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -195,41 +189,31 @@ SOURCES = {
 
 KEYPOINTS = [{"pixel": [1.0 * k, 5.0 * (k % 2)], "point": p} for k, p in enumerate([[0.0] * 3, *EYE])]
 DATASET = {
-    "format": 1,
-    "materials": ["red", "wood"],
+    "format": 1, "materials": ["red", "wood"],
     "meshes": {
-        "chair": {"file": "m/chair.obj", "parts": {"shell": "red"}},
-        "vase": {"file": "vase.ply", "material": "red"},
+        "chair": {"file": "m/chair.obj", "parts": {"shell": "red"}}, "vase": {"file": "vase.ply", "material": "red"},
         "box": {"file": "m/box.gltf", "parts": {"chair": "wood"}},
     },
     "photos": [
         {
-            "name": "hall",
-            "image": "7.png",
-            "encoding": "srgb",
-            "illumination": "hall",
-            "world_from_camera": EYE,
+            "name": "hall", "image": "7.png", "encoding": "srgb", "illumination": "hall", "world_from_camera": EYE,
             "masks": {"red": "red.png"},
             "objects": [
                 {
-                    "name": "vase",
-                    "mesh": "vase",
-                    "mask": "red.png",
+                    "name": "vase", "mesh": "vase", "mask": "red.png",
                     "pose": {"rotation": EYE, "translation": [0.0, 0.0, 2.5]},
                 },
                 {"name": "chair", "mesh": "chair", "materials": {"shell": "wood"}, "keypoints": KEYPOINTS},
             ],
         },
         {
-            "name": "room",
-            "image": "8.png",
-            "masks": "mask.png",
+            "name": "room", "image": "8.png", "masks": "mask.png",
             "camera": {"focal_px": 812.0, "principal_point": [8.0, 6.0]},
             "objects": [{"name": "vase", "mesh": "vase"}, {"name": "box", "mesh": "box"}],
         },
     ],
     "truth": "truth.yaml",
-}
+}  # fmt: skip
 TRUTH = {
     "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3}},
     "illumination": {"hall": "light.exr"},
@@ -256,22 +240,12 @@ PLAIN = {  # name -> what is written as JSON or YAML
     "poses.json": POSES,
 }
 CONTENT = {
-    "7.png": PHOTO,
-    "8.png": PHOTO,
-    "mask.png": MASK,
-    "red.png": RED,
-    "m/chair.obj": OBJ.encode(),
-    "m/a.mtl": b"newmtl red\n",
-    "m/box.gltf": json.dumps(gltf_header("../buffers/b%201.bin")).encode(),
-    "buffers/b 1.bin": DATA,
-    "vase.ply": PLY,
-    "model/cameras.bin": cameras_bin(),
-    "model/images.bin": images_bin(),
-    "text/cameras.txt": CAMERAS_TXT,
-    "text/images.txt": IMAGES_TXT,
-    **MESHES,
+    "7.png": PHOTO, "8.png": PHOTO, "mask.png": MASK, "red.png": RED, "m/chair.obj": OBJ.encode(),
+    "m/a.mtl": b"newmtl red\n", "m/box.gltf": json.dumps(gltf_header("../buffers/b%201.bin")).encode(),
+    "buffers/b 1.bin": DATA, "vase.ply": PLY, "model/cameras.bin": cameras_bin(), "model/images.bin": images_bin(),
+    "text/cameras.txt": CAMERAS_TXT, "text/images.txt": IMAGES_TXT, **MESHES,
     **{name: json.dumps(value).encode() for name, value in PLAIN.items()},
-}
+}  # fmt: skip
 
 
 def observations(n: int = 5) -> Observations:
