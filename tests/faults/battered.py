@@ -1,4 +1,4 @@
-"""A project that faults are tried on: the toy, its files written in small pieces; ways to run it, kill it and see what is left."""
+"""The toy, its files written in small pieces; ways to run it, kill it and see what is left."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def new_runs(project: Project, *settings: str) -> list[str]:
 
 
 def lost_in(project: Project, wanted: dict[str, bytes], *settings: str) -> list[str]:
-    """What a fault cost: the next run must be accepted, make what is missing and only that, and end in the same bytes."""
+    """What a fault cost: the next run must be accepted, make only what is missing, and end in the same bytes."""
     losses, before = [], set(kept(project).values())
     if verbs.verify(project, None) != 0:
         losses.append("something that is damaged is taken for a result")

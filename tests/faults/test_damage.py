@@ -1,4 +1,4 @@
-"""Damage in the store: noticed where a result is used, made again, replaced by force, named by `verify`; nothing is lost or spread."""
+"""Damage in the store is noticed where a result is used, made again, named by `verify`; nothing is lost or spread."""
 
 import json
 import os
@@ -98,7 +98,7 @@ def test_what_a_user_does_to_a_file_under_the_datasets_name_is_noticed(project, 
 
 
 def test_a_stage_over_the_set_reads_no_damaged_view(project):
-    """The view alone is damaged: its tree is right, so that nothing is made again, but the total is to read what is right."""
+    """The view alone is damaged: nothing is made again, for its tree is right, but the total is to read what is right."""
     replace(in_set(project, "count/counts.json"), '{"a": {"letters": 100}}')
     replace(in_set(project, "count/a.json"), '{"letters": 100}')
     assert new_runs(project, "table.scale=3") == ["table", "total"]

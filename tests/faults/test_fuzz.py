@@ -1,4 +1,4 @@
-"""Whatever a file holds, it is read or refused by an InputError, soon: files of every kind spoiled at random, thousands of them.
+"""Whatever a file holds, it is read or refused by an InputError, soon: files of every kind spoiled at random.
 
 What earlier searches found stands in `test_hostile_input`.  `make test` spoils some hundred files, always the same; the
 long test goes on for FUZZ_SECONDS (600), shared by its parts, each time with others.
@@ -113,7 +113,7 @@ def spoiled(draw, value):
 
 @st.composite
 def spoiled_bytes(draw, content: bytes) -> bytes:
-    """A file with bytes changed, cut out, doubled or put in, half of them where headers are; cut at the end at times."""
+    """A file with bytes changed, cut out, doubled or put in, half of them in the header; cut at the end at times."""
     for _ in range(draw(st.integers(1, 4))):
         reach = len(content) if draw(st.booleans()) else min(len(content), 400)
         at, length = draw(st.integers(0, reach)), draw(st.sampled_from([0, 1, 1, 4, 8, 40]))

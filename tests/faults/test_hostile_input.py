@@ -1,4 +1,4 @@
-"""Whatever is in a file, its reader refuses it with file, place and cure, soon and in little memory; what is odd but legal is read."""
+"""A reader refuses a hostile file with file, place and cure, soon and in little memory; what is odd but legal is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a step can read counts in its key, is looked at again before its result is kept, and is named by `why` where it changed."""
+"""What a step can read counts in its key, is looked at again before its result is kept, and is named by `why`."""
 
 import ast
 import json
@@ -115,7 +115,7 @@ def test_every_file_in_the_package_of_a_module_counts_but_what_python_or_an_edit
 def test_no_module_is_named_only_at_run_time():
     """`import_module(name)` hides a module from the keys of the steps that run it; the runner alone loads stages so.
 
-    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it, and all import the package.
+    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it.
     """
     loaders = ("import_module", "__import__", "run_path", "run_module", "spec_from_file_location")
     package = LIBRARY / "factorlib"

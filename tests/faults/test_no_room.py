@@ -1,7 +1,7 @@
-"""A full disk, a quota, a limit on files, and folders that may not be written: the user's to mend, nothing cut is kept, the next run goes on.
+"""A full disk, a quota, a limit, folders that may not be written: the user's to mend; nothing cut is kept.
 
-Runs go without root's privileges (`setpriv`), which pass limits and rights.  The disk is a small file system in memory; the
-quota a library that says EDQUOT (`quota.c`), for which a C compiler is needed.
+Runs go without root's privileges (`setpriv`), which pass limits and rights.  The disk is a small file system in memory;
+the quota a library that says EDQUOT (`quota.c`), for which a C compiler is needed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Whatever befalls a run, what was finished is kept, nothing half-written is seen, and the next run ends in the same bytes.
+"""Whatever befalls a run, what was finished is kept and the next run ends in the same bytes.
 
-With real processes and a seed for each try.  `make test` makes a few tries of each fault, `make test-long` all of them, which
-are the numbers of docs/reliability.md (`python -m benchmarks.faults`).
+With real processes and a seed for each try.  `make test` makes a few tries of each fault, `make test-long` all of them,
+which are the numbers of docs/reliability.md (`python -m benchmarks.faults`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def edit(project, stage, old, new):
 
 @few(3, 100)
 def test_a_kill_at_any_moment_loses_nothing_that_was_finished(fresh, finished, again, seeds):
-    """Two of three tries wait until a stage is writing, and strike somewhere in that time; the third strikes at any time."""
+    """Two of three tries wait until a stage is writing, and strike in that time; the third strikes at any time."""
     wanted, hits, losses = results(finished), dict.fromkeys(STAGES, 0), {whom: [] for whom in WHOM}
     for seed in seeds:
         project = again(fresh)
@@ -180,7 +180,7 @@ def test_drafts_of_killed_writers_go_once_they_are_old_and_those_of_others_stay(
     for name, path in ((name, path) for name, paths in drafts.items() for path in paths):
         write(path, "{")
         os.utime(path, (time.time() - 7200 * (name != "new"),) * 2)
-    link = project.build / "set" / f".upper.{os.getpid()}"  # that another run is about to rename
+    link = project.build / "set" / f".upper.{os.getppid()}"  # that another run is about to rename
     link.symlink_to("../store", target_is_directory=True)
     write(project.root / "data" / "set" / "c.txt", "Gamma")
     assert make(project) == 0 and link.is_symlink()
@@ -249,7 +249,7 @@ CLOCK = "import time\n_now, _now_ns = time.time, time.time_ns\ntime.time = lambd
 
 @pytest.mark.parametrize("days", [1, *(pytest.param(days, marks=pytest.mark.long) for days in (400, -1, -4000))])
 def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(finished, again, tmp_path, days):
-    """All files are from the time before: theirs is the future, and what is edited now is older than what is remembered."""
+    """All files are from the future, and what is edited now is older than what is remembered."""
     project, seconds = again(finished), days * 86400
     write(tmp_path / "clock" / "sitecustomize.py", CLOCK.format(seconds))
     path, before = f"{tmp_path / 'clock'}{os.pathsep}{LIBRARY}", len(done(project))

@@ -1,4 +1,4 @@
-"""What a user can write on the command line, and what can befall build/, ends in words; `clean` deletes what the runner made alone."""
+"""What a user can write, and what can befall build/, ends in words; `clean` deletes what the runner made alone."""
 
 import json
 import os
@@ -27,7 +27,7 @@ NOBODYS = ["mine", "data", "nowhere", "elsewhere/set", "/nowhere/set", "../set",
 
 @pytest.fixture
 def checkout(project, monkeypatch):
-    """The toy with everything current, with a .git, links in circles and a folder beside the results; the user stands in it."""
+    """The toy, everything current, with a .git, links in circles and a folder beside the results; the user stands in it."""
     write(project.root / ".git" / "HEAD", "ref: refs/heads/main")
     write(project.build / "bench" / "times.json", "{}")
     write(project.build / "mine" / "notes.txt", "not the runner's")

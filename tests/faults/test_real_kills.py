@@ -1,4 +1,4 @@
-"""The real pipeline, on the smallest data set there is, killed in each of its stages while it writes: the same bytes afterwards."""
+"""The real pipeline on a small data set, killed in each of its stages while it writes: the same bytes afterwards."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEFT_OUT = "study"  # the photo whose poses are searched
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The pipeline over two photos of data/synthetic, everything made; a copy of the source, which nobody edits meanwhile."""
+    """Two photos of data/synthetic, everything made; a copy of the source, which nobody edits meanwhile."""
     root = tmp_path_factory.mktemp("real")
     shutil.copy(LIBRARY / "pipeline.yaml", root)
     for name in ("stages", "factorlib", "data/synthetic"):

@@ -1,7 +1,7 @@
 """Which steps get new keys by a single change: exactly those that the change can reach, and those below them.
 
-Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of code
-another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml itself.  `make test` takes a sample
+Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of
+code another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml.  `make test` takes a sample
 that is the same each time, `make test-long` every module, file and package, and many lines.
 """
 
@@ -157,7 +157,7 @@ OTHER = dict(
 
 
 def mutations(text):
-    """{line: texts in which one name, number, text or operator of it is another}, but for docstrings; some are no Python."""
+    """{line: texts in which one token of it is another}, but for docstrings; some are no Python."""
     docstrings = {
         (item.lineno, item.col_offset)
         for node in ast.walk(ast.parse(text))
@@ -185,7 +185,7 @@ def imported(text):
 
 
 def check_line(project, module, texts):
-    """Whether one of the texts is Python that imports the same: then what runs the module gets new keys, and what is below."""
+    """Whether one of the texts imports the same: then what runs the module gets new keys, and what is below."""
     for text in texts:
         try:
             if imported(text) != imported(text_of(module)) or ast.dump(ast.parse(text)) == ast.dump(

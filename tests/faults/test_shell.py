@@ -1,4 +1,4 @@
-"""What is given to make as NAME=value reaches programs as it was written, whatever make and the shell would read in it."""
+"""What is given to make as NAME=value reaches programs as it was written, unread by make and the shell."""
 
 import json
 import os
@@ -52,7 +52,7 @@ def make(checkout, *words, **environment):
 
 @pytest.mark.parametrize("shift", [0, 5])
 def test_no_variable_is_expanded_on_its_way(checkout, shift):
-    """Each variable holds another try, and with another shift yet another, on the command line and in the environment."""
+    """Each variable holds another try, with another shift yet another, on the command line and in the environment."""
     spy = f"#!{sys.executable}\nimport json, os, sys\nprint(json.dumps([sys.argv[1:], dict(os.environ)]))\n"
     (checkout / ".venv" / "bin" / "python").write_text(spy)
     given = dict(zip((*VARIABLES, *OWN), cycle(TRIES[shift:] + TRIES[:shift])))

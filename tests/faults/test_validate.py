@@ -1,4 +1,4 @@
-"""`make validate` finds every fault with the checks of the stages, and `make all` looks at what is new before it runs anything."""
+"""`make validate` finds every fault by the checks of the stages, and `make all` looks at what is new before it runs."""
 
 from __future__ import annotations
 

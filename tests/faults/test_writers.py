@@ -1,6 +1,6 @@
-"""Writers that say so where a file finds no room, and leave no cut one: each, with room for all of it but the last part.
+"""Every writer says so where a file finds no room, and leaves no cut one.
 
-Room ends by a limit on the size of files, which needs no right: the system then says at the same place as on a full disk.
+Room ends by a limit on the size of files, which needs no right: the system then says so as on a full disk.
 """
 
 import ast
