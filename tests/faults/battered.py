@@ -1,4 +1,4 @@
-"""A project that faults are tried on: the toy, its files written in small pieces, and ways to run it, kill it and look at what is left."""
+"""The toy, its files written in small pieces; ways to run it, kill it and see what is left."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
+from factorlib import __main__ as command_line
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project
-from factorlib.runner.store import Store
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, write
 
@@ -29,78 +31,91 @@ def write(path, text):
             stream.flush()
             time.sleep(float(os.environ.get("TOY_PAUSE", "0")))
 '''
-PAUSE = "0.008"  # seconds for a piece, where something is to happen meanwhile
-TEXTS = {"a": "Alpha " * 50, "b": "Beta " * 50}
+PAUSE = 0.008  # seconds for a piece, where something is to happen meanwhile
+COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first word
+    "import sys; from pathlib import Path; from factorlib import __main__ as line; from tests.runner import toy;"
+    "root = Path(sys.argv.pop(1)); line.project = lambda: toy.toy(root); line.main()"
+)
 
 
-def slow_project(root: Path, **texts: str) -> Project:
+def slow_project(root: Path) -> Project:
     """The toy with stages that write slowly where TOY_PAUSE says so."""
-    made = make_project(root, **(texts or TEXTS))
+    made = make_project(root, a="Alpha " * 50, b="Beta " * 50)
     write(root / "toylib" / "slowly.py", SLOWLY)
-    for name, text in (("upper", toy.UPPER), ("count", toy.COUNT), ("table", toy.TABLE), ("total", toy.TOTAL)):
+    for name in STAGES:
+        text = getattr(toy, name.upper())
         slow = re.sub(r"\(out / (.+?)\)\.write_text\((.*)\)$", r"write(out / \1, \2)", text, flags=re.MULTILINE)
-        write(
-            root / "stages" / f"{name}.py",
-            slow.replace("import msgspec\n", "import msgspec\nfrom toylib.slowly import write\n", 1),
-        )
+        slow = slow.replace("import msgspec\n", "import msgspec\nfrom toylib.slowly import write\n", 1)
+        write(root / "stages" / f"{name}.py", slow)
     return made
+
+
+# ── runs ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def make(project: Project, *settings: str, targets: list[str] | None = None, force: bool = False) -> int:
+    return verbs.make(project, verbs.Wish("set", targets, list(settings), force))
+
+
+def call(project: Project, *words: str) -> int | str:
+    """What `python -m factorlib` with these words ends with: an exit code, or its last words."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as caught:
+        patch.setattr(command_line, "project", lambda: project)
+        patch.setattr(sys, "argv", ["factorlib", *words])
+        command_line.main()
+    return caught.value.code
 
 
 def start(project: Project, *settings: str, **environment: str) -> subprocess.Popen:
     """A run as a user starts it, in a group of processes of its own, writing slowly."""
-    command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
-    words = {**os.environ, "PYTHONPATH": str(LIBRARY), "TOY_PAUSE": PAUSE, "PYTHONDONTWRITEBYTECODE": "1"} | environment
-    return subprocess.Popen(
-        command, env=words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
-
-
-def make(project: Project, *settings: str) -> int:
-    return verbs.make(project, verbs.Wish("set", settings=list(settings)))
+    words = [sys.executable, toy.__file__, str(project.root), "set", *settings]
+    set_ = {**os.environ, "PYTHONPATH": str(LIBRARY), "TOY_PAUSE": str(PAUSE), "PYTHONDONTWRITEBYTECODE": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(words, env=set_ | environment, start_new_session=True, **pipes)
 
 
 def wait_until(true, seconds=60, every=0.001):
-    """Whether it came to that in time."""
+    """What a function returns once that is true, or False after so many seconds."""
     end = time.monotonic() + seconds
-    while not (found := true()):
+    while not (value := true()):
         if time.monotonic() > end:
             return False
         time.sleep(every)
-    return found
+    return value
 
 
 def half_written(project: Project) -> set[str]:
     """Stages of which a step has begun to write files that are no result yet."""
-    found = set()
+    stages = set()
     with contextlib.suppress(OSError):  # a run sweeps meanwhile
         for path in (project.build / "store" / "tmp").glob("run-*/*/*"):
-            found.add(path.parent.name.partition("-")[0])
-    return found
+            stages.add(path.parent.name.partition("-")[0])
+    return stages
 
 
 def members(group: int) -> list[int]:
     """Processes of a group that are not yet dead."""
-    found = []
+    pids = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             state, _, of = stat.read_text().rpartition(")")[2].split()[:3]
             if of == str(group) and state != "Z":
-                found.append(int(stat.parent.name))
-    return sorted(found)
+                pids.append(int(stat.parent.name))
+    return sorted(pids)
 
 
 def workers(group: int) -> list[int]:
     """Processes of a run that are at work on a step."""
-    found = []
+    pids = []
     for pid in members(group):
         with contextlib.suppress(OSError):
             if b"runner.child" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                found.append(pid)
-    return found
+                pids.append(pid)
+    return pids
 
 
 def end(process: subprocess.Popen) -> int:
-    """What a run ends with; none of its processes is left."""
+    """The exit code of a run; none of its processes is left."""
     process.communicate(timeout=120)
     assert wait_until(lambda: not members(process.pid), every=0.02)
     return process.returncode
@@ -113,24 +128,27 @@ def kill(process: subprocess.Popen, whom: str) -> None:
             os.killpg(process.pid, signal.SIGKILL)
         elif whom == "the run":
             os.kill(process.pid, signal.SIGKILL)
-        elif found := workers(process.pid):
-            os.kill(found[-1], signal.SIGKILL)
+        elif pids := workers(process.pid):
+            os.kill(pids[-1], signal.SIGKILL)
+
+
+# ── what is there afterwards ─────────────────────────────────────────────────────────────────────────────────────────
 
 
 def results(project: Project) -> dict[str, bytes]:
-    """What a user finds under the data set's name, but for the log of runs; drafts of a writer that was killed are hidden files."""
-    return {
-        name: data
-        for name, data in files_of(project.build / "set").items()
-        if name != "log.jsonl" and not name.startswith(("errors/", "."))
-    }
+    """What stands under the data set's name, but for the log of runs; drafts of a writer that was killed are hidden."""
+    files = files_of(project.build / "set")
+    return {k: v for k, v in files.items() if k != "log.jsonl" and not k.startswith(("errors/", "."))}
 
 
 def kept(project: Project) -> dict[str, str]:
-    """Step by key, of every result that the store has."""
-    store = Store(project.build / "store")
-    found = {path.stem: store.entry(path.stem) for path in store.keys.glob("*.json")}
-    return {key: "/".join(filter(None, (e.record["stage"], e.record["photo"]))) for key, e in found.items() if e}
+    """Step by key, of every result in the store."""
+    steps, store = {}, project.build / "store"
+    for path in (store / "keys").glob("*.json"):
+        entry = json.loads(path.read_bytes())
+        if (store / "trees" / entry["output"]).is_dir():
+            steps[path.stem] = "/".join(filter(None, (entry["record"]["stage"], entry["record"]["photo"])))
+    return steps
 
 
 def done(project: Project) -> list[str]:
@@ -140,21 +158,27 @@ def done(project: Project) -> list[str]:
     return ["/".join(filter(None, (e["stage"], e["photo"]))) for e in events if e["event"] == "done"]
 
 
+def new_runs(project: Project, *settings: str) -> list[str]:
+    """The steps that the next run does."""
+    before = len(done(project))
+    assert make(project, *settings) == 0
+    return sorted(done(project)[before:])
+
+
 def lost_in(project: Project, wanted: dict[str, bytes], *settings: str) -> list[str]:
-    """What a fault cost: the next run must be accepted, make what is not there yet and only that, and end in the same bytes."""
-    found, before = [], set(kept(project).values())
+    """What a fault cost: the next run must be accepted, make only what is missing, and end in the same bytes."""
+    losses, before = [], set(kept(project).values())
     if verbs.verify(project, None) != 0:
-        found.append("something that is damaged is taken for a result")
+        losses.append("something that is damaged is taken for a result")
     already = len(done(project))
     if make(project, *settings) != 0:
-        found.append("the next run failed")
+        losses.append("the next run failed")
     if again := sorted(before & set(done(project)[already:])):
-        found.append(f"made twice: {', '.join(again)}")
+        losses.append(f"made twice: {', '.join(again)}")
     now = results(project)
     if now != wanted:
-        found.append(
-            f"other bytes: {sorted(name for name in now.keys() | wanted.keys() if now.get(name) != wanted.get(name))}"
-        )
+        names = sorted(name for name in now.keys() | wanted.keys() if now.get(name) != wanted.get(name))
+        losses.append(f"other bytes: {names}")
     if verbs.verify(project, None) != 0:
-        found.append("damaged afterwards")
-    return found
+        losses.append("damaged afterwards")
+    return losses

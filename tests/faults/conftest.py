@@ -1,4 +1,4 @@
-"""What tests of faults share: another user, without root's rights, and a folder that he may enter."""
+"""What tests of faults share: a finished toy, small disks, and another user, without root's rights."""
 
 import os
 import shutil
@@ -8,7 +8,24 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults.battered import make
+from tests.runner import toy
+
 NOBODY = 65534
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """The toy, everything made; nobody changes it."""
+    made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
+    assert make(made) == 0
+    return made
+
+
+@pytest.fixture
+def project(made_once, tmp_path):
+    """The toy, everything current, in a checkout of its own."""
+    return toy.copy(made_once, tmp_path / "checkout")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A small good data set with a file of every kind that is read, results of an earlier run beside it, and who reads each.
+"""A good data set with a file of every kind, results of an earlier run beside it, and who reads each.
 
 Tests spoil one file at a time; `changed` puts it back.
 """
@@ -104,15 +104,9 @@ def glb(header: dict | str | None = None, data: bytes = DATA) -> bytes:
 
 
 MESHES = {
-    "a.obj": OBJ.encode(),
-    "a.off": OFF.encode(),
-    "a.stl": STL_TEXT.encode(),
-    "b.stl": STL,
-    "a.ply": PLY_TEXT.encode(),
-    "b.ply": PLY,
-    "a.gltf": gltf_text().encode(),
-    "a.glb": glb(),
-}
+    "a.obj": OBJ.encode(), "a.off": OFF.encode(), "a.stl": STL_TEXT.encode(), "b.stl": STL, "a.ply": PLY_TEXT.encode(),
+    "b.ply": PLY, "a.gltf": gltf_text().encode(), "a.glb": glb(),
+}  # fmt: skip
 
 # ── masks ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -194,6 +188,19 @@ SOURCES = {
 # ── the data set, its truth, and results of an earlier run ───────────────────────────────────────────────────────────
 
 KEYPOINTS = [{"pixel": [1.0 * k, 5.0 * (k % 2)], "point": p} for k, p in enumerate([[0.0] * 3, *EYE])]
+PLACE = {"rotation": EYE, "translation": [0.0, 0.0, 2.5]}
+HALL = {
+    "name": "hall", "image": "7.png", "encoding": "srgb", "illumination": "hall", "world_from_camera": EYE,
+    "masks": {"red": "red.png"},
+    "objects": [
+        {"name": "vase", "mesh": "vase", "mask": "red.png", "pose": PLACE},
+        {"name": "chair", "mesh": "chair", "materials": {"shell": "wood"}, "keypoints": KEYPOINTS},
+    ],
+}  # fmt: skip
+ROOM = {
+    "name": "room", "image": "8.png", "masks": "mask.png", "camera": {"focal_px": 812.0, "principal_point": [8.0, 6.0]},
+    "objects": [{"name": "vase", "mesh": "vase"}, {"name": "box", "mesh": "box"}],
+}  # fmt: skip
 DATASET = {
     "format": 1,
     "materials": ["red", "wood"],
@@ -202,39 +209,14 @@ DATASET = {
         "vase": {"file": "vase.ply", "material": "red"},
         "box": {"file": "m/box.gltf", "parts": {"chair": "wood"}},
     },
-    "photos": [
-        {
-            "name": "hall",
-            "image": "7.png",
-            "encoding": "srgb",
-            "illumination": "hall",
-            "world_from_camera": EYE,
-            "masks": {"red": "red.png"},
-            "objects": [
-                {
-                    "name": "vase",
-                    "mesh": "vase",
-                    "mask": "red.png",
-                    "pose": {"rotation": EYE, "translation": [0.0, 0.0, 2.5]},
-                },
-                {"name": "chair", "mesh": "chair", "materials": {"shell": "wood"}, "keypoints": KEYPOINTS},
-            ],
-        },
-        {
-            "name": "room",
-            "image": "8.png",
-            "masks": "mask.png",
-            "camera": {"focal_px": 812.0, "principal_point": [8.0, 6.0]},
-            "objects": [{"name": "vase", "mesh": "vase"}, {"name": "box", "mesh": "box"}],
-        },
-    ],
+    "photos": [HALL, ROOM],
     "truth": "truth.yaml",
 }
 TRUTH = {
     "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3}},
     "illumination": {"hall": "light.exr"},
     "normals": {"room": "normals.exr"},
-    "poses": {"hall": {"vase": {"rotation": EYE, "translation": [0.0, 0.0, 2.5]}}},
+    "poses": {"hall": {"vase": PLACE}},
 }
 STDERR = {"diffuse": [0.1, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.1}
 SOLUTION = {
@@ -246,32 +228,18 @@ CAMERA = {"focal_px": 300.0, "principal_point": [8.0, 6.0], "focal_source": "exi
 PLACED = {"rotation": EYE, "translation": [0.0, 0.0, 2.0], "scale": [1.0, 1.0, 1.0], "runner_up": None}
 POSES = {"hall": {"camera": CAMERA, "objects": {"vase": PLACED}}}
 PLAIN = {  # name -> what is written as JSON or YAML
-    "truth.yaml": TRUTH,
-    "coco.json": COCO,
-    "t.json": TRANSFORMS,
-    "model/scene_camera.json": SCENE_CAMERA,
+    "truth.yaml": TRUTH, "coco.json": COCO, "t.json": TRANSFORMS, "model/scene_camera.json": SCENE_CAMERA,
     "model/scene_gt.json": SCENE_GT,
-    "solve/materials.json": SOLUTION,
-    "solve/exposures.json": {"hall": [1.0, 1.0, 1.0]},
-    "poses.json": POSES,
-}
+    "solve/materials.json": SOLUTION, "solve/exposures.json": {"hall": [1.0, 1.0, 1.0]}, "poses.json": POSES,
+}  # fmt: skip
 CONTENT = {
-    "7.png": PHOTO,
-    "8.png": PHOTO,
-    "mask.png": MASK,
-    "red.png": RED,
-    "m/chair.obj": OBJ.encode(),
+    "7.png": PHOTO, "8.png": PHOTO, "mask.png": MASK, "red.png": RED, "m/chair.obj": OBJ.encode(),
     "m/a.mtl": b"newmtl red\n",
-    "m/box.gltf": json.dumps(gltf_header("../buffers/b%201.bin")).encode(),
-    "buffers/b 1.bin": DATA,
-    "vase.ply": PLY,
-    "model/cameras.bin": cameras_bin(),
-    "model/images.bin": images_bin(),
-    "text/cameras.txt": CAMERAS_TXT,
+    "m/box.gltf": json.dumps(gltf_header("../buffers/b%201.bin")).encode(), "buffers/b 1.bin": DATA, "vase.ply": PLY,
+    "model/cameras.bin": cameras_bin(), "model/images.bin": images_bin(), "text/cameras.txt": CAMERAS_TXT,
     "text/images.txt": IMAGES_TXT,
-    **MESHES,
-    **{name: json.dumps(value).encode() for name, value in PLAIN.items()},
-}
+    **MESHES, **{name: json.dumps(value).encode() for name, value in PLAIN.items()},
+}  # fmt: skip
 
 
 def observations(n: int = 5) -> Observations:

@@ -1,184 +1,155 @@
-"""Wrong results under a right key: what a step can read counts in its key, and is looked at again before its result is kept."""
+"""What a step can read counts in its key, is looked at again before its result is kept, and is named by `why`."""
 
 import ast
-from pathlib import Path
+import json
 
+import hypothesis.strategies as st
 import pytest
+import yaml
+from hypothesis import given, settings
 
+from factorlib.dataset.slices import _fields
 from factorlib.errors import InputError
-from factorlib.runner import verbs
-from factorlib.runner.closure import Sources
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.project import LIBRARY
+from factorlib.runner import words
+from factorlib.runner.plan import Listing, plan
+from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.survey import survey
+from tests.faults.battered import make
+from tests.faults.test_many_photos import Everything
 from tests.runner import toy
-from tests.runner.toy import make_project, reasons, state, write
-
-
-def make(project, **options):
-    settings = {"targets": None, "settings": [], "force": False} | options
-    return verbs.make(project, verbs.Wish("set", **settings))
-
-
-@pytest.fixture
-def project(tmp_path):
-    return make_project(tmp_path / "root")
-
-
-def editing(text, file, content):
-    """The stage `text`, which writes `content` to `file` while it runs, as an editor beside it would."""
-    return text.replace("(out /", f"Path({str(file)!r}).write_text({content!r})\n    (out /", 1).replace(
-        "import json", "import json\nfrom pathlib import Path", 1
-    )
-
+from tests.runner.toy import reasons, state, write
 
 # ── what changes while a step runs ───────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize(
-    "name, file, content",
-    [
-        ("stages.table", "stages/table.py", toy.TABLE.replace("params.scale", "7")),
-        ("toylib.more", "toylib/more.py", "NUMBER = 2\n"),
-        ("stages:note.txt", "stages/note.txt", "other"),
-    ],
-)
-def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old_key(
-    project, capsys, name, file, content
-):
-    path = project.root / file
-    write(project.root / "toylib" / "more.py", "NUMBER = 1\n")
-    write(project.root / "stages" / "note.txt", "one")
-    source = toy.TABLE.replace("import msgspec", "import msgspec\nfrom toylib import more")
-    write(project.root / "stages" / "table.py", editing(source, path, content))
-    assert make(project, targets=["table"]) == 1
-    said = capsys.readouterr().err
-    assert file in said and "changed while" in said and "run again" in said and "defect" not in said
-    assert not list((project.build / "store").glob("keys/*")) and not list((project.build / "store").glob("trees/*"))
+@pytest.fixture
+def fresh(tmp_path):
+    """The toy, nothing made yet."""
+    return toy.make_project(tmp_path / "root")
 
 
-def test_a_stage_whose_code_was_edited_is_not_started_for_further_photos(project, capsys, monkeypatch):
-    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 1)
-    path = project.root / "stages" / "count.py"
-    write(path, editing(toy.COUNT, path, toy.COUNT + "\nMORE = 1\n"))
-    assert make(project) == 1
-    said = capsys.readouterr()
-    assert said.err.count("changed while the run went on") == 1
-    assert "1 step failed: count/a" in said.out and "not run for that: count" in said.out
-
-
-def test_a_syntax_error_half_typed_while_a_step_runs_is_no_defect(project, capsys):
-    write(project.root / "stages" / "table.py", editing(toy.TABLE, project.root / "stages" / "table.py", "def ("))
-    assert make(project, targets=["table"]) == 1
-    said = capsys.readouterr().err
-    assert "stages/table.py" in said and "defect" not in said
-
-
-def test_a_remark_typed_while_a_step_runs_loses_nothing(project):
-    path = project.root / "stages" / "table.py"
-    text = toy.TABLE.replace(
-        "(out /", f"f = Path({str(path)!r}); f.write_text('# a remark\\n' + f.read_text())\n    (out /", 1
+def doing(stage, code):
+    """The text of a stage that runs some code before it writes."""
+    return stage.replace("(out /", f"{code}\n    (out /", 1).replace(
+        "import json", "import json\nfrom pathlib import Path", 1
     )
-    write(path, text.replace("import json", "import json\nfrom pathlib import Path", 1))
-    assert make(project, targets=["table"]) == 0 and path.read_text().startswith("# a remark")
 
 
-def test_code_edited_before_its_step_begins_stops_it_before_it_costs_anything(project, capsys):
+def editing(stage, file, content):
+    """A stage that writes to a file while it runs, as an editor beside it would."""
+    return doing(stage, f"Path({str(file)!r}).write_text({content!r})")
+
+
+EDITS = {
+    "stages/table.py": toy.TABLE.replace("params.scale", "7"),
+    "stages/table.py, half typed": "def (",
+    "toylib/more.py": "NUMBER = 2\n",
+    "stages/note.txt": "other",
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old_key(fresh, capsys, edit):
+    file = edit.partition(",")[0]
+    write(fresh.root / "toylib" / "more.py", "NUMBER = 1\n")
+    write(fresh.root / "stages" / "note.txt", "one")
+    source = toy.TABLE.replace("import msgspec", "import msgspec\nfrom toylib import more")
+    write(fresh.root / "stages" / "table.py", editing(source, fresh.root / file, EDITS[edit]))
+    assert make(fresh, targets=["table"]) == 1
+    text = capsys.readouterr().err
+    assert file in text and "defect" not in text
+    assert edit != file or ("changed while" in text and "run again" in text)
+    assert not list((fresh.build / "store").glob("keys/*")) and not list((fresh.build / "store").glob("trees/*"))
+
+
+def test_a_stage_whose_code_was_edited_is_not_started_for_further_photos(fresh, capsys, monkeypatch):
+    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 1)
+    path = fresh.root / "stages" / "count.py"
+    write(path, editing(toy.COUNT, path, toy.COUNT + "\nMORE = 1\n"))
+    assert make(fresh) == 1
+    text = capsys.readouterr()
+    assert text.err.count("changed while the run went on") == 1
+    assert "1 step failed: count/a" in text.out and "not run for that: count" in text.out
+
+
+def test_a_remark_typed_while_a_step_runs_loses_nothing(fresh):
+    path = fresh.root / "stages" / "table.py"
+    write(path, doing(toy.TABLE, f"f = Path({str(path)!r}); f.write_text('# a remark\\n' + f.read_text())"))
+    assert make(fresh, targets=["table"]) == 0 and path.read_text().startswith("# a remark")
+
+
+def test_code_edited_before_its_step_begins_stops_it_before_it_costs_anything(fresh, capsys):
     """The table edits a stage that comes after it."""
-    later, sign = project.root / "stages" / "total.py", project.root / "it-ran"
+    later, sign = fresh.root / "stages" / "total.py", fresh.root / "it-ran"
     text = toy.TOTAL.replace("counts =", f"Path({str(sign)!r}).touch()\n    counts =")
     write(later, text)
-    write(project.root / "stages" / "table.py", editing(toy.TABLE, later, text.replace("str(scale", "str(2 * scale")))
-    assert make(project) == 1
+    write(fresh.root / "stages" / "table.py", editing(toy.TABLE, later, text.replace("str(scale", "str(2 * scale")))
+    assert make(fresh) == 1
     assert "stages/total.py" in capsys.readouterr().err and not sign.exists()
-    assert make(project) == 0 and (project.build / "set" / "total" / "total.txt").read_text() == "total: 36"
+    assert make(fresh) == 0 and (fresh.build / "set" / "total" / "total.txt").read_text() == "total: 36"
 
 
 # ── what counts ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("name", ["kernel.c", "table", "weights/w.json", "README.md", "lib.so"])
-def test_every_file_in_the_package_of_a_module_counts_whatever_it_is_called(project, name):
-    write(project.root / "toylib" / name, "1")
+def test_every_file_in_the_package_of_a_module_counts_but_what_python_or_an_editor_leaves(project):
+    counting, other = (
+        ["kernel.c", "table", "weights/w.json", "README.md", "lib.so"],
+        [".letters.py.swp", "letters.py~", "#letters.py#"],
+    )
+    other += [".hidden/x.c", "__pycache__/letters.cpython-311.pyc", "letters.pyc"]
+    for name in other:
+        write(project.root / "toylib" / name, "1")
+        assert set(state(project).values()) == {"current"}, name
+    for name in counting:
+        write(project.root / "toylib" / name, "1")
     assert make(project) == 0
-    write(project.root / "toylib" / name, "2")
-    assert reasons(project, "count/a") == [f"package data toylib:{name}: changed"]
-    (project.root / "toylib" / name).unlink()
-    assert reasons(project, "count/a") == [f"package data toylib:{name}: gone"]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        ".letters.py.swp",
-        "letters.py~",
-        "#letters.py#",
-        ".hidden/x.c",
-        "__pycache__/letters.cpython-311.pyc",
-        "letters.pyc",
-    ],
-)
-def test_what_python_or_an_editor_leaves_does_not_count(project, name):
-    assert make(project) == 0
-    write(project.root / "toylib" / name, "1")
-    assert set(state(project).values()) == {"current"}
-
-
-def test_the_kernel_of_the_reflection_networks_counts():
-    sources = Sources([LIBRARY], FileHashes(None))
-    for stage in ("train", "solve", "render", "refine"):
-        closure = sources.closure("stages", stage, LIBRARY / "pipeline.yaml")
-        assert "factorlib.reflection:kernel.c" in closure.data, stage
-        assert {"factorlib.reflection.network", "factorlib.reflection.fused"} <= closure.modules.keys(), stage
+    for name in counting:
+        write(project.root / "toylib" / name, "2")
+        assert reasons(project, "count/a") == [f"package data toylib:{name}: changed"]
+        (project.root / "toylib" / name).unlink()
+        assert reasons(project, "count/a") == [f"package data toylib:{name}: gone"]
+        write(project.root / "toylib" / name, "1")
 
 
 def test_no_module_is_named_only_at_run_time():
     """`import_module(name)` hides a module from the keys of the steps that run it; the runner alone loads stages so.
 
-    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it, and all import the package.
+    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it.
     """
-    runner, door = LIBRARY / "factorlib" / "runner", LIBRARY / "factorlib" / "__init__.py"
-    files = [
-        p
-        for folder in ("factorlib", "stages")
-        for p in (LIBRARY / folder).rglob("*.py")
-        if runner not in p.parents and p != door
-    ]
-    assert not [p for p in (LIBRARY / "stages").glob("*.py") if "load_result" in p.read_text()]
+    loaders = ("import_module", "__import__", "run_path", "run_module", "spec_from_file_location")
+    package = LIBRARY / "factorlib"
+    files = {p for folder in (package, LIBRARY / "stages") for p in folder.rglob("*.py")} - {package / "__init__.py"}
     hidden = [
-        f"{p}: {n.id if isinstance(n, ast.Name) else n.attr}"
-        for p in files
-        for n in ast.walk(ast.parse(p.read_text()))
-        if _loads(n)
+        f"{path}: {name}"
+        for path in files
+        if package / "runner" not in path.parents
+        for node in ast.walk(ast.parse(path.read_text()))
+        if (name := getattr(node, "id", getattr(node, "attr", ""))) in loaders
     ]
-    assert not hidden
+    assert not hidden and not [p for p in (LIBRARY / "stages").glob("*.py") if "load_result" in p.read_text()]
 
-
-def _loads(node) -> bool:
-    name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
-    return name in ("import_module", "__import__", "run_path", "run_module", "spec_from_file_location")
-
-
-# ── what a module reads from the environment ─────────────────────────────────────────────────────────────────────────
 
 SPEAKING = 'import os\nENVIRONMENT = ("TOY_FORM",)\nPROGRAMS = {"TOY_CC": "sh"}\ndef letters(text):\n    return len(text) if os.environ.get("TOY_FORM") == "0" else 1\n'
 
 
 @pytest.fixture
-def speaking(project, monkeypatch):
+def speaking(fresh, monkeypatch):
     """The toy whose letters depend on the environment, and say so."""
     for name in ("TOY_FORM", "TOY_CC"):
         monkeypatch.delenv(name, raising=False)
-    write(project.root / "toylib" / "letters.py", SPEAKING)
-    assert make(project) == 0
-    return project
+    write(fresh.root / "toylib" / "letters.py", SPEAKING)
+    assert make(fresh) == 0
+    return fresh
 
 
 def test_an_environment_variable_that_a_module_declares_is_in_the_key(speaking, monkeypatch):
-    assert (speaking.build / "set" / "total" / "total.txt").read_text() == "total: 4"
+    total = speaking.build / "set" / "total" / "total.txt"
+    assert total.read_text() == "total: 4"
     monkeypatch.setenv("TOY_FORM", "0")
     assert reasons(speaking, "count/a") == ['environment variable TOY_FORM: none -> "0"']
     assert state(speaking)["upper/a"] == "current", "only what runs that module"
-    assert make(speaking) == 0 and (speaking.build / "set" / "total" / "total.txt").read_text() == "total: 18"
+    assert make(speaking) == 0 and total.read_text() == "total: 18"
     monkeypatch.delenv("TOY_FORM")
     assert set(state(speaking).values()) == {"current"}, "the other form's results are still there"
 
@@ -188,25 +159,112 @@ def test_whether_a_program_that_a_module_declares_is_there_is_in_the_key(speakin
     assert reasons(speaking, "count/a") == ['program TOY_CC: "sh" -> none']
     monkeypatch.setenv("TOY_CC", "/bin/sh")
     assert set(state(speaking).values()) == {"current"}, "where it lies is no matter"
-
-
-def test_a_command_that_no_shell_could_read_is_refused(speaking, monkeypatch):
     monkeypatch.setenv("TOY_CC", "sh 'open")
     with pytest.raises(InputError, match="is no command") as caught:
         state(speaking)
     assert caught.value.key == "TOY_CC"
+    write(speaking.root / "toylib" / "letters.py", SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
+    with pytest.raises(InputError, match=r"(?s)letters\.py.*ENVIRONMENT"):
+        state(speaking)
 
 
-def test_a_declaration_that_is_no_list_of_names_is_refused(project):
-    write(project.root / "toylib" / "letters.py", SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
-    with pytest.raises(InputError, match="ENVIRONMENT") as caught:
-        state(project)
-    assert "letters.py" in str(caught.value)
+# ── why ──────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+CHAIR = {"file": "chair.obj", "parts": {"shell": "red", "legs": "white"}}
+KITCHEN = {"name": "kitchen", "image": "kitchen.jpg", "masks": "mask.png", "objects": [{"name": "c", "mesh": "chair"}]}
+HALL = {
+    "name": "hall",
+    "image": "hall.jpg",
+    "masks": {"red": "mask.png"},
+    "objects": [*KITCHEN["objects"], {"name": "v", "mesh": "vase"}],
+}
+MESHES = {"chair": CHAIR, "vase": {"file": "vase.ply", "material": "white"}}
+SET = {"format": 1, "materials": ["red", "white"], "meshes": MESHES, "photos": [KITCHEN, HALL]}
 
 
-def test_the_form_of_the_reflection_operator_is_in_the_keys_of_what_runs_it():
-    sources = Sources([LIBRARY], FileHashes(None))
-    for stage in ("solve", "render", "refine"):
-        closure = sources.closure("stages", stage, Path("pipeline.yaml"))
-        assert "FACTORLIB_FUSED" in closure.environment and closure.programs["CC"] == "cc", stage
-    assert not sources.closure("stages", "masks", Path("pipeline.yaml")).environment
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """This project with a data set of its own, whose files are empty."""
+    tmp_path = tmp_path_factory.mktemp("photos")
+    for name in ("pipeline.yaml", "stages", "factorlib"):
+        (tmp_path / name).symlink_to(LIBRARY / name)
+    for name in ["kitchen.jpg", "hall.jpg", "mask.png", "own.png", "chair.obj", "vase.ply"]:
+        write(tmp_path / "data" / "set" / name, "")
+    return Project(tmp_path, photo_sets())
+
+
+def why(project, change=lambda spec: None, settings=(), before=()):
+    """What `make why` would print if all had been made, then dataset.yaml changed."""
+    file = project.root / "data" / "set" / "dataset.yaml"
+    write(file, yaml.safe_dump(SET))
+    seen = survey(project, "set", None, list(before))
+    made = plan(seen.spec, seen.records, Listing(Everything(), {}))
+    spec = json.loads(json.dumps(SET))
+    change(spec)
+    write(file, yaml.safe_dump(spec))
+    seen = survey(project, "set", None, list(settings))
+    listing = Listing({p.key: p.output for p in made}, {str(p.step): p.record for p in made})
+    return "\n".join(words.why_lines(plan(seen.spec, seen.records, listing)))
+
+
+KITCHEN_, HALL_ = ("photos", 0), ("photos", 1, "objects")
+
+
+@pytest.mark.parametrize("place, key, value, line", [
+    (KITCHEN_, "encoding", "linear", 'dataset.yaml: photos.*.encoding: not given -> "linear"'),
+    (KITCHEN_, "camera", {"focal_px": 812.0}, "dataset.yaml: photos.*.camera.focal_px: not given -> 812.0"),
+    (KITCHEN_, "illumination", "hall", 'dataset.yaml: photos.*.illumination: "kitchen" -> "hall"'),
+    (KITCHEN_, "masks", "own.png", 'dataset.yaml: photos.*.masks: "mask.png" -> "own.png"'),
+    ((*HALL_, 1), "mask", "own.png", 'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"'),
+    ((*HALL_, 0), "materials", {"legs": "red"}, 'photos.*.objects[0].materials.legs: not given -> "red"'),
+    (("meshes", "chair", "parts"), "legs", "red", 'dataset.yaml: meshes.chair.parts.legs: "white" -> "red"'),
+    ((), "materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' came"),
+    ((), "materials", ["white", "red"], 'dataset.yaml: materials: ["red", "white"] -> ["white", "red"]'),
+])  # fmt: skip
+def test_the_field_is_named_with_old_and_new(photos, place, key, value, line):
+    def change(spec):
+        for step in place:
+            spec = spec[step]
+        spec[key] = value
+
+    text = why(photos, change)
+    assert line in text and "changed" not in text.replace("file ", "")
+
+
+def test_a_step_over_the_set_names_the_photo_and_what_changed_in_every_photo_is_said_once(photos):
+    text = why(photos, lambda spec: spec["photos"][0].update(illumination="one"))
+    assert 'photos.kitchen.illumination: "kitchen" -> "one"' in text.split("solve")[1]
+    text = why(photos, lambda spec: [photo.update(encoding="linear") for photo in spec["photos"]])
+    assert text.count("encoding") == 1
+
+
+def test_a_parameter_and_a_changed_default_name_what_they_were_and_are(photos, project):
+    assert "parameter lobes: 72 (the default) -> 48" in why(photos, settings=["solve.lobes=48"])
+    assert "parameter lobes: 48 -> 72 (the default)" in why(photos, before=["solve.lobes=48"])
+    write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
+    assert reasons(project, "table") == ["default of parameter scale: 2 -> 3", "source of stages.table: changed"]
+
+
+def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default(project):
+    """A key that is too new costs time; one that is too old would give the result of another parameter."""
+    uncertain = toy.TABLE.replace("class Params", "GAIN = 1\nif msgspec:\n    GAIN = 2\nclass Params", 1)
+    write(project.root / "stages" / "table.py", uncertain.replace("scale: int = 2", "scale: int = GAIN"))
+    assert make(project) == 0 and (project.build / "set" / "total" / "total.txt").read_text() == "total: 18"
+    assert {state(project, settings=(f"table.scale={scale}",))["table"] for scale in (1, 2)} == {"to run"}
+
+
+names = st.text("ab", min_size=1, max_size=2)
+tables = lambda inner: st.dictionaries(names, inner, max_size=2)  # noqa: E731
+facts = st.recursive(
+    st.none() | st.booleans() | st.integers(0, 2) | names | st.lists(st.integers(0, 2), max_size=2),
+    lambda inner: tables(inner) | st.lists(tables(inner), max_size=2),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=100)
+@given(facts, facts)
+def test_fields_are_equal_just_where_the_facts_are(one, other):
+    """They stand in the key in place of the facts."""
+    text = lambda value: json.dumps(value, sort_keys=True)  # noqa: E731
+    assert (text(_fields(one, "x")) == text(_fields(other, "x"))) == (text(one) == text(other))

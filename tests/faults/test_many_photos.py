@@ -35,7 +35,7 @@ def work(function):
 
 
 class Everything(dict):
-    """A store that holds a result of every key."""
+    """A store that holds a result of every key, another for each."""
 
     def get(self, key, default=None):
         return f"output of {key}"
@@ -47,30 +47,17 @@ def planning(photos, outputs):
     return lambda: plan(spec, own, Listing(outputs, {str(step): own[step] for step in own}))
 
 
-def slicing(photos):
+def slicing(photos, _):
     entry = {"image": "i.png", "masks": "m.png", "objects": [{"name": "o", "mesh": "m"}]}
-    file = {
-        "format": 1,
-        "materials": ["a"],
-        "meshes": {"m": {"file": "m.obj"}},
-        "photos": [{"name": f"p{k}", **entry} for k in range(photos)],
-    }
-    dataset = Dataset(Path(), msgspec.convert(file, DatasetFile))
-    return lambda: [
-        dataset_slice(dataset, name, photo.name)
-        for photo in dataset.spec.photos
-        for name in ("photo", "objects", "light")
-    ]
+    file = {"format": 1, "materials": ["a"], "meshes": {"m": {"file": "m.obj"}}}
+    file["photos"] = [{"name": f"p{k}", **entry} for k in range(photos)]
+    dataset, names = Dataset(Path(), msgspec.convert(file, DatasetFile)), ("photo", "objects", "light")
+    return lambda: [dataset_slice(dataset, name, photo.name) for photo in dataset.spec.photos for name in names]
 
 
-@pytest.mark.parametrize("outputs", [{}, Everything()], ids=["nothing made", "all made"])
-def test_a_plan_is_linear(outputs):
-    works = [work(planning(photos, outputs)) for photos in (20, 40, 80)]
-    assert works[2] - works[1] < 2.1 * (works[1] - works[0])
-
-
-def test_the_slices_of_all_photos_are_linear():
-    works = [work(slicing(photos)) for photos in (20, 40, 80)]
+@pytest.mark.parametrize("made, outputs", [(planning, {}), (planning, Everything()), (slicing, None)])
+def test_a_plan_and_the_slices_of_all_photos_are_linear(made, outputs):
+    works = [work(made(photos, outputs)) for photos in (20, 40, 80)]
     assert works[2] - works[1] < 2.1 * (works[1] - works[0])
 
 

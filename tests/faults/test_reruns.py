@@ -1,19 +1,22 @@
-"""Which steps get new keys by any single change: exactly those that the change can reach, and those below them.
+"""Which steps get new keys by a single change: exactly those that the change can reach, and those below them.
 
-Of the real pipeline, at the level of plans: nothing is run.  Changes are generated, of every line of every module, every
-parameter, every file of a data set, every file of a package, every package that is installed; who can be reached by a
-change of code another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml itself.
-`make test` takes a sample that is the same each time, `make test-long` all of them.
+Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of
+code another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml.  `make test` takes a sample
+that is the same each time, `make test-long` every module, file and package, and many lines.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import importlib.metadata
+import io
 import json
+import keyword
 import os
 import random
 import shutil
-import time
+import tokenize
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -22,129 +25,89 @@ import grimp
 import msgspec
 import pytest
 import yaml
-from faults.changes import lines_of, of_each_line, of_no_account
-from faults.tries import note
 
 from factorlib.errors import InputError
-from factorlib.runner import survey as survey_module
-from factorlib.runner.closure import Source, Sources, source_of
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Listing, difference, plan
-from factorlib.runner.project import LIBRARY, Project, Provider, photo_sets
+from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.runner.survey import survey
 from factorlib.runner.worker import Code, load_stage
+from tests.faults.test_many_photos import Everything
+from tests.faults.tries import note
 
-DATA = "synthetic"
-LINES, MODULES = 60, 8  # of the sample
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices)
+STAGES = list(PIPELINE.stages)
+LINES, MANY_LINES, MODULES = 20, 600, 8  # of the samples
 
 
-class Everything(dict):
-    """A store that holds a result of every key, another for each."""
-
-    def get(self, key, default=None):
-        return f"output of {key}"
-
-
-class Memory(FileHashes):
-    """Hashes of files as they were first found, but for those that are edited.  edits: by file, its Source or its hash."""
-
-    def __init__(self):
-        super().__init__(None)
-        self.edits, self.found = {}, {}
-
-    def content(self, path):
-        return self._of(path, lambda: super(Memory, self).content(path))
-
-    def source(self, path, parse, type_):
-        return self._of(path, parse)
-
-    def _of(self, path, make):
-        path = Path(os.path.abspath(path))
-        if path in self.edits:
-            return self.edits[path]
-        if path not in self.found:
-            self.found[path] = make()
-        return self.found[path]
-
-    def save(self):
-        pass
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """This project, to be edited."""
+    root = tmp_path_factory.mktemp("project")
+    for name in ("stages", "factorlib", "data", "recipes"):
+        shutil.copytree(LIBRARY / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(LIBRARY / "pipeline.yaml", root)
+    return Project(root, photo_sets())
 
 
-MEMORY = Memory()
-SETS = photo_sets()
-PROJECT = Project(LIBRARY, Provider(SETS.slices, cache(SETS.read)))
-CLOSURES = {}
-
-
-class Remembered(Sources):
-    """Closures as they were found, while no code is edited."""
-
-    def closure(self, package, stage, pipeline_file):
-        if self.hashes is not MEMORY or any(
-            path.is_relative_to(LIBRARY / code) for path in MEMORY.edits for code in ("factorlib", "stages")
-        ):
-            return super().closure(package, stage, pipeline_file)
-        if stage not in CLOSURES:
-            CLOSURES[stage] = super().closure(package, stage, pipeline_file)
-        return CLOSURES[stage]
-
-
-@pytest.fixture(autouse=True)
-def unchanged(monkeypatch):
-    monkeypatch.setattr(survey_module, "FileHashes", lambda cache: MEMORY)
-    monkeypatch.setattr(survey_module, "Sources", Remembered)
-    MEMORY.edits.clear()
-    yield
-    MEMORY.edits.clear()
-
-
-def planned(settings=(), dataset=DATA, project=PROJECT):
+def planned(project, settings=(), dataset="synthetic"):
     """Every step, those of optional stages and of all recipes too, as planned were everything made."""
-    seen = survey(project, dataset, list(PIPELINE.stages), list(settings), recipes=["all"])
+    seen = survey(project, dataset, STAGES, list(settings), recipes=["all"])
     return plan(seen.spec, seen.records, Listing(Everything(), {}))
 
 
-def keys(settings=(), dataset=DATA, project=PROJECT):
-    return {str(p.step): p.key for p in planned(settings, dataset, project)}
+def keys(project, settings=(), dataset="synthetic"):
+    return {str(p.step): p.key for p in planned(project, settings, dataset)}
 
 
 @cache
-def usual(dataset):
-    return keys(dataset=dataset)
+def usual(project, dataset):
+    return keys(project, dataset=dataset)
 
 
-def other_keys(settings=(), dataset=DATA, project=PROJECT):
+def other_keys(project, settings=(), dataset="synthetic"):
     """The steps whose keys are not the usual ones."""
-    before, now = usual(dataset), keys(settings, dataset, project)
+    before, now = usual(project, dataset), keys(project, settings, dataset)
     assert now.keys() == before.keys()
     return {step for step in now if now[step] != before[step]}
 
 
-def with_those_below(steps, dataset=DATA):
+@contextlib.contextmanager
+def edited(project, contents: dict[str, bytes | str]):
+    """Within, files of the project hold something else."""
+    before = {name: (project.root / name).read_bytes() for name in contents}
+    usual(project, "synthetic"), usual(project, "eames")
+    try:
+        for name, content in contents.items():
+            (project.root / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        yield
+    finally:
+        for name, content in before.items():
+            (project.root / name).write_bytes(content)
+
+
+def below(project, steps, dataset="synthetic"):
     """Those steps, and all that take their results, however far: read from pipeline.yaml, step by step."""
     found = set(steps)
     for name in PIPELINE.order():
-        for step in usual(dataset):
-            stage, _, of = step.partition("/")
-            if stage == name and any(_takes(stage, of, above) for above in found):
+        for step in usual(project, dataset):
+            stage, _, photo = step.partition("/")
+            if stage == name and any(_takes(stage, photo, above) for above in found):
                 found.add(step)
     return found
 
 
-def _takes(stage, of, above):
-    above_stage, _, above_of = above.partition("/")
+def _takes(stage, photo, above):
+    above_stage, _, above_photo = above.partition("/")
     alone = PIPELINE.stages[stage].over == "photo" and PIPELINE.stages[above_stage].over == "photo"
-    return above_stage in PIPELINE.stages[stage].inputs and (of == above_of or not alone)
+    return above_stage in PIPELINE.stages[stage].inputs and (photo == above_photo or not alone)
 
 
-def steps_of(stages, dataset=DATA):
-    return {step for step in usual(dataset) if step.partition("/")[0] in stages}
+def steps_of(project, stages):
+    return {step for step in usual(project, "synthetic") if step.partition("/")[0] in stages}
 
 
-# ── who imports what, as import-linter's library sees it ─────────────────────────────────────────────────────────────
+# ── code ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @cache
@@ -165,160 +128,125 @@ def reached_by(stage):
     return found
 
 
-@cache
-def all_modules():
-    """The modules of the project that any stage runs, with their files."""
-    sources = Sources([LIBRARY], MEMORY)
-    names = sorted(
-        {
-            name
-            for stage in PIPELINE.stages
-            for name in reached_by(stage)
-            if name.partition(".")[0] in ("factorlib", "stages")
-        }
-    )
-    return {name: sources.find(name) for name in names}
-
-
 def users(module):
-    return {stage for stage in PIPELINE.stages if module in reached_by(stage)}
+    return {stage for stage in STAGES if module in reached_by(stage)}
 
 
-def edited(module, text) -> Source:
-    file = all_modules()[module]
-    return source_of(text, module, file.name == "__init__.py")
+@cache
+def modules():
+    """{name: file within the project} of the modules that any stage runs."""
+    files = {}
+    for name in sorted({name for stage in STAGES for name in reached_by(stage)}):
+        path = Path(*name.split("."))
+        for file in (path.with_suffix(".py"), path / "__init__.py"):
+            if (LIBRARY / file).is_file():
+                files[name] = str(file)
+    return files
 
 
-def test_the_modules_in_the_keys_are_those_that_are_imported():
-    sources = Sources([LIBRARY], MEMORY)
-    for stage in PIPELINE.stages:
-        found = sources.closure("stages", stage, LIBRARY / "pipeline.yaml")
-        assert set(found.modules) == {name for name in reached_by(stage) if name in all_modules()}
+def text_of(module):
+    return (LIBRARY / modules()[module]).read_text(encoding="utf-8")
 
 
-# ── lines of code ────────────────────────────────────────────────────────────────────────────────────────────────────
+OTHER = dict(
+    zip(
+        ["+", "-", "*", "/", "<", ">", "<=", ">=", "==", "!=", "|", "&", "+=", "-=", "True", "False", "and", "or"],
+        ["-", "+", "/", "*", "<=", ">=", "<", ">", "!=", "==", "&", "|", "-=", "+=", "False", "True", "or", "and"],
+    )
+)
 
 
-def check_line(module, number, texts):
-    """Whether the line could be changed; the change is then seen by the steps that run the module, and by no other."""
-    before = MEMORY.source(all_modules()[module], None, Source)
+def mutations(text):
+    """{line: texts in which one token of it is another}, but for docstrings; some are no Python."""
+    docstrings = {
+        (item.lineno, item.col_offset)
+        for node in ast.walk(ast.parse(text))
+        for item in getattr(node, "body", []) if isinstance(getattr(node, "body", None), list)
+        if isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)
+    }  # fmt: skip
+    lines, by_line = text.splitlines(keepends=True), {}
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        new = OTHER.get(token.string)
+        if new is None and token.type in (tokenize.NAME, tokenize.NUMBER) and not keyword.iskeyword(token.string):
+            new = token.string + ("7" if token.type == tokenize.NUMBER else "_")
+        elif token.type == tokenize.STRING and token.start not in docstrings and not token.string.endswith('"""'):
+            new = f"{token.string[:-1]}x{token.string[-1]}"
+        if new is not None and token.start[0] == token.end[0]:
+            line = lines[token.start[0] - 1]
+            changed = line[: token.start[1]] + new + line[token.end[1] :]
+            by_line.setdefault(token.start[0], []).append(
+                "".join([*lines[: token.start[0] - 1], changed, *lines[token.start[0] :]])
+            )
+    return by_line
+
+
+def imported(text):
+    return [ast.dump(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+def check_line(project, module, texts):
+    """Whether one of the texts imports the same: then what runs the module gets new keys, and what is below."""
     for text in texts:
         try:
-            now = edited(module, text)
-        except (SyntaxError, InputError, RecursionError):
+            if imported(text) != imported(text_of(module)) or ast.dump(ast.parse(text)) == ast.dump(
+                ast.parse(text_of(module))
+            ):
+                continue
+            with edited(project, {modules()[module]: text}):
+                assert other_keys(project) == below(project, steps_of(project, users(module))), module
+            return True
+        except (SyntaxError, InputError):
             continue
-        if now.digest == before.digest:
-            continue
-        if (now.imports, now.environment, now.programs) != (before.imports, before.environment, before.programs):
-            check_module(module, now)  # another closure
-        elif now.names != before.names:
-            check_defaults(module, now)
-        return True
     return False
 
 
-def check_module(module, now):
-    """Another text of a module, from its first effect to its last."""
-    MEMORY.edits[all_modules()[module]] = now
-    try:
-        assert other_keys() == with_those_below(steps_of(users(module))), module
-    finally:
-        MEMORY.edits.clear()
-
-
-def check_defaults(module, now):
-    """A change of names and defaults reaches no stage that does not run the module."""
-    others = [stage for stage in PIPELINE.stages if stage not in users(module)]
-
-    def of():
-        """Return the parameters of the stages that do not run the module."""
-        return [Sources([LIBRARY], MEMORY).stage_params("stages", stage, LIBRARY / "pipeline.yaml") for stage in others]
-
-    before = of()
-    MEMORY.edits[all_modules()[module]] = now
-    try:
-        assert of() == before, module
-    finally:
-        MEMORY.edits.clear()
-
-
-def check_lines(chosen):
-    """A line's change comes into a record as the digest of its module and nowhere else, unless it changes what is imported."""
-    usual(DATA)
-    changed = unchanged = 0
-    for module, number, texts in chosen:
-        if check_line(module, number, texts):
-            changed += 1
-        else:
-            unchanged += 1
+@pytest.mark.parametrize("lines", [LINES, pytest.param(MANY_LINES, marks=pytest.mark.long)])
+def test_a_line_of_any_module_reruns_what_runs_it_and_what_is_below(project, lines):
+    chance = random.Random(17)
+    chosen = chance.sample(sorted(modules()), min(lines, len(modules())))
+    every = [(module, texts) for module in chosen for texts in mutations(text_of(module)).values()]
+    sample = chance.sample(every, lines)
+    changed = sum(check_line(project, module, texts) for module, texts in sample)
     note("reruns", "a line of a module", changed)
-    assert changed > 10 * unchanged, "lines that hold nothing to change, such as `else:` and `)`"
+    assert changed > 0.7 * len(sample), "the others import, or hold nothing that can be another"
 
 
-def every_line():
-    for module, file in all_modules().items():
-        if file.is_file():
-            for number, texts in of_each_line(file.read_text(encoding="utf-8")):
-                yield module, number, texts
+@pytest.mark.parametrize("share", [MODULES, pytest.param(None, marks=pytest.mark.long)])
+def test_a_change_of_a_module_changes_the_keys_of_what_runs_it_alone(project, share):
+    """All modules of the project count that are imported, as grimp sees it."""
+    chosen = sorted(modules()) if share is None else random.Random(3).sample(sorted(modules()), share)
+    for module in chosen:
+        with edited(project, {modules()[module]: text_of(module) + "\nNEW = 1\n"}):
+            assert other_keys(project) == below(project, steps_of(project, users(module))), module
+    note("reruns", "a module, all plans made anew", len(chosen))
 
 
-def test_a_line_of_any_module_reruns_what_runs_it_and_what_is_below():
-    chosen = random.Random(17).sample(sorted(all_modules()), 30)
-    lines = [found for found in every_line() if found[0] in chosen]
-    check_lines(random.Random(17).sample(lines, LINES))
-
-
-@pytest.mark.long
-def test_every_line_of_every_module_reruns_what_runs_it_and_what_is_below():
-    check_lines(every_line())
-
-
-def one_line_of(module):
-    """The module with its last line changed that can be and imports nothing."""
-    text = all_modules()[module].read_text(encoding="utf-8")
-    before = MEMORY.source(all_modules()[module], None, Source)
-    for _, texts in reversed(list(of_each_line(text))):
-        for new in texts:
-            try:
-                now = edited(module, new)
-            except (SyntaxError, InputError):
-                continue
-            if now.digest != before.digest and now.imports == before.imports:
-                return now
-    return edited(module, text + "\nNEW = 1\n")  # a module without a line of code
-
-
-def check_modules(modules):
-    usual(DATA)
-    for module in modules:
-        check_module(module, one_line_of(module))
-    note("reruns", "a module, all plans made anew", len(modules))
-
-
-def files_of_modules():
-    return [module for module, file in all_modules().items() if file.is_file()]
-
-
-def test_a_change_of_a_module_changes_the_keys_of_what_runs_it_alone():
-    check_modules(random.Random(3).sample(files_of_modules(), MODULES))
-
-
-@pytest.mark.long
-def test_a_change_of_every_module_changes_the_keys_of_what_runs_it_alone():
-    check_modules(files_of_modules())
+def of_no_account(text):
+    """By what was done: texts that say the same to Python."""
+    lines, tree = text.splitlines(keepends=True), ast.parse(text)
+    tokens = list(tokenize.generate_tokens(io.StringIO(text).readline))
+    alone = {t.start[0] for t in tokens if t.type == tokenize.COMMENT and not t.line[: t.start[1]].strip()}
+    ends = {t.end[0] for t in tokens if t.type == tokenize.NEWLINE}
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body and ast.get_docstring(node):
+            body[0].value.value = "Other words."
+    yield "comments", "".join(line for k, line in enumerate(lines, 1) if k not in alone) + "# a remark\n"
+    yield "layout", "".join(line + ("\n" if k in ends else "") for k, line in enumerate(lines, 1))
+    yield "docstrings, formatted anew", ast.unparse(tree)
 
 
 @pytest.mark.parametrize("share", [8, pytest.param(1, marks=pytest.mark.long)])
-def test_comments_docstrings_and_layout_change_no_key(share):
-    usual(DATA)
-    tries = 0
-    for module in files_of_modules()[::share]:
-        text = all_modules()[module].read_text(encoding="utf-8")
-        before = MEMORY.source(all_modules()[module], None, Source)
-        for what, new in of_no_account(text).items():
-            assert edited(module, new) == before, f"{module}: {what}"
-            tries += (new != text) * len(lines_of(text))
-    note("reruns", "comments, docstrings and layout, lines of modules", tries)
+def test_comments_docstrings_and_layout_change_no_key(project, share):
+    """Of many modules at once: what changes no key together changes none alone."""
+    changes = {}
+    for module in list(modules())[::share]:
+        for what, text in of_no_account(text_of(module)):
+            changes.setdefault(what, {})[modules()[module]] = text
+    for contents in changes.values():
+        with edited(project, contents):
+            assert other_keys(project) == set()
+    note("reruns", "comments, docstrings and layout, modules", sum(map(len, changes.values())))
 
 
 # ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -339,10 +267,6 @@ def defaults(stage):
     return dict(leaves(msgspec.to_builtins(params_of(stage)())))
 
 
-def word(value):
-    return json.dumps(value, separators=(",", ":"))
-
-
 def another(value):
     if isinstance(value, bool):
         return not value
@@ -353,258 +277,196 @@ def another(value):
     return value + 1 if isinstance(value, int) else value * 1.5 + 0.001
 
 
-ALL_PARAMETERS = [(stage, name) for stage in PIPELINE.stages for name in defaults(stage)]
+def words_of(stage, values):
+    return [f"{stage}.{name}={json.dumps(value, separators=(',', ':'))}" for name, value in values.items()]
 
 
-@pytest.mark.parametrize("stage, name", ALL_PARAMETERS)
-def test_a_parameter_reruns_its_stage_and_what_is_below_and_its_default_nothing(stage, name):
-    default = defaults(stage)[name]
-    assert other_keys([f"{stage}.{name}={word(default)}"]) == set(), "set to its default"
-    assert other_keys([f"{stage}.{name}={word(another(default))}"]) == with_those_below(steps_of({stage}))
-    note("reruns", "a parameter", 1)
-    note("reruns", "a parameter set to its default", 1)
+def record_of(project, stage, settings=()):
+    return next(p.record for p in planned(project, settings) if p.step.stage == stage)
 
 
-def test_all_parameters_at_their_defaults_are_none():
-    words = [f"{stage}.{name}={word(defaults(stage)[name])}" for stage, name in ALL_PARAMETERS]
-    assert other_keys(words) == set()
+@pytest.mark.parametrize("stage", STAGES)
+def test_each_parameter_of_a_stage_reruns_it_and_what_is_below_and_its_default_nothing(project, stage):
+    values = defaults(stage)
+    assert other_keys(project, words_of(stage, values)) == set(), "set to their defaults"
+    others = words_of(stage, {name: another(value) for name, value in values.items()})
+    if others:
+        assert (
+            other_keys(project, others[:1]) == other_keys(project, others) == below(project, steps_of(project, {stage}))
+        )
+    lines = "\n".join(difference(record_of(project, stage), record_of(project, stage, others)))
+    assert [name for name in values if f"parameter {name}: " not in lines] == [], "each stands in the key by itself"
+    note("reruns", "a parameter", len(values))
+    note("reruns", "a parameter set to its default", len(values))
 
 
-@pytest.mark.parametrize(
-    "stage, param", [(stage, param) for stage, found in PIPELINE.stages.items() for param in found.given]
-)
-def test_a_folder_that_is_given_reruns_its_stage_and_what_is_below_by_content(tmp_path, stage, param):
+def without_fields(text, class_, fields):
+    """The source of a module whose class has lost some fields."""
+    tree = ast.parse(text)
+    node = next(node for node in tree.body if getattr(node, "name", None) == class_)
+    node.body = [n for n in node.body if getattr(getattr(n, "target", None), "id", None) not in fields] + [ast.Pass()]
+    return ast.unparse(tree)
+
+
+@pytest.mark.parametrize("stage", [stage for stage in STAGES if defaults(stage)])
+def test_parameters_that_are_removed_are_noticed_named_and_refused(project, stage):
+    """Of each class in which fields of the parameters are written, all of them."""
+    classes = {}
+    for field in {name.partition(".")[0] for name in defaults(stage)}:
+        owner = next(c for c in params_of(stage).__mro__ if field in getattr(c, "__annotations__", {}))
+        classes.setdefault((owner.__module__, owner.__name__), []).append(field)
+    before = record_of(project, stage)
+    for (module, class_), fields in classes.items():
+        with edited(project, {modules()[module]: without_fields(text_of(module), class_, fields)}):
+            assert other_keys(project) == below(project, steps_of(project, users(module)))
+            lines = difference(before, record_of(project, stage))
+            assert all(any(line.startswith(f"default of parameter {field}:") for line in lines) for field in fields)
+            with pytest.raises(InputError, match=f"has no parameter '{fields[0]}'"):
+                keys(project, [f"{stage}.{fields[0]}=1"])
+        note("reruns", "a parameter removed", len(fields))
+
+
+def test_a_parameter_taken_out_of_pipeline_yaml_is_noticed(project):
+    text = (project.root / "pipeline.yaml").read_text()
+    more = text.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1)
+    with edited(project, {"pipeline.yaml": more}):
+        assert other_keys(project) == below(project, steps_of(project, {"solve"}))
+    assert other_keys(project) == set()
+
+
+GIVEN = [(stage, param) for stage, found in PIPELINE.stages.items() for param in found.given]
+
+
+@pytest.mark.parametrize("stage, param", GIVEN)
+def test_a_folder_that_is_given_reruns_its_stage_and_what_is_below_by_content(project, tmp_path, stage, param):
     for folder in ("one", "same"):
         (tmp_path / folder).mkdir()
         for file in PIPELINE.stages[stage].given[param]:
             (tmp_path / folder / file).write_text("{}")
-    given, same = (keys([f"{stage}.{param}={tmp_path / folder}"]) for folder in ("one", "same"))
-    assert given == same and {step for step in given if given[step] != usual(DATA)[step]} == with_those_below(
-        steps_of({stage})
+    given, same = ([f"{stage}.{param}={tmp_path / folder}"] for folder in ("one", "same"))
+    assert other_keys(project, given) == below(project, steps_of(project, {stage})) and keys(project, given) == keys(
+        project, same
     )
     note("reruns", "a folder that is given", 1)
 
 
-def without_field(text, class_, field):
-    """The source of a module whose class has lost a field, and the text that explains it."""
-    tree = ast.parse(text)
-    for node in tree.body:
-        if getattr(node, "name", None) == class_:
-            at = next(
-                k for k, item in enumerate(node.body) if getattr(getattr(item, "target", None), "id", None) == field
-            )
-            del node.body[at]
-    return ast.unparse(tree)
+# ── files, packages and the environment ──────────────────────────────────────────────────────────────────────────────
 
 
-def owner(stage, field):
-    """The module and the class in which a field of a stage's parameters is written."""
-    cls = next(cls for cls in params_of(stage).__mro__ if field in getattr(cls, "__annotations__", {}))
-    return cls.__module__, cls.__name__
-
-
-@pytest.mark.parametrize("stage, field", sorted({(stage, name.partition(".")[0]) for stage, name in ALL_PARAMETERS}))
-def test_a_parameter_that_is_removed_is_seen_named_and_refused(stage, field):
-    before = next(p.record for p in planned() if p.step.stage == stage)
-    module, class_ = owner(stage, field)
-    text = without_field(all_modules()[module].read_text(encoding="utf-8"), class_, field)
-    MEMORY.edits[all_modules()[module]] = edited(module, text)
-    assert other_keys() == with_those_below(steps_of(users(module)))
-    now = next(p.record for p in planned() if p.step.stage == stage)
-    assert any(line.startswith(f"default of parameter {field}:") for line in difference(before, now))
-    with pytest.raises(InputError, match=f"has no parameter '{field}'"):
-        keys([f"{stage}.{field}=1"])
-    note("reruns", "a parameter removed", 1)
-
-
-def test_a_parameter_taken_out_of_pipeline_yaml_is_seen(tmp_path):
-    project = copied(tmp_path)
-    words = (project.root / "pipeline.yaml").read_text()
-    (project.root / "pipeline.yaml").write_text(
-        words.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1)
-    )
-    assert other_keys(project=project) == with_those_below(steps_of({"solve"}))
-    (project.root / "pipeline.yaml").write_text(words)
-    assert other_keys(project=project) == set()
-
-
-CONDITIONAL = (
-    "import msgspec\nGAIN = 1\nif msgspec:\n    GAIN = 2\nclass Params(msgspec.Struct):\n    gain: int = GAIN\n"
-)
-
-
-def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default():
-    """A key that is too new costs time; one that is too old would give the result of another parameter."""
-    from factorlib.runner.defaults import UNKNOWN, names_of, other_than, values_of
-
-    names = names_of(ast.parse(CONDITIONAL))
-    assert values_of("m", "Params", lambda module: names) == {"gain": UNKNOWN}
-    assert other_than({"gain": UNKNOWN}, {"gain": 1}) == {"gain": 1}
-
-
-# ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def copied(tmp_path, dataset=DATA):
-    """This project with a data set and recipes of its own, to be edited."""
-    for name in ("stages", "factorlib"):
-        (tmp_path / name).symlink_to(LIBRARY / name)
-    shutil.copy(LIBRARY / "pipeline.yaml", tmp_path)
-    shutil.copytree(LIBRARY / "data" / dataset, tmp_path / "data" / dataset)
-    shutil.copytree(LIBRARY / "recipes", tmp_path / "recipes")
-    return Project(tmp_path, photo_sets())
-
-
-def readers(dataset, file):
+def readers(project, dataset, file):
     """The steps that are handed a file of a data set, by what dataset.yaml says of it."""
-    folder = LIBRARY / "data" / dataset
+    folder, found = LIBRARY / "data" / dataset, set()
     spec = yaml.safe_load((folder / "dataset.yaml").read_text())
-    found = set()
     for photo in spec["photos"]:
         masks = photo["masks"] if isinstance(photo["masks"], dict) else {"": photo["masks"]}
         own = {obj.get("mask") for obj in photo["objects"]}
         meshes = {spec["meshes"][obj["mesh"]]["file"] for obj in photo["objects"]}
+        texts = {mesh: (folder / mesh).read_text().splitlines() for mesh in meshes if mesh.endswith(".obj")}
         near = {
             str(Path(mesh).parent / line.split()[1])
-            for mesh in meshes
-            if mesh.endswith(".obj")
-            for line in _lines(folder / mesh, "mtllib")
+            for mesh in texts
+            for line in texts[mesh]
+            if line.startswith("mtllib ")
         }
-        found |= (
-            _takers("dataset.photo", photo["name"], dataset)
-            if file in {photo["image"], *masks.values(), *own}
-            else set()
-        )
-        found |= _takers("dataset.objects", photo["name"], dataset) if file in meshes | near | own else set()
+        if file in {photo["image"], *masks.values(), *own}:
+            found |= takers(project, "dataset.photo", photo["name"], dataset)
+        if file in meshes | near | own:
+            found |= takers(project, "dataset.objects", photo["name"], dataset)
     truth = yaml.safe_load((folder / spec["truth"]).read_text()) if spec.get("truth") else {}
     maps = {*truth.get("illumination", {}).values(), *truth.get("normals", {}).values()}
-    return found | (_takers("dataset.truth", None, dataset) if file in maps else set())
+    return found | (takers(project, "dataset.truth", None, dataset) if file in maps else set())
 
 
-def _lines(file, word):
-    return [line for line in file.read_text().splitlines() if line.startswith(word + " ")]
+def takers(project, slice_, photo, dataset):
+    steps = (step.partition("/") for step in usual(project, dataset))
+    taking = ((stage, mid, of) for stage, mid, of in steps if slice_ in PIPELINE.stages[stage].inputs)
+    return {stage + mid + of for stage, mid, of in taking if PIPELINE.stages[stage].over != "photo" or of == photo}
 
 
-def _takers(slice_, photo, dataset):
-    return {step for step in usual(dataset) if slice_ in PIPELINE.stages[step.partition("/")[0]].inputs and
-            (PIPELINE.stages[step.partition("/")[0]].over != "photo" or step.partition("/")[2] == photo)}  # fmt: skip
+@pytest.mark.parametrize("dataset", ["synthetic", "eames"])
+def test_a_file_of_a_data_set_reruns_who_is_handed_it_and_what_is_below(project, dataset):
+    folder = project.root / "data" / dataset
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".yaml")
+    for path in files:
+        with edited(project, {str(path.relative_to(project.root)): path.read_bytes() + b"\n"}):
+            direct = readers(project, dataset, str(path.relative_to(folder)))
+            assert other_keys(project, dataset=dataset) == below(project, direct, dataset), path
+    note("reruns", "a file of a data set", len(files))
 
 
-FILES = [
-    (dataset, str(path.relative_to(LIBRARY / "data" / dataset)))
-    for dataset in ("synthetic", "eames")
-    for path in sorted((LIBRARY / "data" / dataset).rglob("*"))
-    if path.is_file() and path.suffix != ".yaml"
-]
+def test_remarks_and_layout_of_a_data_sets_yaml_change_no_key(project):
+    for name in ("data/synthetic/dataset.yaml", "data/synthetic/truth/truth.yaml"):
+        spec = yaml.safe_load((project.root / name).read_text())
+        with edited(project, {name: "# a remark\n" + yaml.safe_dump(spec, default_flow_style=True, sort_keys=False)}):
+            assert other_keys(project) == set()
 
 
-@pytest.mark.parametrize("dataset, file", FILES)
-def test_a_file_of_a_data_set_reruns_who_is_handed_it_and_what_is_below(dataset, file):
-    usual(dataset)
-    MEMORY.edits[LIBRARY / "data" / dataset / file] = "0" * 32
-    direct = readers(dataset, file)
-    assert other_keys(dataset=dataset) == with_those_below(direct, dataset)
-    note("reruns", "a file of a data set", 1)
+def test_a_file_of_a_package_reruns_who_runs_that_package(project):
+    """Weights, templates, kernels: whatever lies in the folder of a module that is run."""
+    names = [str(p.relative_to(project.root)) for p in sorted((project.root / "factorlib").rglob("*")) if p.is_file()]
+    data = [name for name in names if not name.endswith(".py")]
+    counting = 0
+    for name in data:
+        folder = next(f for f in (project.root / name).parents if (f / "__init__.py").exists())
+        package = ".".join(folder.relative_to(project.root).parts)
+        stages = {
+            s for s in STAGES if package in reached_by(s) or any(m.rpartition(".")[0] == package for m in reached_by(s))
+        }
+        with edited(project, {name: (project.root / name).read_bytes() + b"\n"}):
+            assert other_keys(project) == below(project, steps_of(project, stages)), name
+        counting += bool(stages)
+    assert counting > 10 and "factorlib/reflection/kernel.c" in data
+    note("reruns", "a file of a package", counting)
 
 
-@cache
-def data_files():
-    sources = Sources([LIBRARY], MEMORY)
-    closures = {stage: sources.closure("stages", stage, LIBRARY / "pipeline.yaml") for stage in PIPELINE.stages}
-    return sorted({closure.files[f"data:{name}"] for closure in closures.values() for name in closure.data})
-
-
-def in_package(file):
-    """The package in whose folder, or below it, a file lies."""
-    folder = next(folder for folder in file.parents if (folder / "__init__.py").exists())
-    return ".".join(folder.relative_to(LIBRARY).parts)
-
-
-@pytest.mark.parametrize("file", data_files(), ids=lambda file: str(file.relative_to(LIBRARY)))
-def test_a_file_of_a_package_reruns_who_runs_that_package(file):
-    MEMORY.edits[file] = "0" * 32
-    package = in_package(file)
-    stages = {
-        stage
-        for stage in PIPELINE.stages
-        if package in reached_by(stage) or any(m.rpartition(".")[0] == package for m in reached_by(stage))
-    }
-    assert stages and other_keys() == with_those_below(steps_of(stages))
-    note("reruns", "a file of a package", 1)
-
-
-@pytest.mark.parametrize("name", ["dataset.yaml", "truth/truth.yaml"])
-def test_remarks_and_layout_of_a_data_sets_yaml_change_no_key(tmp_path, name):
-    project = copied(tmp_path)
-    file = project.root / "data" / DATA / name
-    file.write_text(
-        "# a remark\n" + yaml.safe_dump(yaml.safe_load(file.read_text()), default_flow_style=True, sort_keys=False)
-    )
-    assert other_keys(project=project) == set()
-
-
-def test_an_edit_that_keeps_size_and_time_is_seen(tmp_path, monkeypatch):
-    """Of a file of the data set, of a module and of a file of a package, with what is remembered of them on disk."""
-    monkeypatch.setattr(survey_module, "FileHashes", FileHashes)
-    project = copied(tmp_path)
-    for name in ("stages", "factorlib"):
-        (project.root / name).unlink()
-        shutil.copytree(LIBRARY / name, project.root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    time.sleep(2.1)  # younger files are not remembered
-    before = keys(project=project)
-    assert keys(project=project) == before
-    table = json.loads((project.build / "store/cache/files.json").read_bytes())
-    for name in (f"data/{DATA}/masks/study.png", "factorlib/urm/merge.py", "factorlib/reflection/kernel.c"):
+def test_an_edit_that_keeps_size_and_time_is_noticed(project):
+    """Of a file of the data set, of a module and of a file of a package; all are old enough to be remembered."""
+    for name, old, new in (("data/synthetic/masks/study.png", b"IEND", b"IENE"),
+    ("factorlib/urm/merge.py", b"return ", b"return-"),
+                           ("factorlib/reflection/kernel.c", b"int ", b"long")):  # fmt: skip
         path = project.root / name
-        assert any(str(path) in part for part in (table["contents"], table["sources"])), "it is remembered"
-        stat, content = path.stat(), path.read_bytes()
-        path.write_bytes(_one_other(content, name))
-        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-        assert (path.stat().st_size, path.stat().st_mtime_ns) == (
-            stat.st_size,
-            stat.st_mtime_ns,
-        ) and path.read_bytes() != content
-        assert keys(project=project) != before, name
-        path.write_bytes(content)
-        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-        assert keys(project=project) == before, name
+        for _ in range(2):  # an edit, and back again
+            os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns - 10**10))
+            before, stat = keys(project), path.stat()
+            path.write_bytes(path.read_bytes().replace(old, new, 1))
+            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+            assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
+            assert keys(project) != before, name
+            old, new = new, old
         note("reruns", "an edit that keeps size and time", 1)
-
-
-def _one_other(content, name):
-    """One byte of a picture or a file of a package, one operator of a module."""
-    if name.endswith(".py"):
-        return content.replace(b"return ", b"return-", 1)
-    if name.endswith(".c"):
-        return content.replace(b"int ", b"long", 1)
-    return content[:-20] + bytes([content[-20] ^ 1]) + content[-19:]
-
-
-# ── packages ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+    assert other_keys(project) == set()
 
 
 @cache
 def packages():
     """Distributions that any stage imports, and the names they are imported by."""
-    names = {name for stage in PIPELINE.stages for name in reached_by(stage)} - all_modules().keys()
-    by = packages_distributions()
-    found = {}
-    for name in names:
-        for distribution in by.get(name, []):
+    distributions, found = packages_distributions(), {}
+    for name in {name for stage in STAGES for name in reached_by(stage)} - modules().keys():
+        for distribution in distributions.get(name, []):
             found.setdefault(distribution, set()).add(name)
     return found
 
 
-@pytest.mark.parametrize("distribution", sorted(packages()))
-def test_another_version_of_a_package_reruns_who_imports_it(monkeypatch, distribution):
-    class Newer(Packages):
-        def versions(self, imports):
-            return {
-                name: f"{version}.1" if name == distribution else version
-                for name, version in super().versions(imports).items()
-            }
+@pytest.mark.parametrize("share", [5, pytest.param(1, marks=pytest.mark.long)])
+def test_another_version_of_a_package_reruns_who_imports_it(project, monkeypatch, share):
+    usual(project, "synthetic")
+    version, by = importlib.metadata.version, packages_distributions()
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
+    for distribution in sorted(packages())[::share]:
+        newer = lambda name, it=distribution: f"{version(name)}.1" if name == it else version(name)  # noqa: E731
+        monkeypatch.setattr(importlib.metadata, "version", newer)
+        (project.build / "store" / "cache" / "packages.json").unlink(missing_ok=True)
+        stages = {stage for stage in STAGES if packages()[distribution] & reached_by(stage)}
+        assert stages and other_keys(project) == below(project, steps_of(project, stages)), distribution
+        note("reruns", "a package's version", 1)
+    (project.build / "store" / "cache" / "packages.json").unlink(missing_ok=True)
 
-    monkeypatch.setattr(survey_module, "Packages", Newer)
-    stages = {stage for stage in PIPELINE.stages if packages()[distribution] & reached_by(stage)}
-    assert stages and other_keys() == with_those_below(steps_of(stages))
-    note("reruns", "a package's version", 1)
+
+def test_the_form_of_the_reflection_operator_is_in_the_keys_of_what_runs_it(project, monkeypatch):
+    usual(project, "synthetic")
+    stages = users("factorlib.reflection.fused")
+    assert {"solve", "render", "refine", "train"} <= stages
+    for name, value in (("FACTORLIB_FUSED", "0"), ("CC", "no-such-compiler")):
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            assert other_keys(project) == below(project, steps_of(project, stages))

@@ -1,4 +1,4 @@
-"""What is given to make as NAME=value reaches programs as it was written, whatever make and the shell would read in it."""
+"""What is given to make as NAME=value reaches programs as it was written, unread by make and the shell."""
 
 import json
 import os
@@ -14,18 +14,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PWNED = "pwned"
 TRIES = [
-    f"$(shell touch {PWNED})",
-    f"${{shell touch {PWNED}}}",
-    f"$$(touch {PWNED})",
-    f"`touch {PWNED}`",
-    f'"; touch {PWNED}; "',
-    f"'; touch {PWNED}; '",
-    f"x; touch {PWNED}",
-    f"x\ntouch {PWNED}",
-    f"$(eval X:=$(shell touch {PWNED}))",
-    f"x #\\\n| touch {PWNED}",
+    f"$(shell touch {PWNED})", f"${{shell touch {PWNED}}}", f"$$(touch {PWNED})", f"`touch {PWNED}`",
+    f'"; touch {PWNED}; "', f"'; touch {PWNED}; '",
+    f"x; touch {PWNED}", f"x\ntouch {PWNED}", f"$(eval X:=$(shell touch {PWNED}))", f"x #\\\n| touch {PWNED}",
     f"$(info $(shell touch {PWNED}))",
-]
+]  # fmt: skip
 VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
 OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
 ODD = 'it\'s $(touch pwned) "two" `touch pwned` \\ ;&|<>*?~ $HOME %s é\n#last'
@@ -50,15 +43,8 @@ def checkout(tmp_path):
 
 def make(checkout, *words, **environment):
     clean = {k: v for k, v in os.environ.items() if k not in (*VARIABLES, *OWN, "MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
-    done = subprocess.run(
-        ["make", *words],
-        cwd=checkout,
-        env=clean | environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    options = {"capture_output": True, "text": True, "timeout": 600, "check": False}
+    done = subprocess.run(["make", *words], cwd=checkout, env=clean | environment, **options)
     assert not [p for p in checkout.rglob(PWNED) if p.name == PWNED], "a command was run"
     assert "Traceback" not in done.stderr
     return done
@@ -66,25 +52,19 @@ def make(checkout, *words, **environment):
 
 @pytest.mark.parametrize("shift", [0, 5])
 def test_no_variable_is_expanded_on_its_way(checkout, shift):
-    """Each variable holds another try, and with another shift yet another, on the command line and in the environment."""
+    """Each variable holds another try, with another shift yet another, on the command line and in the environment."""
     spy = f"#!{sys.executable}\nimport json, os, sys\nprint(json.dumps([sys.argv[1:], dict(os.environ)]))\n"
     (checkout / ".venv" / "bin" / "python").write_text(spy)
     given = dict(zip((*VARIABLES, *OWN), cycle(TRIES[shift:] + TRIES[:shift])))
-    for done in (
-        make(checkout, "plan", *(f"{name}={text}" for name, text in given.items())),
-        make(checkout, "plan", **given),
-    ):
+    for done in (make(checkout, "plan", *map("=".join, given.items())), make(checkout, "plan", **given)):
         arguments, environment = json.loads(done.stdout)
         assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
         assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}
 
 
-def test_no_goal_is_a_command(checkout):
+def test_no_goal_and_no_path_to_python_is_a_command(checkout):
     goals = ["x;touch pwned", "$(shell touch pwned)", "`touch pwned`", "x\ntouch pwned", '"$(touch pwned)"']
     assert make(checkout, "--keep-going", *goals).returncode != 0
-
-
-def test_a_path_to_python_is_no_command(checkout):
     shutil.rmtree(checkout / ".venv")
     (checkout / "factorlib").unlink()
     (checkout / "factorlib").mkdir()
@@ -97,12 +77,9 @@ def test_the_real_program_refuses_what_is_no_dataset_and_what_is_neither_0_nor_1
     done = make(checkout, "plan", f"DATASET={TRIES[0]}", f"SET={TRIES[1]}", "FORCE=0")
     assert done.returncode != 0 and "error: " in done.stderr
     assert "FORCE: 'yes' is neither 1 nor 0" in make(checkout, "plan", "DATASET=x", "FORCE=yes").stderr
-
-
-def test_an_empty_dataset_is_not_no_dataset(checkout):
     (checkout / "build" / "set").mkdir(parents=True)
     (checkout / "build" / "set" / "dataset.txt").write_text("data/set\n")
-    assert "DATASET" in make(checkout, "clean", "DATASET=").stderr
+    assert "DATASET" in make(checkout, "clean", "DATASET=").stderr, "an empty name is not none"
     assert (checkout / "build" / "set").exists()
 
 

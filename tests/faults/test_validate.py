@@ -1,4 +1,4 @@
-"""`make validate` finds every fault with the checks of the stages, and `make all` looks at what is new before it runs anything."""
+"""`make validate` finds every fault by the checks of the stages, and `make all` looks at what is new before it runs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider, photo_sets
+from tests.faults.battered import make
 from tests.faults.good import DATA, OBJ, make_set, put
 from tests.runner import toy
 
@@ -32,15 +33,17 @@ def project(tmp_path_factory):
     return Project(root, photo_sets())
 
 
-def said_by(verb, capsys) -> tuple[int, str]:
+def refusal(verb, capsys) -> str:
+    """The words with which a verb is refused; nothing was run."""
     try:
-        code = verb()
+        code, text = verb(), capsys.readouterr().err
     except InputError as error:
-        return 1, f"error: {error}"
-    return code, capsys.readouterr().err
+        code, text = 1, f"error: {error}"
+    assert code == 1, text
+    return text
 
 
-FAULTS = {  # file -> what is in it, and what is said
+FAULTS = {  # file -> what is in it, and words of the error
     "7.png": (b"no photo", "7.png"),
     "mask.png": (b"\x89PNG", "not readable as a PNG"),
     "m/chair.obj": (OBJ.replace("v 1.0", "v nan"), "not finite"),
@@ -48,34 +51,25 @@ FAULTS = {  # file -> what is in it, and what is said
 }
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_each_fault_is_found_without_running_anything(project, folder, capsys, name):
-    content, words = FAULTS[name]
-    put(folder / name, content)
+def test_all_faults_are_said_at_once_and_each_once_without_running_anything(project, folder, capsys):
+    assert verbs.validate(project, str(folder), []) == 0 and "2 photos" in capsys.readouterr().out
+    for name, (content, _) in FAULTS.items():
+        put(folder / name, content)
     for verb in (
         lambda: verbs.validate(project, str(folder), []),
         lambda: verbs.make(project, verbs.Wish(str(folder))),
     ):
-        code, said = said_by(verb, capsys)
-        assert code == 1 and re.search(words, said), said
+        text = refusal(verb, capsys)
+        assert all(words in text for _, words in FAULTS.values())
+        assert text.count("error: ") == 4 and "4 faults" in text
     assert not list((project.root / "build").glob("set/*")), "something was run"
 
 
-def test_all_faults_are_said_at_once_and_each_once(project, folder, capsys):
-    assert verbs.validate(project, str(folder), []) == 0
-    assert "2 photos" in capsys.readouterr().out
-    for name, (content, _) in FAULTS.items():
-        put(folder / name, content)
-    code, said = said_by(lambda: verbs.validate(project, str(folder), []), capsys)
-    assert code == 1 and said.count("error: ") == 4 and "4 faults" in said
-
-
 def test_the_limits_of_align_hold_for_validate(project, folder, capsys):
-    code, said = said_by(lambda: verbs.validate(project, str(folder), ["align.limits.triangles=3"]), capsys)
-    assert code == 1 and "4 triangles" in said
-    assert verbs.validate(project, str(folder), ["align.limits.triangles=4"]) == 0
-    code, said = said_by(lambda: verbs.validate(project, str(folder), ["align.limits.triangles=0"]), capsys)
-    assert code == 1 and "SET align.limits.triangles=0: " in said
+    look = lambda most: verbs.validate(project, str(folder), [f"align.limits.triangles={most}"])  # noqa: E731
+    assert "4 triangles" in refusal(lambda: look(3), capsys)
+    assert look(4) == 0
+    assert "SET align.limits.triangles=0: " in refusal(lambda: look(0), capsys)
 
 
 def test_looking_at_a_set_takes_less_than_a_second(folder):
@@ -104,8 +98,8 @@ def test_a_file_of_a_recipe_is_refused_before_anything_runs(project, folder, cap
     write_rgb_exr(folder / name, content) if isinstance(content, np.ndarray) else put(folder / name, content)
     wanted = f"mesh: {name}\nkind: insert" if Path(name).suffix in MESHES else f"lights: [{name}]\nkind: relight"
     wish = verbs.Wish(str(folder), ["render"], recipes=[str(put(folder / "own.yaml", wanted))])
-    code, said = said_by(lambda: verbs.make(project, wish), capsys)
-    assert code == 1 and re.search(words, said, re.DOTALL) and str(folder / name) in said and "\n  " in said, said
+    text = refusal(lambda: verbs.make(project, wish), capsys)
+    assert re.search(words, text, re.DOTALL) and str(folder / name) in text and "\n  " in text, text
     assert not list((project.root / "build").glob("set/*")), "something was run"
 
 
@@ -122,19 +116,15 @@ def test_a_run_looks_at_what_is_new_and_no_more(tmp_path, capsys):
 
         def faults(slice_, photo, params, settings):
             asked.append((slice_, photo))
-            return (
-                [InputError("a fault", file=f"{photo}.txt")] if "fault" in (folder / f"{photo}.txt").read_text() else []
-            )
+            faulty = "fault" in (folder / f"{photo}.txt").read_text()
+            return [InputError("a fault", file=f"{photo}.txt")] if faulty else []
 
         return Data(data.folder, data.photos, data.slice, faults)
 
     project = Project(toy.make_project(tmp_path).root, Provider(("photo",), read))
-    assert verbs.make(project, verbs.Wish("set")) == 0
-    assert asked == [("photo", "a"), ("photo", "b")]
+    assert make(project) == 0 and asked == [("photo", "a"), ("photo", "b")]
     asked.clear()
-    assert verbs.make(project, verbs.Wish("set")) == 0
-    assert verbs.make(project, verbs.Wish("set", settings=["upper.times=2"])) == 0
-    assert asked == []
+    assert make(project) == 0 and make(project, "upper.times=2") == 0 and asked == []
     toy.write(tmp_path / "data/set/c.txt", "a fault")
-    assert verbs.make(project, verbs.Wish("set")) == 1
+    assert make(project) == 1
     assert asked == [("photo", "c")] and "a fault" in capsys.readouterr().err

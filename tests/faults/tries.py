@@ -1,7 +1,4 @@
-"""What a test of faults tried and what was lost by it, for the tables that `python -m benchmarks.faults` makes of it.
-
-Where FAULTS_LOG names a file, each test adds lines to it, JSON objects; otherwise nothing is written.
-"""
+"""Lines for the tables of docs/reliability.md: what a test of faults tried and what was lost by it."""
 
 import json
 import os
@@ -11,6 +8,6 @@ from factorlib.wholefile import append_text
 
 
 def note(table: str, name: str, tries: int = 1, lost: int = 0, **more: object) -> None:
-    """One line of a table: what was tried, how often, and how many of the tries lost something."""
+    """Add a line to the file that FAULTS_LOG names; without it, nothing is written."""
     if path := os.environ.get("FAULTS_LOG"):
         append_text(Path(path), json.dumps({"table": table, "name": name, "tries": tries, "lost": lost, **more}) + "\n")
