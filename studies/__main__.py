@@ -1,6 +1,7 @@
 """The command line: `python -m studies [study …] [--quick]`; all studies without a name.  Make passes STUDY and QUICK on.
 
-With --clean the results of studies are forgotten, with --gc those that no study names any more are deleted, quick ones among them.
+With --docs the tables of docs/studies.md are written anew afterwards; with --clean the results of studies are forgotten, with --gc
+those that no study names any more are deleted, quick ones among them.
 """
 
 from __future__ import annotations
@@ -16,10 +17,8 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.pipeline import executor_words
 from factorlib.runner.stop import heed_stops
-from studies.catalogue.contents import STUDIES
-from studies.core.study import FULL, QUICK
-from studies.run.project import studies
-from studies.run.verbs import collect, forget, make
+from studies.run import STUDIES, collect, forget, make, studies
+from studies.study import FULL, QUICK
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -30,6 +29,7 @@ def run(
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
     force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
+    docs: Annotated[bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew")] = False,
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
@@ -39,12 +39,17 @@ def run(
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
-    project = studies(QUICK if switched_on("QUICK", quick) else FULL)
+    scale = QUICK if switched_on("QUICK", quick) else FULL
     for name in named:
-        project.dataset_folder(name)
+        studies(scale).dataset_folder(name)
     if clean:
-        raise typer.Exit(forget(project, named or list(STUDIES)))
-    raise typer.Exit(make(project, named or list(STUDIES), forced(force), executor_words(chosen(None))))
+        raise typer.Exit(forget(scale, named or list(STUDIES)))
+    code = make(scale, named or list(STUDIES), forced(force), executor_words(chosen(None)))
+    if docs and code == 0:
+        from studies.run.page import refresh_docs
+
+        refresh_docs(named or list(STUDIES), scale.quick)
+    raise typer.Exit(code)
 
 
 def main() -> None:

@@ -16,24 +16,24 @@ import typer
 
 from benchmarks.markdown import refresh, table
 from benchmarks.rounded import exact
-from factorlib.results.metrics import Metrics, ScoredPicture, read_metrics
+from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 
-DOCS = LIBRARY / "docs" / "studies.md"
-PLACE = "real sets"
+DOCS, PLACE = LIBRARY / "docs" / "studies.md", "real sets"
+PSNR, FLAT = "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"
+HEAD = ["set: photo", "DSSIM of the re-synthesis", FLAT, PSNR, FLAT]
 
 
-def rows_of(name: str, found: Metrics) -> list[list[str]]:
+def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
     """A row for each photo, and the mean: DSSIM and PSNR of the re-synthesis, each beside that of flat colours."""
-    shots = [(photo, errors.gauges["none"]) for photo, errors in found.resynthesis.photos.items() if errors.gauges]
-    mean = found.resynthesis.mean
-    return [_row(f"{name}: {of}", scores) for of, scores in shots + ([("mean", mean["none"])] if mean else [])]
-
-
-def _row(label: str, scores: ScoredPicture) -> list[str]:
-    both = (scores.estimate, scores.null)
-    return [label, *(exact(of.dssim, 3) for of in both), *(f"{of.psnr_tonemapped_db:.1f}" for of in both)]
+    scored = {photo: errors.gauges["none"] for photo, errors in metrics.resynthesis.photos.items() if errors.gauges}
+    scored |= {"mean": metrics.resynthesis.mean["none"]} if metrics.resynthesis.mean else {}
+    both = {photo: (errors.estimate, errors.null) for photo, errors in scored.items()}
+    return [
+        [f"{name}: {photo}", *(exact(e.dssim, 3) for e in of), *(f"{e.psnr_tonemapped_db:.1f}" for e in of)]
+        for photo, of in both.items()
+    ]
 
 
 def measured(folder: Path) -> Metrics:
@@ -49,27 +49,14 @@ def main(
     docs: Annotated[bool, typer.Option(help="also refresh the table in docs/studies.md")] = False,
 ) -> None:
     """Run, read, print."""
-    absent = [folder for folder in folders if not (folder / "dataset.yaml").is_file()]
-    for folder in absent:
+    present = [folder for folder in folders if (folder / "dataset.yaml").is_file()]
+    for folder in (folder for folder in folders if folder not in present):
         print(f"{folder}: absent: nothing is measured of it")
-    rows = [
-        row for folder in folders if folder not in absent for row in rows_of(folder.resolve().name, measured(folder))
-    ]
-    if not rows:
-        return
-    found = table(
-        [
-            "set: photo",
-            "DSSIM of the re-synthesis",
-            "of flat colours",
-            "PSNR, tone-mapped, of the re-synthesis (dB)",
-            "of flat colours",
-        ],
-        rows,
-    )
-    print(found)
-    if docs:
-        refresh(DOCS, {PLACE: found})
+    rows = [row for folder in present for row in rows_of(folder.resolve().name, measured(folder))]
+    if rows:
+        print(table(HEAD, rows))
+        if docs:
+            refresh(DOCS, {PLACE: table(HEAD, rows)})
 
 
 if __name__ == "__main__":

@@ -19,36 +19,25 @@ import typer
 
 from benchmarks.markdown import refresh, table
 from benchmarks.rounded import exact
-from factorlib.dataset.schema import LightSlice
-from factorlib.evaluate.ball import Light
-from factorlib.reflection.network import SHIPPED
+from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
-from stages import solve
-from studies.core.case import Case, light_name
-from studies.core.observed import observations_of
-from studies.core.score import scored
-from studies.core.study import FULL, full_matrix
-from studies.core.world import light, light_map, materials_of
+from studies.conclusion import MEASURES
+from studies.spheres import light_map, materials_of, observations_of
+from studies.steps.score import scored
+from studies.steps.solve import solved
+from studies.study import FULL, Case, full_matrix
 
-DOCS = LIBRARY / "docs" / "studies.md"
-PLACE = "rounding"
+DOCS, PLACE = LIBRARY / "docs" / "studies.md", "rounding"
 PERTURBED = 1e-7  # of a radiance
-MEASURES = {
-    "diffuse": "error of k_d",
-    "specular": "error of k_s",
-    "roughness": "error of roughness",
-    "stated_roughness": "its stated standard error",
-    "entries": "DSSIM, all entries",
-}
+NAMES = ("diffuse", "specular", "roughness", "stated_roughness", "entries")  # of measures
 
 
-def perturbed(seen: Observations, rng: np.random.Generator) -> Observations:
+def perturbed(table: Observations, rng: np.random.Generator) -> Observations:
     """The same observations, each radiance off by about `PERTURBED` of it."""
-    return msgspec.structs.replace(
-        seen, radiance=seen.radiance * (1 + PERTURBED * rng.standard_normal(seen.radiance.shape))
-    )
+    share = 1 + PERTURBED * rng.standard_normal(table.radiance.shape)
+    return msgspec.structs.replace(table, radiance=table.radiance * share)
 
 
 def errors_of(case: Case, lights: dict[int, Light], time: int) -> dict[str, float]:
@@ -57,18 +46,11 @@ def errors_of(case: Case, lights: dict[int, Light], time: int) -> dict[str, floa
     with TemporaryDirectory() as folder:
         urm, out = Path(folder) / "urm", Path(folder) / "solve"
         urm.mkdir(), out.mkdir()
-        for number, (name, seen) in enumerate(observations_of(case, truths, lights).items()):
+        for number, (name, observed) in enumerate(observations_of(case, truths, lights).items()):
             rng = np.random.default_rng([14, case.seed, number, time])
-            write_observations(urm / f"{name}.parquet", perturbed(seen, rng) if time else seen)
-        facts = {light_name(li): msgspec.to_builtins(LightSlice(light_name(li), None)) for li in case.lights}
-        folders = {"urm": urm, "train": SHIPPED}
-        solve.main(
-            solve.Params(),
-            Inputs(folders, {"dataset.materials": case.material_names, "dataset.light": facts}),
-            out,
-            silent,
-        )
-        return scored(case, truths, out, lights).score.values
+            write_observations(urm / f"{name}.parquet", perturbed(observed, rng) if time else observed)
+        solved({}, urm, Inputs({}), out, silent)
+        return scored(case, truths, out, lights)[0].values
 
 
 def row_of(size: int, seeds: int, times: int) -> list[str]:
@@ -76,12 +58,13 @@ def row_of(size: int, seeds: int, times: int) -> list[str]:
     first, apart = [], []
     for seed in range(seeds):
         case = FULL.case(seed, full_matrix(size, size))
-        lights = {li: light(light_map(seed, li, FULL.light_rows, FULL.light_spp)) for li in range(size)}
-        found = [errors_of(case, lights, time) for time in range(times + 1)]
-        first.append(found[0])
-        apart.append({name: max(abs(a[name] - b[name]) for a, b in combinations(found, 2)) for name in MEASURES})
-    means = [[float(np.mean([one[name] for one in of])) for of in (first, apart)] for name in MEASURES]
-    return [f"{size} × {size}", *(f"{exact(error)}, ± {exact(difference / 2)}" for error, difference in means)]
+        maps = {li: light_map(seed, li, FULL.light_rows, FULL.light_spp) for li in range(size)}
+        lights = {li: light_of_lat_long(radiance) for li, radiance in maps.items()}
+        solves = [errors_of(case, lights, time) for time in range(times + 1)]
+        first.append([solves[0][name] for name in NAMES])
+        apart.append([max(abs(a[name] - b[name]) for a, b in combinations(solves, 2)) for name in NAMES])
+    means = zip(np.mean(first, axis=0), np.mean(apart, axis=0) / 2, strict=True)
+    return [f"{size} × {size}", *(f"{exact(error)}, ± {exact(half)}" for error, half in means)]
 
 
 def main(
@@ -93,10 +76,10 @@ def main(
     """Print a row for each size."""
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # of the lights, as in studies
     rows = [row_of(size, seeds, times) for size in sizes or (1, 2, 3)]
-    found = table([f"materials × lights ({seeds} worlds, {times + 1} solves of each)", *MEASURES.values()], rows)
-    print(found)
+    head = [f"materials × lights ({seeds} worlds, {times + 1} solves of each)", *(MEASURES[n].label for n in NAMES)]
+    print(table(head, rows))
     if docs:
-        refresh(DOCS, {PLACE: found})
+        refresh(DOCS, {PLACE: table(head, rows)})
 
 
 if __name__ == "__main__":

@@ -14,85 +14,65 @@ Poses by shading (the stage `refine`) are not among them: `python -m benchmarks.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-from studies.core.objects.case import Perturbation
-from studies.core.objects.setting import setting
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.study import Claim, Scale, Setting, Study, full_matrix, own
 
-PERTURBATIONS: dict[str, tuple[str, Perturbation]] = {
-    "exact": ("exact", Perturbation()),
-    "turned-2": ("turned 2°", Perturbation(turned_deg=2.0)),
-    "turned-5": ("turned 5°", Perturbation(turned_deg=5.0)),
-    "turned-10": ("turned 10°", Perturbation(turned_deg=10.0)),
-    "turned-20": ("turned 20°", Perturbation(turned_deg=20.0)),
-    "shifted": ("shifted 5 %", Perturbation(shifted=0.05)),
-    "larger": ("10 % larger", Perturbation(larger=0.1)),
-    "coarse": ("of 100 triangles", Perturbation(triangles=100)),
+PERTURBATIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "exact": ("exact", {}),
+    "turned-2": ("turned 2°", {"turned_deg": 2.0}),
+    "turned-5": ("turned 5°", {"turned_deg": 5.0}),
+    "turned-10": ("turned 10°", {"turned_deg": 10.0}),
+    "turned-20": ("turned 20°", {"turned_deg": 20.0}),
+    "shifted": ("shifted 5 %", {"shifted": 0.05}),
+    "larger": ("10 % larger", {"larger": 0.1}),
+    "coarse": ("of 100 triangles", {"triangles": 100}),
 }
-ARMS: dict[str, tuple[str, dict[str, Any]]] = {
-    "as-it-is": ("", {}),
+AS_IT_IS = "as-it-is"
+TREATMENTS: dict[str, tuple[str, dict[str, Any]]] = {
+    AS_IT_IS: ("", {}),
     "squares": (" squares", {"robust": False}),
     "even": (" even", {"confidence": False}),
     "outline": (" outline", {"refined": True}),
 }
-ALONE, FIT = ("as-it-is",), ("as-it-is", "outline")
-SHOWN = {
-    "full": {"exact": ALONE, "turned-2": ALONE, "turned-5": (*FIT, "even"), "turned-10": ALONE, "turned-20": (*FIT, "squares"),
-             "shifted": FIT, "larger": FIT, "coarse": ("as-it-is", "even")},
-    "quick": {"exact": ALONE, "turned-5": tuple(ARMS), "turned-20": FIT},
+BESIDE = {  # treatments beside `AS_IT_IS`
+    "full": {"exact": (), "turned-2": (), "turned-5": ("outline", "even"), "turned-10": (), "turned-20": ("outline", "squares"),
+             "shifted": ("outline",), "larger": ("outline",), "coarse": ("even",)},
+    "quick": {"exact": (), "turned-5": ("squares", "even", "outline"), "turned-20": ("outline",)},
 }  # fmt: skip
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """Each perturbation, with each treatment beside it."""
-    pairs = [(perturbation, arm) for perturbation, arms in SHOWN[scale.name].items() for arm in arms]
-    return [_setting(scale, x, perturbation, arm) for x, (perturbation, arm) in enumerate(pairs)]
-
-
-def _setting(scale: Scale, x: int, perturbation: str, arm: str) -> Setting:
-    (of_perturbation, perturbed), (of_arm, how) = PERTURBATIONS[perturbation], ARMS[arm]
-    return setting(
-        scale,
-        f"{perturbation}-{arm}",
-        of_perturbation + of_arm,
-        x,
-        full_matrix(scale.side, scale.side),
-        perturbation=perturbed,
-        **how,
-    )
+    """Each perturbation, with its treatments beside it."""
+    entries = full_matrix(scale.side, scale.side)
+    pairs = [(p, t) for p, beside in BESIDE[scale.name].items() for t in (AS_IT_IS, *beside)]
+    labels = {(p, t): PERTURBATIONS[p][0] + TREATMENTS[t][0] for p, t in pairs}
+    how = {(p, t): PERTURBATIONS[p][1] | TREATMENTS[t][1] for p, t in pairs}
+    return [scale.of_objects(f"{p}-{t}", labels[p, t], entries, **how[p, t]) for p, t in pairs]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """What raises the error, and what helps against it; of settings that this scale has."""
-    costly = [_costly(perturbation) for perturbation in ("turned-5", "turned-20", "shifted", "larger", "coarse")]
-    refined = [
-        _helps("outline", perturbation, "fitting the outline") for perturbation in ("turned-5", "turned-20", "larger")
+    words = {p: PERTURBATIONS[p][0] for p in ("turned-5", "turned-20", "shifted", "larger", "coarse")}
+    costly = [
+        Claim("entries", f"exact-{AS_IT_IS}", f"{p}-{AS_IT_IS}", f"“{w}” raises the error") for p, w in words.items()
     ]
-    robust = [_matters("squares", "turned-20", "the robust loss")]
-    sure = [_matters("even", perturbation, "knowing how sure normals are") for perturbation in ("turned-5", "coarse")]
-    known = {one.name for one in settings(scale)}
-    return [claim for claim in (*costly, *refined, *robust, *sure) if {claim.lower, claim.higher} <= known]
+    helps = [  # of a treatment that is better than `AS_IT_IS`; of one that does without what helps
+        *((f"{p}-outline", f"{p}-{AS_IT_IS}", p, "fitting the outline") for p in ("turned-5", "turned-20", "larger")),
+        (f"turned-20-{AS_IT_IS}", "turned-20-squares", "turned-20", "the robust loss"),
+        *((f"{p}-{AS_IT_IS}", f"{p}-even", p, "knowing how sure normals are") for p in ("turned-5", "coarse")),
+    ]
+    every = [*costly, *(own("entries", a, b, f"{what} helps where objects are {words[p]}") for a, b, p, what in helps)]
+    names = {setting.name for setting in settings(scale)}
+    return [claim for claim in every if set(claim.settings) <= names]
 
 
-def _costly(perturbation: str) -> Claim:
-    return Claim(
-        "entries", "exact-as-it-is", f"{perturbation}-as-it-is", f"“{PERTURBATIONS[perturbation][0]}” raises the error"
-    )
+def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
+    """Spheres of the recovered materials, a column for each setting."""
+    from studies.steps.score import spheres_by_setting
 
-
-def _helps(arm: str, perturbation: str, what: str) -> Claim:
-    return _better(f"{perturbation}-{arm}", f"{perturbation}-as-it-is", perturbation, what)
-
-
-def _matters(arm: str, perturbation: str, what: str) -> Claim:
-    return _better(f"{perturbation}-as-it-is", f"{perturbation}-{arm}", perturbation, what)
-
-
-def _better(lower: str, higher: str, perturbation: str, what: str) -> Claim:
-    return Claim(
-        "entries", lower, higher, f"{what} helps where objects are {PERTURBATIONS[perturbation][0]}", paper=False
-    )
+    return spheres_by_setting(settings(scale), scale.seeds[0], scores)
 
 
 STUDY = Study(
@@ -104,5 +84,6 @@ STUDY = Study(
     measures=("entries", "new_light", "normals", "diffuse", "specular", "roughness", "glossy"),
     settings=settings,
     claims=claims,
-    kind="objects",
+    lights=1,
+    pictures=pictures,
 )

@@ -7,45 +7,31 @@ Measured   errors of materials and predictions, beside the standard errors that 
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Guess, Scale, Setting, Study
+from studies.study import Claim, Guess, Scale, Setting, Study, own
 
 FACES = {"full": (1, 2, 3, 5, 9, 20, 60), "quick": (1, 9)}
 
 
 def settings(scale: Scale) -> list[Setting]:
     """From one face to a sphere."""
-    faces = FACES[scale.name]
-    few = [scale.setting(f"faces-{k}", str(k), x, facets=k) for x, k in enumerate(faces)]
-    return [*few, scale.setting(scale.square, "sphere", len(faces))]
+    few = [scale.setting(f"faces-{k}", str(k), facets=k) for k in FACES[scale.name]]
+    return [*few, scale.setting(scale.square, "sphere")]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """Few faces against a guess that knows mean colours, a sphere against few faces, in error and in what is stated of it."""
-    sphere = scale.square
-    nine = "faces-9"
+    sphere, nine, one = scale.square, "faces-9", "faces-1"
+    guess, stated = (
+        "better than by a guess of mean colours",
+        "the solve states a smaller error of roughness for a sphere",
+    )
     return [
-        Claim(
-            "new_light",
-            nine,
-            Guess(nine),
-            "materials of nine faces are predicted in every light better than by a guess of mean colours",
-        ),
-        Claim(
-            "entries",
-            nine,
-            Guess(nine),
-            "all entries are predicted from nine faces better than by a guess of mean colours",
-        ),
-        Claim("new_light", nine, "faces-1", "nine faces tell more of materials than one"),
-        Claim("new_light", sphere, nine, "a sphere tells more than nine faces", paper=False),
-        Claim("roughness", sphere, "faces-1", "roughness is known better of a sphere than of one face", paper=False),
-        Claim(
-            "stated_roughness",
-            sphere,
-            "faces-1",
-            "the solve states a smaller error of roughness for a sphere than for one face",
-            paper=False,
-        ),
+        Claim("new_light", nine, Guess(nine), f"materials of nine faces are predicted in every light {guess}"),
+        Claim("entries", nine, Guess(nine), f"all entries are predicted from nine faces {guess}"),
+        Claim("new_light", nine, one, "nine faces tell more of materials than one"),
+        own("new_light", sphere, nine, "a sphere tells more than nine faces"),
+        own("roughness", sphere, one, "roughness is known better of a sphere than of one face"),
+        own("stated_roughness", sphere, one, f"{stated} than for one face"),
     ]
 
 

@@ -7,7 +7,7 @@ Measured   materials and predictions.  Renderings are of the true normals; the s
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Rise, Scale, Setting, Study
+from studies.study import Claim, Rise, Scale, Setting, Study, own
 
 NORMALS = {"full": (1, 2, 5, 10, 20), "quick": (5, 20)}
 LABELS = {"full": (2, 10, 20), "quick": (20,)}
@@ -15,10 +15,11 @@ LABELS = {"full": (2, 10, 20), "quick": (20,)}
 
 def settings(scale: Scale) -> list[Setting]:
     """Unperturbed, then each perturbation by itself."""
-    perturbations = [(f"normals-{d}deg", f"{d}°", {"normal_deg": float(d)}) for d in NORMALS[scale.name]]
-    perturbations += [(f"labels-{p}pc", f"{p} %", {"wrong_labels": p / 100}) for p in LABELS[scale.name]]
-    perturbed = [scale.setting(name, label, x, **how) for x, (name, label, how) in enumerate(perturbations, 1)]
-    return [scale.setting(scale.square, "none", 0), *perturbed]
+    return [
+        scale.setting(scale.square, "none"),
+        *(scale.setting(f"normals-{d}deg", f"{d}°", normal_deg=float(d)) for d in NORMALS[scale.name]),
+        *(scale.setting(f"labels-{p}pc", f"{p} %", wrong_labels=p / 100) for p in LABELS[scale.name]),
+    ]
 
 
 def claims(scale: Scale) -> list[Claim]:
@@ -26,27 +27,14 @@ def claims(scale: Scale) -> list[Claim]:
     none, degrees, shares = scale.square, NORMALS[scale.name], LABELS[scale.name]
     at = {0: none} | {d: f"normals-{d}deg" for d in degrees}
     *_, low, mid, most = at
+    late, early = Rise(at[mid], at[most], most - mid), Rise(at[low], at[mid], mid - low)
     return [
-        Claim(
-            "entries",
-            none,
-            f"normals-{degrees[0]}deg",
-            f"noise of {degrees[0]}° on normals raises the error",
-            paper=False,
-        ),
-        Claim("entries", none, f"normals-{degrees[-1]}deg", f"noise of {degrees[-1]}° on normals raises the error"),
-        Claim("entries", at[mid], at[most], f"{most}° is worse than {mid}°", paper=False),
-        Claim(
-            "entries",
-            Rise(at[mid], at[most], most - mid),
-            Rise(at[low], at[mid], mid - low),
-            f"the error rises less per degree beyond {mid}°",
-        ),
-        Claim("entries", none, f"labels-{shares[0]}pc", f"{shares[0]} % of wrong labels raise the error", paper=False),
-        Claim(
-            "entries", none, f"labels-{shares[-1]}pc", f"{shares[-1]} % of wrong labels raise the error", paper=False
-        ),
-    ]
+        own("entries", none, at[degrees[0]], f"noise of {degrees[0]}° on normals raises the error"),
+        Claim("entries", none, at[most], f"noise of {most}° on normals raises the error"),
+        own("entries", at[mid], at[most], f"{most}° is worse than {mid}°"),
+        Claim("entries", late, early, f"the error rises less per degree beyond {mid}°"),
+        *(own("entries", none, f"labels-{p}pc", f"{p} % of wrong labels raise the error") for p in (shares[0], shares[-1])),
+    ]  # fmt: skip
 
 
 STUDY = Study(

@@ -13,47 +13,74 @@ Spread     the six photos (of a photo with two chairs, the mean of both): one se
 
 from __future__ import annotations
 
-from studies.core.left_out.case import CHAIRS, LeftOutCase, Prediction
-from studies.core.study import Claim, Scale, Setting, Study
+from pathlib import Path
+from typing import Any
 
-PHOTOS = {"full": tuple(CHAIRS), "quick": ("kitchen", "hall")}
-PREDICTIONS: tuple[Prediction, ...] = ("left out", "observed", "flat")
+import msgspec
+
+from studies.study import Claim, Scale, Setting, Study, own
+
+FOLDER = "data/eames"
+SHELLS = {  # of the chairs, by photo
+    "terrace": ("red", "white"),
+    "kitchen": ("yellow",),
+    "hall": ("black", "yellow"),
+    "garden": ("white",),
+    "office": ("red",),
+    "patio": ("black",),
+}
+PHOTOS = {"full": tuple(SHELLS), "quick": ("kitchen", "hall")}
+PREDICTIONS = ("left out", "observed", "flat")
+
+
+class LeftOut(msgspec.Struct, frozen=True):
+    """The shells of a photo that are predicted one at a time, and from what."""
+
+    photo: str
+    shells: tuple[str, ...]
+    prediction: str
+
+
+def case(photos: tuple[str, ...], number: int, prediction: str) -> LeftOut:
+    """Of a photo by its number; a shell that no other photo shows is not asked for."""
+    others = {shell for k, photo in enumerate(photos) if k != number for shell in SHELLS[photo]}
+    return LeftOut(photos[number], tuple(s for s in SHELLS[photos[number]] if s in others), prediction)
 
 
 def settings(scale: Scale) -> list[Setting]:
     """Ways to predict; what stands in a seed's place is the number of a photo."""
-    return [_setting(scale, x, prediction) for x, prediction in enumerate(PREDICTIONS)]
-
-
-def _setting(scale: Scale, x: int, prediction: Prediction) -> Setting:
     photos = PHOTOS[scale.name]
-    case = lambda photo: LeftOutCase(photos[photo], photos, prediction, scale.solve)  # noqa: E731
-    return Setting(f"chair-{prediction.replace(' ', '-')}", prediction, x, case)
+    return [Setting(f"chair-{p.replace(' ', '-')}", p, lambda k, p=p: case(photos, k, p)) for p in PREDICTIONS]
 
 
-def spread(scale: Scale) -> tuple[int, ...]:
-    """Numbers of the photos whose chairs are predicted."""
-    return tuple(range(len(PHOTOS["full"]))) if scale.name == "full" else (0,)
+def numbers(scale: Scale) -> tuple[int, ...]:
+    """The numbers of the photos whose chairs are predicted; of a quick study the first alone."""
+    return (0,) if scale.quick else tuple(range(len(SHELLS)))
 
 
 def claims(scale: Scale) -> list[Claim]:
     """Better than without light; worse than with the chair."""
+    left_out, observed, flat = (setting.name for setting in settings(scale))
     return [
-        Claim(
-            "chair",
-            "chair-left-out",
-            "chair-flat",
-            "a chair that was left out is predicted better than by a flat colour",
-        ),
-        Claim("chair_scaled", "chair-left-out", "chair-flat", "the same with brightness and tint given", paper=False),
-        Claim(
-            "chair",
-            "chair-observed",
-            "chair-left-out",
-            "a chair that was observed is shown better than one that was left out",
-            paper=False,
-        ),
+        Claim("chair", left_out, flat, "a chair that was left out is predicted better than by a flat colour"),
+        own("chair_scaled", left_out, flat, "the same with brightness and tint given"),
+        own("chair", observed, left_out, "a chair that was observed is shown better than one that was left out"),
     ]
+
+
+def by_photo(table: Any) -> list[str]:
+    """Each photo's values, as a sentence: six photos are few, and one that is unlike the others decides a mean."""
+    values = {row.label: row.cells["chair"].values for row in table.rows}
+    photos = dict(enumerate(PHOTOS[table.scale]))
+    each = (f"{photos[k]} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k in table.seeds)
+    return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
+
+
+def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
+    """The photos' shells above the predicted ones, a picture for each way to predict."""
+    from studies.steps.chairs import shells_of_photos
+
+    return shells_of_photos(settings(scale), numbers(scale), scores)
 
 
 STUDY = Study(
@@ -65,7 +92,10 @@ STUDY = Study(
     measures=("chair", "chair_scaled"),
     settings=settings,
     claims=claims,
-    kind="left_out",
-    spread=spread,
+    steps=("sets", "photos", "whole", "leave_out", "chairs"),
+    sets=lambda scale: {"folder": FOLDER, "photos": PHOTOS[scale.name], "solve": scale.solve},
+    numbers=numbers,
     over="photos",
+    notes=by_photo,
+    pictures=pictures,
 )

@@ -7,24 +7,17 @@ Measured   material 0 in every light of its world, and every material of the wor
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study
-
-
-def settings(scale: Scale) -> list[Setting]:
-    """1 × 1 to the largest."""
-    return [scale.matrix(x=n, materials=n, lights=n) for n in range(1, scale.largest + 1)]
+from studies.study import Claim, Scale, Study, own
 
 
 def claims(scale: Scale) -> list[Claim]:
     """The largest against one photo, and against one less."""
-    n = scale.largest
-    measures = (("first_material", "material 0"), ("first_light", "light 0"))
-    against_one = [Claim(m, f"{n}x{n}", "1x1", f"error falls from 1 × 1 to {n} × {n} ({what})") for m, what in measures]
-    against_less = [
-        Claim(m, f"{n}x{n}", f"{n - 1}x{n - 1}", f"it still falls from {n - 1} × {n - 1} ({what})", paper=False)
-        for m, what in measures
-    ]
-    return against_one + against_less
+    n, less = scale.largest, scale.largest - 1
+    measures = {"first_material": "material 0", "first_light": "light 0"}
+    return [
+        *(Claim(m, f"{n}x{n}", "1x1", f"error falls from 1 × 1 to {n} × {n} ({what})") for m, what in measures.items()),
+        *(own(m, f"{n}x{n}", f"{less}x{less}", f"it still falls from {less} × {less} ({of})") for m, of in measures.items()),
+    ]  # fmt: skip
 
 
 STUDY = Study(
@@ -34,6 +27,6 @@ STUDY = Study(
     paper="The error falls as the full matrix grows from 1 × 1 to 5 × 5.",
     varied="materials × lights, all observed",
     measures=("first_material", "first_light", "entries", "diffuse", "specular", "roughness", "glossy"),
-    settings=settings,
+    settings=lambda scale: [scale.matrix(n, n) for n in range(1, scale.largest + 1)],
     claims=claims,
 )

@@ -11,85 +11,62 @@ Measured   entries that were observed and those that were not.  The paper's phot
 
 from __future__ import annotations
 
-from studies.core.entries import Entry
-from studies.core.objects.setting import setting
-from studies.core.study import Claim, Guess, Scale, Setting, Study, full_matrix
+from pathlib import Path
 
-
-def docksta(photos: int) -> list[Entry]:
-    """Material 0 in all photos, and in each one more.
-
-    >>> docksta(2)
-    [(0, 0), (0, 1), (1, 0), (2, 1)]
-    """
-    return sorted([(0, p) for p in range(photos)] + [(p + 1, p) for p in range(photos)])
-
-
-def unlinked(photos: int) -> list[Entry]:
-    """The same without the linking material.
-
-    >>> unlinked(2)
-    [(1, 0), (2, 1)]
-    """
-    return [(p + 1, p) for p in range(photos)]
+from studies.study import Claim, Entry, Guess, Scale, Setting, Study, case_name, full_matrix, own
 
 
 def patterns(scale: Scale) -> dict[str, list[Entry]]:
-    """Entries by the names of the sets."""
-    full = scale.name == "full"
-    photos = 6 if full else 3
+    """Entries by the names of the sets.
+
+    >>> from studies.study import QUICK
+    >>> patterns(QUICK)["docksta"]
+    [(0, 0), (0, 1), (0, 2), (1, 0), (2, 1), (3, 2)]
+    """
+    photos, fewer = (3, 2) if scale.quick else (6, 4)
+    unlinked = [(p + 1, p) for p in range(photos)]
     return {
-        "docksta": docksta(photos),
-        "docksta-unlinked": unlinked(photos),
-        "lapd": full_matrix(2, 4 if full else 2),
+        "docksta": sorted([(0, p) for p in range(photos)] + unlinked),
+        "docksta-unlinked": unlinked,
+        "lapd": full_matrix(2, fewer),
         "photos": full_matrix(scale.largest, scale.largest),
     }
 
 
 def settings(scale: Scale) -> list[Setting]:
     """A set each."""
-    return [
-        setting(scale, f"set-{name}", name.replace("-unlinked", " without chair"), x, entries)
-        for x, (name, entries) in enumerate(patterns(scale).items())
-    ]
+    sets = patterns(scale).items()
+    return [scale.of_objects(f"set-{name}", name.replace("-unlinked", " without chair"), of) for name, of in sets]
 
 
 def claims(scale: Scale) -> list[Claim]:
-    """Each set is predicted better than by a guess that knows mean colours; what links the photos is worth something, and a full
-    matrix more than a sparse one."""
-    sets = (("docksta", "unobserved", "entries of Docksta's pattern that were not observed"), ("lapd", "entries", "entries of LAPD's pattern"),
-            ("photos", "entries", "entries of all photos"))  # fmt: skip
-    return [
-        *(
-            Claim(
-                measure,
-                f"set-{name}",
-                Guess(f"set-{name}"),
-                f"{words} are predicted better than by a guess of mean colours",
-            )
-            for name, measure, words in sets
-        ),
-        Claim(
-            "unobserved",
-            "set-docksta",
-            "set-docksta-unlinked",
-            "the linking chair helps to predict what was not observed",
-        ),
-        Claim(
-            "observed",
-            "set-docksta",
-            "set-docksta-unlinked",
-            "the linking chair helps with what was observed",
-            paper=False,
-        ),
-        Claim(
-            "entries",
-            "set-photos",
-            "set-docksta",
-            "the full matrix is predicted better than the linked one",
-            paper=False,
-        ),
+    """Each set is better than a guess of mean colours; what links photos is worth something, a full matrix more than a sparse one."""
+    linked, unlinked = "set-docksta", "set-docksta-unlinked"
+    guesses = [
+        ("unobserved", linked, "entries of Docksta's pattern that were not observed"),
+        ("entries", "set-lapd", "entries of LAPD's pattern"),
+        ("entries", "set-photos", "entries of all photos"),
     ]
+    better = "are predicted better than by a guess of mean colours"
+    return [
+        *(Claim(measure, name, Guess(name), f"{words} {better}") for measure, name, words in guesses),
+        Claim("unobserved", linked, unlinked, "the linking chair helps to predict what was not observed"),
+        own("observed", linked, unlinked, "the linking chair helps with what was observed"),
+        own("entries", "set-photos", linked, "the full matrix is predicted better than the linked one"),
+    ]
+
+
+def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
+    """Each set's materials (rows) in its lights (columns), true and recovered."""
+    seed = scale.seeds[0]
+    words = "(rows) in the set's lights (columns); left the truth, right recovered materials in recovered lights.  Frames: observed entries."
+    return {
+        f"{s.name}.png": (
+            f"{s.label}, seed {seed}: {', '.join(s.case(seed).material_names)} {words}",
+            (scores / f"matrix-{case_name(s.name, seed)}.png").read_bytes(),
+        )
+        for s in settings(scale)
+    }
 
 
 STUDY = Study(
@@ -101,5 +78,6 @@ STUDY = Study(
     measures=("unobserved", "observed", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=settings,
     claims=claims,
-    kind="objects",
+    lights=1,
+    pictures=pictures,
 )

@@ -10,41 +10,40 @@ What cannot be switched off: the gauge.
 
 from __future__ import annotations
 
-from studies.core.part import PARTS, Part
-from studies.core.study import Claim, Scale, Setting, Study
+from typing import Any
 
-QUICK = ("as-it-is", "bounce", "robust")
-WORTH = {
-    "shadows": "shadows",
-    "bounce": "bounces",
-    "normals": "confidences of normals",
-    "robust": "pseudo-Huber residuals",
+from studies.study import Claim, Scale, Setting, Study, own
+
+WITHOUT: dict[str, tuple[str, str, dict[str, Any]]] = {  # label, what is off, options of the solver of few lobes
+    "as-it-is": ("as it is", "", {}),
+    "shadows": ("no shadows", "shadows", {"shadows": False, "bounces": False}),
+    "bounce": ("no bounce", "bounces", {"bounces": False}),
+    "normals": ("all normals sure", "confidences of normals", {"seen": "sure"}),
+    "robust": ("squares", "pseudo-Huber residuals", {"robust_scale": 1e6}),
+    "clipped-as-data": ("clipped as data", "bounds for clipped values", {"seen": "unclipped"}),
+    "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", {"seen": "dropped"}),
 }
-FURTHER = {"clipped-as-data": "bounds for clipped values", "clipped-left-out": "clipped pixels, as bounds,"}
-DO = {
-    "unseen": "explain unseen observations better",
-    "diffuse": "make k_d truer",
-    "glossy": "make lights truer",
-}  # measure -> what parts may do
+QUICK = ("as-it-is", "bounce", "robust")
+DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}
 
 
 def settings(scale: Scale) -> list[Setting]:
     """As it is, then without each part."""
-    names = QUICK if scale.name == "quick" else tuple(PARTS)
-    return [
-        Setting(name, PARTS[name][0], x, lambda seed, name=name: Part(seed, name, scale.solve))
-        for x, name in enumerate(names)
-    ]
+    names = QUICK if scale.quick else tuple(WITHOUT)
+    hows = {name: {**scale.solve, **WITHOUT[name][2]} for name in names}
+    return [Setting(n, WITHOUT[n][0], lambda seed, n=n: {"seed": seed, "solve": hows[n]}) for n in names]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """Unseen cells, materials and lights with each part against without it."""
-    parts = {name: words for name, words in (WORTH | FURTHER).items() if scale.name == "full" or name in QUICK}
-    return [
-        Claim(measure, "as-it-is", name, f"{words} {does}", paper=False)
-        for measure, does in DO.items()
-        for name, words in parts.items()
-    ]
+    names = [setting.name for setting in settings(scale)][1:]
+    return [own(measure, "as-it-is", n, f"{WITHOUT[n][1]} {does}") for measure, does in DO.items() for n in names]
+
+
+def sets(scale: Scale) -> dict[str, Any]:
+    """The rendered sets of chairs, one a seed: so many shots of so many pixels; small ones, since a study is of many solves."""
+    size = (2, 120, 90, 16, 32) if scale.quick else (4, 240, 180, 64, 64)
+    return {"seeds": scale.seeds, **dict(zip(("shots", "width", "height", "spp", "light_rows"), size, strict=True))}
 
 
 STUDY = Study(
@@ -56,5 +55,6 @@ STUDY = Study(
     measures=("unseen", "diffuse", "specular", "glossy", "roughness", "mirror"),
     settings=settings,
     claims=claims,
-    kind="parts",
+    steps=("sets", "photos", "parts"),
+    sets=sets,
 )

@@ -8,57 +8,39 @@ Measured   the materials in every light of the world, all materials of the world
 
 from __future__ import annotations
 
-from studies.core.objects.setting import setting
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from pathlib import Path
+
+from studies.study import Claim, Scale, Setting, Study, full_matrix, own
 
 
 def settings(scale: Scale) -> list[Setting]:
     """Photos one by one; then the same from the solution before."""
-    cold = [_setting(scale, n, n, "nothing") for n in range(1, scale.largest + 1)]
-    return cold + [_setting(scale, scale.largest + n, n, "earlier") for n in range(2, scale.largest + 1)]
-
-
-def _setting(scale: Scale, x: int, n: int, start: str) -> Setting:
-    name, label = (f"photos-{n}-warm", f"{n} warm") if start == "earlier" else (f"photos-{n}", str(n))
-    return setting(scale, name, label, x, full_matrix(scale.side, n), start=start)
+    n = scale.largest
+    cold = [scale.of_objects(f"photos-{k}", str(k), full_matrix(scale.side, k)) for k in range(1, n + 1)]
+    return cold + [
+        scale.of_objects(f"photos-{k}-warm", f"{k} warm", full_matrix(scale.side, k), start="earlier")
+        for k in range(2, n + 1)
+    ]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """All photos against one and against one less; warm against from nothing."""
-    n = scale.largest
-    measures = (
-        ("new_light", "re-rendering"),
-        ("diffuse", "k_d"),
-        ("roughness", "roughness"),
-        ("first_light", "light 0"),
-    )
+    n, what = scale.largest, {"new_light": "re-rendering", "diffuse": "k_d", "roughness": "roughness", "first_light": "light 0"}  # fmt: skip
+    cold, warm = f"photos-{n}", f"photos-{n}-warm"
     return [
-        *(Claim(m, f"photos-{n}", "photos-1", f"{n} photos are better than one ({what})") for m, what in measures),
-        Claim(
-            "new_light",
-            f"photos-{n}",
-            f"photos-{n - 1}",
-            f"the last of {n} photos still improves re-rendering",
-            paper=False,
-        ),
-        Claim(
-            "seconds",
-            f"photos-{n}-warm",
-            f"photos-{n}",
-            "a warm start takes less time than a start from nothing",
-            paper=False,
-        ),
-        Claim(
-            "new_light", f"photos-{n}-warm", f"photos-{n}", "a warm start is better than one from nothing", paper=False
-        ),
-        Claim(
-            "new_light",
-            f"photos-{n}",
-            f"photos-{n}-warm",
-            "a start from nothing is better than a warm one",
-            paper=False,
-        ),
+        *(Claim(m, cold, "photos-1", f"{n} photos are better than one ({words})") for m, words in what.items()),
+        own("new_light", cold, f"photos-{n - 1}", f"the last of {n} photos still improves re-rendering"),
+        own("seconds", warm, cold, "a warm start takes less time than a start from nothing"),
+        own("new_light", warm, cold, "a warm start is better than one from nothing"),
+        own("new_light", cold, warm, "a start from nothing is better than a warm one"),
     ]
+
+
+def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
+    """Spheres of the recovered materials, a column for each setting."""
+    from studies.steps.score import spheres_by_setting
+
+    return spheres_by_setting(settings(scale), scale.seeds[0], scores)
 
 
 STUDY = Study(
@@ -70,5 +52,6 @@ STUDY = Study(
     measures=("new_light", "first_light", "seconds", "diffuse", "specular", "roughness", "glossy"),
     settings=settings,
     claims=claims,
-    kind="objects",
+    lights=1,
+    pictures=pictures,
 )

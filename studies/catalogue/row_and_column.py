@@ -6,13 +6,7 @@ Measured   their own entries, as in the paper; and, as for the size of the matri
 
 from __future__ import annotations
 
-from studies.core.study import Claim, Scale, Setting, Study
-
-
-def settings(scale: Scale) -> list[Setting]:
-    """One entry, a row, a column, all."""
-    n = scale.largest
-    return [scale.matrix(x, *shape) for x, shape in enumerate([(1, 1), (1, n), (n, 1), (n, n)])]
+from studies.study import Claim, Scale, Study, own
 
 
 def claims(scale: Scale) -> list[Claim]:
@@ -21,9 +15,9 @@ def claims(scale: Scale) -> list[Claim]:
     row, column = f"1x{n}", f"{n}x1"
     return [
         Claim("entries", row, column, f"1 × {n} predicts its entries better than {n} × 1"),
-        Claim("first_material", row, column, f"1 × {n} tells more of material 0 than {n} × 1", paper=False),
-        Claim("first_material", row, "1x1", "more lights tell more of material 0", paper=False),
-        Claim("first_light", column, "1x1", "more materials tell more of light 0", paper=False),
+        own("first_material", row, column, f"1 × {n} tells more of material 0 than {n} × 1"),
+        own("first_material", row, "1x1", "more lights tell more of material 0"),
+        own("first_light", column, "1x1", "more materials tell more of light 0"),
     ]
 
 
@@ -34,6 +28,6 @@ STUDY = Study(
     paper="1 × 5 does well, 5 × 1 slightly worse.",
     varied="materials × lights, all observed",
     measures=("entries", "first_material", "first_light", "diffuse", "specular", "roughness", "glossy"),
-    settings=settings,
+    settings=lambda scale: [scale.matrix(m, n) for m in (1, scale.largest) for n in (1, scale.largest)],
     claims=claims,
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from studies.core.study import Claim, Scale, Setting, Study, full_matrix
+from studies.study import Claim, Scale, Setting, Study, full_matrix, own
 
 LOBES = {"solver": "few_lobes"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -26,34 +26,27 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("paper's solver", {"solver": "paper", "operator": "network"}),
     "paper-network": ("all the paper's", {"solver": "paper", "operator": "paper_network"}),
 }
-SEEN = full_matrix(2, 2)
 QUICK = ("default", "closed-form", "merge-4", "paper")
 
 
 def settings(scale: Scale) -> list[Setting]:
     """All of `VARIANTS`; of a quick study, those of `QUICK`."""
-    names = QUICK if scale.name == "quick" else tuple(VARIANTS)
-    return [scale.setting(name, VARIANTS[name][0], x, SEEN, solve=VARIANTS[name][1]) for x, name in enumerate(names)]
+    variants = {name: VARIANTS[name] for name in (QUICK if scale.quick else VARIANTS)}
+    return [scale.setting(name, label, full_matrix(2, 2), solve=how) for name, (label, how) in variants.items()]
 
 
 def claims(scale: Scale) -> list[Claim]:
     """This solver against the paper's, and what reductions cost."""
-    own = [
-        Claim("entries", "default", "paper", "this project's solver predicts better than the paper's", paper=False),
-        Claim("seconds", "default", "paper", "it takes less time than the paper's", paper=False),
+    every = [
+        own("entries", "default", "paper", "this project's solver predicts better than the paper's"),
+        own("seconds", "default", "paper", "it takes less time than the paper's"),
+        own("seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster"),
+        own("entries", "lobes", "closed-form", "the network predicts better than the closed form"),
+        own("entries", "merge-0", "lobes", "merging observations costs accuracy"),
+        own("seconds", "lobes", "merge-0", "merging observations saves time"),
+        own("entries", "lobes", "lobes-16", "72 lobes predict better than 16"),
     ]
-    if scale.name == "quick":
-        return own
-    return [
-        *own,
-        Claim(
-            "seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster", paper=False
-        ),
-        Claim("entries", "lobes", "closed-form", "the network predicts better than the closed form", paper=False),
-        Claim("entries", "merge-0", "lobes", "merging observations costs accuracy", paper=False),
-        Claim("seconds", "lobes", "merge-0", "merging observations saves time", paper=False),
-        Claim("entries", "lobes", "lobes-16", "72 lobes predict better than 16", paper=False),
-    ]
+    return every[:2] if scale.quick else every
 
 
 STUDY = Study(
@@ -65,5 +58,5 @@ STUDY = Study(
     measures=("seconds", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=settings,
     claims=claims,
-    kind="speed",
+    across="seconds",
 )

@@ -1,1 +1,191 @@
-"""How the project's runner sees a study, and the command line."""
+"""How the project's runner sees a study: a data set whose photos are the study's cases.
+
+Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
+(`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
+build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step: it is
+written anew after each run, for it takes a second.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from factorlib.errors import InputError, did_you_mean
+from factorlib.jsonfile import json_text, read_json
+from factorlib.runner import verbs
+from factorlib.runner.filehash import FileHashes
+from factorlib.runner.project import LIBRARY, Data, Project, Provider
+from factorlib.wholefile import replace_file
+from studies import catalogue
+from studies.catalogue import (
+    alignment_error,
+    comparison,
+    cost,
+    gauss_sphere,
+    hard_cases,
+    label_quality,
+    leave_one_out,
+    matrix_size,
+    network_evaluation,
+    paper_sets,
+    parts,
+    prior,
+    progressive,
+    row_and_column,
+    seeds_and_machines,
+    speed,
+    structure,
+)
+from studies.study import FULL, QUICK, Scale, Score, Study
+
+MODULES = (
+    matrix_size, row_and_column, structure, label_quality, alignment_error, progressive, leave_one_out, paper_sets, gauss_sphere,
+    comparison, prior, network_evaluation, cost, speed, parts, hard_cases, seeds_and_machines,
+)  # in the order of the page  # fmt: skip
+STUDIES: dict[str, Study] = {module.STUDY.name: module.STUDY for module in MODULES}
+SLICES = ("case", "worlds", "sets")
+FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
+
+
+class Slice(msgspec.Struct, frozen=True):
+    """What a step sees of the study."""
+
+    facts: Any
+    fields: dict[str, Any]
+    files: list[str] = []
+
+
+class Studies(Project, frozen=True):
+    """The checkout, with studies of a scale in place of data sets."""
+
+    scale: Scale = FULL
+
+    @property
+    def pipeline_file(self) -> Path:
+        """The file that declares the steps of all studies."""
+        return Path(__file__).with_name("pipeline.yaml")
+
+    @property
+    def build(self) -> Path:
+        """The folder of all results of this scale."""
+        folder = self.root / "build" / "studies"
+        return folder / "quick" if self.scale.quick else folder
+
+    def dataset_folder(self, name: str) -> Path:
+        """A folder that stands for a study; nothing lies there.  InputError where no study is called so."""
+        if name not in STUDIES:
+            raise InputError(f"there is no study {name!r}", key="STUDY", cure=did_you_mean(name, STUDIES))
+        return self.root / "studies" / name
+
+    find_dataset = dataset_folder
+
+
+def studies(scale: Scale = FULL, root: Path = LIBRARY, name: str = "") -> Studies:
+    """The project of the studies of a scale; name: of the one that is to run, for steps of a study may be its own module's."""
+    package = catalogue.__name__ if name in STUDIES and not STUDIES[name].steps else "studies.steps"
+    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), package, scale)
+
+
+def data_of(folder: Path, scale: Scale) -> Data:
+    """A study as the runner reads it."""
+    study = STUDIES[folder.name]
+    cases = study.cases(scale)
+
+    def slice_(name: str, case: str | None) -> Slice:
+        """The facts of a slice; its fields are what a change is reported by."""
+        facts = {"worlds": study.worlds, "sets": lambda scale: sets_of(study, scale), "case": lambda _: cases[case]}
+        plain = msgspec.to_builtins(facts[name](scale))
+        return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
+
+    return Data(folder, list(cases), slice_)
+
+
+def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
+    """The data sets of a study, and what one of this checkout contains besides its truth, so that a step's key has it."""
+    facts = study.sets(scale)
+    if "folder" not in facts:
+        return facts
+    hashes, folder = FileHashes(None), LIBRARY / facts["folder"]
+    files = {file.relative_to(folder): file for file in sorted(folder.rglob("*")) if file.is_file()}
+    return facts | {"content": {str(name): hashes.content(f) for name, f in files.items() if name.parts[0] != "truth"}}
+
+
+def make(
+    scale: Scale, names: list[str], force: bool = False, settings: list[str] | None = None, root: Path = LIBRARY
+) -> int:
+    """Run studies as far as anything must run; their results and the page of all that are done lie in build/studies afterwards.
+
+    settings: where their steps run, as `executor=dask`
+
+    A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
+    """
+    codes = []
+    for name in names:
+        project, study = studies(scale, root, name), STUDIES[name]
+        if scale.quick:
+            print(f"{name}: quick: one seed, smallest sets: no conclusion")
+        targets = list(study.steps or (study.module,))
+        codes.append(verbs.make(project, verbs.Wish(name, targets=targets, settings=settings or [], force=force)))
+        if codes[-1] == 0:
+            conclude(study, scale, project.build / name / targets[-1], project.build / name)
+            print(f"  study: {project.shown(project.build / name / 'figure.svg')}")
+            print(f"  page: {project.shown(write_page(project))}")
+    return next((code for code in codes if code), 0)
+
+
+def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
+    """Write what a study comes to into the folder `home`: table.json and .csv, figure.svg, paragraph.md and pictures/.
+
+    scores: the folder of its last step, with scores.json
+    """
+    from studies.conclusion import concluded, csv_text, paragraph  # here: a plan must not pay for science
+    from studies.figures import figure
+
+    table = concluded(study, scale, msgspec.convert(read_json(scores / "scores.json"), dict[str, Score]))
+    pictures = study.pictures(scale, scores)
+    table = msgspec.structs.replace(table, pictures={name: caption for name, (caption, _) in pictures.items()})
+    texts = (figure(table, study.across), csv_text(table), json_text(table), paragraph(table))
+    for file, words in zip(FINISHED, texts, strict=True):
+        replace_file(home / file, words.encode())
+    shutil.rmtree(home / "pictures", ignore_errors=True)
+    for name, (_, data) in pictures.items():
+        (home / "pictures").mkdir(exist_ok=True)
+        replace_file(home / "pictures" / name, data)
+
+
+def write_page(project: Studies) -> Path:
+    """index.html of all studies of this scale that are done."""
+    from studies.run.page import page
+
+    folders = [folder for name in STUDIES if (folder := project.build / name) and (folder / "table.json").is_file()]
+    replace_file(
+        project.build / "index.html", page([(read_json(folder / "table.json"), folder) for folder in folders]).encode()
+    )
+    return project.build / "index.html"
+
+
+def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
+    """Forget the results of studies; `collect` frees what they took.  Returns 0."""
+    project = studies(scale, root)
+    for name in names:
+        shutil.rmtree(project.build / name / "pictures", ignore_errors=True)
+        for file in FINISHED:
+            (project.build / name / file).unlink(missing_ok=True)
+        verbs.clean(project, name)
+    if project.build.is_dir():
+        write_page(project)
+    return 0
+
+
+def collect(agreed: Callable[[], bool]) -> int:
+    """Show which results no study names any more, and delete them where that is `agreed`.  Returns 0."""
+    for project in (studies(FULL), studies(QUICK)):
+        if (project.build / "store").is_dir():
+            print(f"{project.shown(project.build)}:")
+            verbs.collect(project, agreed)
+    return 0

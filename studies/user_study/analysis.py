@@ -1,4 +1,4 @@
-"""How often ours is preferred: by picture and over all, with standard errors.
+"""What participants answered, read and checked, and how often ours is preferred: by picture and over all, with standard errors.
 
 By picture   share p of n participants, standard error √(p (1 − p) / n).
 Over all     mean of the participants' own shares, standard error s / √n over participants: the answers of one person are no
@@ -10,18 +10,92 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
-from benchmarks.figure import COLOURS, dot, line, page, text
-from studies.user_study.answers import Answers
+from benchmarks.figure import page
+from factorlib.errors import InputError
+from factorlib.reading import read_text
+from studies.figures import Mark, rows_of_marks
 
+FORMAT = 1
+CURE = "give files as the page saved them (the button “Save answers (JSON)”), or leave this one out"
 PAPER, PAPER_ERROR = 0.865, 0.021
-LEFT, RIGHT, ROW, TOP, WIDTH = 330, 30, 20, 64, 800
 HEAD = ("picture", "participants", "for_ours", "share", "standard_error", "simulated")
-OVERALL = "all pictures"
+Side = Literal["left", "right"]
+Digits = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
+
+
+class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A question: its picture, on which side ours was, which side was chosen, after how many milliseconds."""
+
+    picture: Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+    ours: Side
+    chosen: Side
+    milliseconds: Annotated[float, msgspec.Meta(ge=0)]
+
+    @property
+    def for_ours(self) -> bool:
+        """Whether ours was chosen."""
+        return self.chosen == self.ours
+
+
+class Answers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All of a participant's.
+
+    page: digest of the questions;  seed: of order and sides;  simulated: empty for a person, else who answered;  asked: questions of the page
+    """
+
+    format: int
+    page: Digits
+    participant: Digits
+    seed: Annotated[int, msgspec.Meta(ge=0, lt=2**32)]
+    simulated: Annotated[str, msgspec.Meta(max_length=200)]
+    asked: Annotated[int, msgspec.Meta(ge=1)]
+    answers: list[Answer]
+
+
+def read_answers(files: Sequence[Path]) -> list[Answers]:
+    """One a participant.
+
+    Raises InputError for no file, one that is not the page's, one that is cut short or changed, the same participant twice, files of
+    different pages, and simulated answers beside people's.
+    """
+    if not files:
+        cure = "name the files that participants saved: answers-*.json"
+        raise InputError("no file of answers is named", key="FILE", cure=cure)
+    read = [_read(file) for file in files]
+    for k, (file, answers) in enumerate(zip(files, read, strict=True)):
+        same = next((f for f, a in zip(files[:k], read, strict=False) if a.participant == answers.participant), None)
+        for field, wrong, words, cure in (
+            ("participant", same, f"the same participant as in {same}", "name each file once"),
+            ("page", answers.page != read[0].page, f"other pictures than in {files[0]}", "analyse the files of each page by themselves"),
+            ("simulated", answers.simulated != read[0].simulated, f"who answered differs from {files[0]}",
+             "analyse people's answers, and those of each simulation, by themselves"),
+        ):  # fmt: skip
+            if wrong:
+                raise InputError(words, file=file, key=field, cure=cure)
+    return read
+
+
+def _read(file: Path) -> Answers:
+    try:
+        read = msgspec.json.decode(read_text(file, "JSON"), type=Answers)
+    except msgspec.DecodeError as error:  # also a ValidationError, which says the field
+        raise InputError(f"not a file of answers: {error}", file=file, cure=CURE) from None
+    if read.format != FORMAT:
+        cure = f"this version reads format {FORMAT}"
+        raise InputError(f"format {read.format} is not known", file=file, key="format", cure=cure)
+    names = [answer.picture for answer in read.answers]
+    if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
+        raise InputError(f"two answers to '{twice}'", file=file, key="answers", cure=CURE)
+    if len(names) != read.asked:
+        raise InputError(f"{len(names)} answers to {read.asked} questions", file=file, key="answers", cure=CURE)
+    return read
 
 
 class Share(msgspec.Struct, frozen=True):
@@ -33,6 +107,13 @@ class Share(msgspec.Struct, frozen=True):
     share: float
     error: float | None
 
+    def __str__(self) -> str:
+        """
+        >>> str(Share("a", 250, 216, 0.865, 0.021))
+        '86.5 % ± 2.1'
+        """
+        return f"{100 * self.share:.1f} %" + (f" ± {100 * self.error:.1f}" if self.error is not None else "")
+
 
 class Analysis(msgspec.Struct, frozen=True):
     """Of one page's answers; simulated: empty for people's."""
@@ -41,106 +122,58 @@ class Analysis(msgspec.Struct, frozen=True):
     pictures: list[Share]
     simulated: str
 
+    @property
+    def label(self) -> str:
+        """What stands on all that is made of simulated answers; empty of people's."""
+        return f"simulated: {self.simulated}" if self.simulated else ""
 
-def analysed(found: Sequence[Answers]) -> Analysis:
+
+def analysed(everyone: Sequence[Answers]) -> Analysis:
     """Of at least one participant."""
-    names = sorted({a.picture for answers in found for a in answers.answers})
-    pictures = [
-        _of_picture(name, [a.for_ours for answers in found for a in answers.answers if a.picture == name])
-        for name in names
-    ]
-    own = [float(np.mean([a.for_ours for a in answers.answers])) for answers in found]
+    votes: dict[str, list[bool]] = {}
+    for a in (a for answers in everyone for a in answers.answers):
+        votes.setdefault(a.picture, []).append(a.for_ours)
+    pictures = []
+    for name, of in sorted(votes.items()):
+        n, share = len(of), float(np.mean(of))
+        pictures.append(Share(name, n, sum(of), share, (share * (1 - share) / n) ** 0.5 if n > 1 else None))
+    own = [float(np.mean([a.for_ours for a in answers.answers])) for answers in everyone]
     error = float(np.std(own, ddof=1) / len(own) ** 0.5) if len(own) > 1 else None
-    overall = Share(OVERALL, len(found), sum(s.for_ours for s in pictures), float(np.mean(own)), error)
-    return Analysis(overall, pictures, found[0].simulated)
+    overall = Share("all pictures", len(own), sum(s.for_ours for s in pictures), float(np.mean(own)), error)
+    return Analysis(overall, pictures, everyone[0].simulated)
 
 
-def _of_picture(name: str, votes: Sequence[bool]) -> Share:
-    n, share = len(votes), float(np.mean(votes))
-    return Share(name, n, sum(votes), share, (share * (1 - share) / n) ** 0.5 if n > 1 else None)
-
-
-def label(found: Analysis) -> str:
-    """What stands on all that is made of simulated answers; empty of people's."""
-    return f"simulated: {found.simulated}" if found.simulated else ""
-
-
-def csv_text(found: Analysis) -> str:
+def csv_text(analysis: Analysis) -> str:
     """A line for each picture, the last one for all."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(HEAD)
-    for s in (*found.pictures, found.overall):
-        writer.writerow(
-            [
-                s.picture,
-                s.participants,
-                s.for_ours,
-                f"{s.share:.4f}",
-                "" if s.error is None else f"{s.error:.4f}",
-                found.simulated,
-            ]
-        )
+    for s in (*analysis.pictures, analysis.overall):
+        error = "" if s.error is None else f"{s.error:.4f}"
+        writer.writerow([s.picture, s.participants, s.for_ours, f"{s.share:.4f}", error, analysis.simulated])
     return out.getvalue()
 
 
-def paragraph(found: Analysis) -> str:
+def paragraph(analysis: Analysis) -> str:
     """Markdown: the share, and the paper's beside it where people were asked."""
-    s = found.overall
-    people = "participant" if s.participants == 1 else "participants"
-    share = f"Ours is preferred to the intrinsic decomposition in {percent(s)} of answers ({s.participants} {people}, {len(found.pictures)} pictures)."
-    if found.simulated:
-        return f"**{label(found)}** {share} No person was asked: nothing is to be set against the paper.\n"
-    return f"{share} The paper: {100 * PAPER:.1f} % ± {100 * PAPER_ERROR:.1f} of 250 people, against SIRFS. {_against_the_paper(s)}\n"
+    s, pictures = analysis.overall, len(analysis.pictures)
+    people = f"{s.participants} participant{'s' * (s.participants != 1)}, {pictures} pictures"
+    share = f"Ours is preferred to the intrinsic decomposition in {s} of answers ({people})."
+    if analysis.simulated:
+        return f"**{analysis.label}** {share} No person was asked: nothing is to be set against the paper.\n"
+    against = "One participant has no standard error: no conclusion."
+    if s.error is not None:
+        distance = (s.share - PAPER) / np.hypot(s.error, PAPER_ERROR)
+        alike = "No difference is shown" if abs(distance) < 1.96 else "The two differ"
+        against = f"{alike}: {distance:+.1f} standard errors of the difference."
+    return f"{share} The paper: {100 * PAPER:.1f} % ± {100 * PAPER_ERROR:.1f} of 250 people, against SIRFS. {against}\n"
 
 
-def _against_the_paper(s: Share) -> str:
-    if s.error is None:
-        return "One participant has no standard error: no conclusion."
-    distance = (s.share - PAPER) / np.hypot(s.error, PAPER_ERROR)
-    alike = "No difference is shown" if abs(distance) < 1.96 else "The two differ"
-    return f"{alike}: {distance:+.1f} standard errors of the difference."
-
-
-def percent(s: Share) -> str:
-    """
-    >>> percent(Share("a", 250, 216, 0.865, 0.021))
-    '86.5 % ± 2.1'
-    """
-    return f"{100 * s.share:.1f} %" + (f" ± {100 * s.error:.1f}" if s.error is not None else "")
-
-
-def figure(found: Analysis) -> str:
-    """SVG that stands alone: a row for each picture, the last one for all; the line at one half is chance."""
-    rows = [*found.pictures, found.overall]
-    height = TOP + ROW * len(rows) + 40
-    base = height - 34
-
-    def across(share: float) -> float:
-        """Of a share, pixels."""
-        return LEFT + share * (WIDTH - LEFT - RIGHT)
-
-    title = f"Preference for ours over the intrinsic decomposition: {percent(found.overall)}"
-    parts = [
-        text(20, 22, title, css="title"),
-        text(20, 42, label(found) or f"{found.overall.participants} participants", css="small soft"),
-    ]
-    for share in (0, 0.25, 0.5, 0.75, 1):
-        css = "axis" if share == 0.5 else "grid"
-        parts += [
-            line(across(share), TOP - 8, across(share), base, css),
-            text(across(share), base + 18, f"{100 * share:g} %", "middle", "small soft"),
-        ]
-    for k, s in enumerate(rows):
-        parts += _row(s, TOP + ROW * k + ROW / 2, across, COLOURS[1 if s.picture == OVERALL else 0])
-    return page(WIDTH, height, parts)
-
-
-def _row(s: Share, y: float, across: Callable[[float], float], colour: str) -> list[str]:
-    low, high = (min(1.0, max(0.0, s.share + side * (s.error or 0.0))) for side in (-1, 1))
-    bar = line(across(low), y, across(high), y, style=f"stroke: {colour}; stroke-width: 1.8")
-    return [
-        text(LEFT - 12, y + 4, s.picture, "end", "small"),
-        *([bar] if s.error else []),
-        dot(across(s.share), y, colour, radius=3.6),
-    ]
+def figure(analysis: Analysis) -> str:
+    """SVG that stands alone: a row for each picture, the last one for all; the dashed line at one half is chance."""
+    rows, title = [*analysis.pictures, analysis.overall], f"Preference for ours: {analysis.overall}"
+    ends = [(None, None) if s.error is None else (s.share - s.error, s.share + s.error) for s in rows]
+    marks = {k: Mark(s.share, *ends[k], null=0.5) for k, s in enumerate(rows)}
+    head = analysis.label or f"{analysis.overall.participants} participants"
+    parts, width, height = rows_of_marks(title, [s.picture for s in rows], {head: marks}, words="{:.0%}".format)
+    return page(width + 100, height, parts)

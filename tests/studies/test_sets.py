@@ -82,8 +82,8 @@ def test_a_real_sets_rows_give_photos_and_the_mean_beside_flat_colours():
     scored = ScoredPicture(PictureError(1.0, 15.47, 0.34357), PictureError(1.0, 13.39, 0.347734))
     seen = PhotoErrors(1.0, 4, 0, 0, 0, 0, None, {}, {"none": scored}, {})
     nothing_counts = msgspec.structs.replace(seen, gauges=None)
-    found = SimpleNamespace(resynthesis=Resynthesis({"a": seen, "b": nothing_counts}, {"none": scored}, 1.0, 1.0))
-    assert real.rows_of("x", found) == [
+    metrics = SimpleNamespace(resynthesis=Resynthesis({"a": seen, "b": nothing_counts}, {"none": scored}, 1.0, 1.0))
+    assert real.rows_of("x", metrics) == [
         ["x: a", ".344", ".348", "15.5", "13.4"],
         ["x: mean", ".344", ".348", "15.5", "13.4"],
     ]

@@ -18,12 +18,11 @@ from factorlib.errors import InputError
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.runner.project import LIBRARY
-from studies.core.baselines.case import Asked, ShownShot
-from studies.core.study import QUICK
-from studies.user_study.analysis import analysed, csv_text, figure, paragraph
-from studies.user_study.answers import Answer, Answers, read_answers
-from studies.user_study.page import page
-from studies.user_study.pictures import digest, trials
+from studies.steps.compare import Asked, ScoredShot
+from studies.study import QUICK
+from studies.user_study.__main__ import digest, trials
+from studies.user_study.__main__ import html as page
+from studies.user_study.analysis import Answer, Answers, analysed, csv_text, figure, paragraph, read_answers
 
 MATERIALS = ("brick", "leaf", "gold")
 needs_chromium = pytest.mark.skipif(
@@ -46,7 +45,7 @@ def scores(tmp_path_factory):
         for k, material in enumerate(MATERIALS):
             for kind in ("novel_view", "novel_light", "novel_material"):
                 asked = Asked(kind, material, k, "front", 0)
-                shots.append(ShownShot(asked, 0.4 if material == "gold" and method == "ours" else error))
+                shots.append(ScoredShot(asked, 0.4 if material == "gold" and method == "ours" else error))
                 png(home / f"{asked.name}.png", 40 * k + 10 + 20 * number)
                 png(home / f"{asked.name}-truth.png", 40 * k + 5)
         write_json(home / "shots.json", shots)

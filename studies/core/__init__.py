@@ -1,1 +1,0 @@
-"""What studies share: cases, the worlds they show, observations, scores, statistics."""

@@ -1,0 +1,276 @@
+"""What methods answer in the comparison, as predictions of photos that were not taken.
+
+Projective   Texturing: the photo's pixels are stuck on the body and carried to the new view.  It knows the body and the camera.  A point
+             that the photo saw has the photo's colour there, between pixels by inverse distance; one that it did not see that of the seen
+             points whose normals are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
+Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos averaged over photos.
+             It knows the normals, and which pixels are of which material; each photo is decomposed by itself.
+   shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few per cent
+               (Ramamoorthi and Hanrahan 2001).  All objects of a photo share it.
+   albedo      a, one a material and channel: in turn with e by weighted least squares of I − a S.
+   highlight   max(I − a S, 0).  So that it does not pull at albedo and shading, a pixel's weight is 1 / (1 + (r/s)²) where its residual
+               r is positive in the mean over channels, s the median size of those that are negative, or `LEAST` of the mean if that is more.
+   average     a photo determines albedos but for a factor per channel: ln a_mi = α_m + β_i in least squares over photos i.  α is the
+               answer, β goes into the photo's shading.
+   new light   its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over photos.
+Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: what does not beat it has recovered
+             nothing.
+Rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as the truth is.
+
+Truths are handed to methods for the gauge alone: photos link all materials and all lights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from factorlib.conventions import lat_long_directions, lat_long_solid_angles
+from factorlib.results.materials import Reflectance
+from studies.body import Map, Photos, Radiance, Scene, View
+from studies.errors import factor_of, times
+
+BETWEEN, NEAREST = (
+    4,
+    12,
+)  # pixels of the photo that a point is between; that one takes its colour from which no photo shows
+ALBEDO = 0.5  # of the grey ball
+LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic
+ITERATIONS, LEAST, DARKEST = 60, 0.01, 1e-4
+ROWS = 32  # of the maps of lights that shading determines, and of even ones
+
+Coefficients = Float[np.ndarray, "9 3"]
+Truths = Mapping[str, Reflectance]
+
+
+class Prediction(Protocol):
+    """A method's answer.
+
+    materials: reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
+    lambertian: that it states no specular part, rather than none being there
+    """
+
+    materials: dict[str, Reflectance]
+    lights: dict[int, Map]
+    lambertian: bool
+
+    def new_view(self, material: str, light: int, view: View) -> Radiance:
+        """A body that was photographed in that light, by another camera."""
+
+    def new_light(self, material: str, light: Map, view: View) -> Radiance:
+        """A body that was photographed, in another light, which is given."""
+
+    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
+        """A body of another material, which is given, in the light of a photo; None where the method has nothing to say."""
+
+
+def in_gauge(
+    materials: Mapping[str, Reflectance], lights: Mapping[int, Map], truths: Truths
+) -> tuple[dict[str, Reflectance], dict[int, Map]]:
+    """Materials times the factor to the truth, lights divided by it: what they show together stays as it is."""
+    factor = factor_of(materials, truths)
+    return {name: times(m, factor) for name, m in materials.items()}, {li: of / factor for li, of in lights.items()}
+
+
+def lambertian_part(materials: Mapping[str, Reflectance]) -> dict[str, Reflectance]:
+    """Without specular parts."""
+    return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
+
+
+class Rendered(msgspec.Struct, frozen=True):
+    """Materials and maps of lights."""
+
+    materials: dict[str, Reflectance]
+    lights: dict[int, Map]
+    lambertian: bool = False
+
+    def new_view(self, material: str, light: int, view: View) -> Radiance:
+        """Recovered material, recovered light."""
+        return Scene(self.lights[light], view).of(self.materials[material])
+
+    def new_light(self, material: str, light: Map, view: View) -> Radiance:
+        """Recovered material, given light."""
+        return Scene(light, view).of(self.materials[material])
+
+    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
+        """Given material, recovered light."""
+        return Scene(self.lights[light], view).of(material)
+
+
+def grey(photos: Photos, truths: Truths) -> Rendered:
+    """Of the photos' mean colours."""
+    radiance, ball = photos.radiance, Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
+    means = {li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights}  # fmt: skip
+    lights = {li: np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3)) for li, colour in means.items()}
+    return Rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths), lambertian=True)
+
+
+# ── projective texturing ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Texture:
+    """Values at the points that a photo sees, to be read from other views."""
+
+    def __init__(self, photo: View):
+        self.photo = photo
+        self._points, self._normals = cKDTree(photo.points), cKDTree(photo.normals)
+
+    def seen(self, view: View) -> Bool[np.ndarray, " n"]:
+        """Which of a view's points the photo sees: those whose normals are turned toward it (the body is convex)."""
+        return view.normals[:, 2] >= self.photo.normals[:, 2].min()
+
+    def at(self, view: View, values: Radiance, unseen: bool = True) -> Radiance:
+        """values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0."""
+        there, colours = self.seen(view), np.zeros((len(view.points), 3))
+        colours[there] = _weighted(self._points, view.points[there], values, BETWEEN)
+        if unseen and not there.all():
+            colours[~there] = _weighted(self._normals, view.normals[~there], values, NEAREST)
+        return colours
+
+
+def _weighted(tree: cKDTree, at: np.ndarray, values: Radiance, count: int) -> Radiance:
+    distance, index = tree.query(at, count)
+    weight = 1 / (distance + 1e-9)
+    return np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
+
+
+class Projective(msgspec.Struct, frozen=True):
+    """Textures by material and light."""
+
+    photos: Photos
+    texture: Texture
+    materials: dict[str, Reflectance] = {}
+    lights: dict[int, Map] = {}
+    lambertian: bool = False
+
+    def new_view(self, material: str, light: int, view: View) -> Radiance:
+        """The photo in that light, carried over."""
+        return self.texture.at(view, self.photos.radiance[material, light])
+
+    def new_light(self, material: str, light: Map, view: View) -> Radiance:
+        """The mean of the material's photos, whatever the light."""
+        photos = [radiance for (name, _), radiance in self.photos.radiance.items() if name == material]
+        return self.texture.at(view, np.mean(photos, axis=0))
+
+    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
+        """A texture knows no light apart from its material."""
+        return None
+
+
+def projective(photos: Photos, truths: Truths) -> Projective:
+    """The photos as textures."""
+    return Projective(photos, Texture(photos.view))
+
+
+# ── intrinsic decomposition ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def harmonics(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 9"]:
+    """The nine real, orthonormal spherical harmonics of degree 0, 1 and 2."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    one, two, three, four = np.sqrt(np.array([1, 3, 15, 5]) / (4 * np.pi))
+    flat = [one * np.ones_like(x), two * y, two * z, two * x, three * x * y, three * y * z]
+    return np.stack([*flat, four * (3 * z * z - 1) / 2, three * x * z, three * (x * x - y * y) / 2], axis=-1)
+
+
+def light_coefficients(light: Map) -> Coefficients:
+    """∫ L Y over the sphere."""
+    size = light.shape[:2]
+    return np.einsum("h,hwk,hwc->kc", lat_long_solid_angles(*size), harmonics(lat_long_directions(*size)), light)
+
+
+def light_map(shading: Coefficients) -> Map:
+    """The light of nine harmonics that shades so; what it has of negative light is cut."""
+    return np.maximum(harmonics(lat_long_directions(ROWS, 2 * ROWS)) @ (shading / LAMBERT[:, None]), 0)
+
+
+class Decomposed(msgspec.Struct, frozen=True):
+    """A photo: shading's coefficients, and each material's albedo, but for one factor per channel between them; highlights [n, 3]."""
+
+    shading: Coefficients
+    albedo: dict[str, Float[np.ndarray, "3"]]
+    highlight: dict[str, Radiance]
+
+
+def decomposed(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radiance]) -> Decomposed:
+    """Decompose one photo; radiance: by material, at the same normals."""
+    basis, image = harmonics(normals), np.stack(list(radiance.values()))
+    weight, albedo = np.ones(image.shape[:2]), np.median(image, axis=1)
+    for _ in range(ITERATIONS):
+        shading = np.stack([_shading(basis, image[..., c], albedo[:, c], weight) for c in range(3)], axis=-1)
+        lit = np.maximum(basis @ shading, DARKEST)
+        albedo = np.einsum("mn,mnc,nc->mc", weight, image, lit) / np.einsum("mn,nc->mc", weight, lit**2)
+        residual = image - albedo[:, None] * lit
+        r = residual.mean(axis=-1)
+        size = np.array([np.median(-row[row < 0]) if (row < 0).any() else 0.0 for row in r])
+        scale = np.maximum(size, LEAST * image.mean(axis=(1, 2)))[:, None]
+        weight = np.where(r > 0, 1 / (1 + (r / scale) ** 2), 1.0)
+    highlight = dict(zip(radiance, np.maximum(residual, 0), strict=True))
+    return Decomposed(shading, dict(zip(radiance, np.maximum(albedo, DARKEST), strict=True)), highlight)
+
+
+def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "9"]:
+    """argmin Σ w (I − a Y·e)² of one channel."""
+    of_pixel = np.einsum("mn,m->n", weight, albedo**2)
+    gram = (basis * of_pixel[:, None]).T @ basis
+    return np.linalg.solve(gram, basis.T @ np.einsum("mn,m,mn->n", weight, albedo, image))
+
+
+def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
+    """exp α by material and exp β by photo, [3] each: a_mi ≈ exp(α_m + β_i)."""
+    names, numbers = sorted({n for p in photos.values() for n in p.albedo}), list(photos)
+    pairs = [(names.index(n), k) for k, p in enumerate(photos.values()) for n in p.albedo]
+    known = np.log([photos[numbers[k]].albedo[names[m]] for m, k in pairs])
+    design = np.zeros((len(pairs), len(names) + len(numbers)))
+    for row, (m, k) in enumerate(pairs):
+        design[row, [m, len(names) + k]] = 1
+    parts = np.exp(np.linalg.lstsq(design, known, rcond=None)[0])
+    return dict(zip(names, parts[: len(names)], strict=True)), dict(zip(numbers, parts[len(names) :], strict=True))
+
+
+class Intrinsic(msgspec.Struct, frozen=True):
+    """Average albedos, each photo's shading, and highlights, which are carried as textures."""
+
+    materials: dict[str, Reflectance]
+    lights: dict[int, Map]
+    shading: dict[int, Coefficients]
+    photos: dict[int, Decomposed]
+    texture: Texture
+    lambertian: bool = True
+
+    def new_view(self, material: str, light: int, view: View) -> Radiance:
+        """Average albedo, the photo's shading there, its highlight where the photo saw the point."""
+        return self._shaded(material, self.shading[light], self.photos[light].highlight[material], view)
+
+    def new_light(self, material: str, light: Map, view: View) -> Radiance:
+        """Average albedo, shading of the new light, the mean highlight of the photos."""
+        highlight = np.mean([p.highlight[material] for p in self.photos.values() if material in p.highlight], axis=0)
+        return self._shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, view)
+
+    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
+        """The light that the shading determines, of nine harmonics, reflected by the given material."""
+        return Scene(self.lights[light], view).of(material)
+
+    def _shaded(self, material: str, shading: Coefficients, highlight: Radiance, view: View) -> Radiance:
+        lit = np.maximum(harmonics(view.normals) @ shading, 0)
+        return np.array(self.materials[material].diffuse) * lit + self.texture.at(view, highlight, unseen=False)
+
+
+def intrinsic(photos: Photos, truths: Truths) -> Intrinsic:
+    """Decompose each photo, average.  Truths count by their Lambertian parts, for it states only those."""
+    normals, radiance = photos.view.normals, photos.radiance
+    parts = {li: decomposed(normals, {n: v for (n, at), v in radiance.items() if at == li}) for li in photos.lights}
+    albedo, scale = averaged(parts)
+    relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
+    factor = factor_of(relative, lambertian_part(truths))
+    shading = {li: part.shading * scale[li] / factor for li, part in parts.items()}
+    materials, lights = (
+        {n: times(m, factor) for n, m in relative.items()},
+        {li: light_map(e) for li, e in shading.items()},
+    )
+    return Intrinsic(materials, lights, shading, parts, Texture(photos.view))

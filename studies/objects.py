@@ -1,0 +1,131 @@
+"""Cases of objects: bodies without symmetry, each turned at random before a camera far away, and perhaps thought to be elsewhere.
+
+The camera is so far that rays are parallel to a third of a degree at most: radiance is of one view direction, by the quadrature that
+spheres have.  Neither shadows nor light between surfaces are rendered, so that what is measured is what wrong geometry does and nothing else.
+
+Pixels     those that both the true body and the one of the perturbed pose and mesh show, as the stage `urm` takes them
+Noise      drawn for each pixel by itself: a perturbation leaves what a pixel shows as it is
+Normals    of the mesh that is given, at the pose that is given: perturbed, or fitted to the outline from there
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from benchmarks.align import shapes
+from factorlib.align.confidence import confidence
+from factorlib.align.refine import FocalPrior, refined
+from factorlib.align.silhouette import Silhouette
+from factorlib.align.state import state_of
+from factorlib.align.target import target_of
+from factorlib.conventions import FRONT, YUP_FROM_CAMERA
+from factorlib.evaluate.ball import Light, ball
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import Caster, rasterise
+from factorlib.meshes.mesh import scaled
+from factorlib.results.materials import Reflectance
+from factorlib.urm.observations import Observations, concatenate
+from studies.spheres import GRAZING, NOISE, table_of
+from studies.study import Case, Objects, light_name
+
+BODIES = ("blob", "jug", "hook")
+SIDE, FILL, FAR = (
+    160,
+    0.9,
+    100.0,
+)  # pixels of a picture; of it, the mesh's diameter; focal length over the picture's side
+CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
+STEPS = 12  # of the fit to the outline
+WINDOW, MARGIN = 200, 0.1  # as the stage `refine` takes them
+
+
+class Observed(msgspec.Struct, frozen=True):
+    """An entry's observations, and the median angle between the normals given and the true ones, degrees."""
+
+    observations: Observations
+    normal_error_deg: float
+
+
+@cache
+def body(name: str, triangles: int | None = None) -> Caster:
+    """A body of one material, or a mesh of few triangles that stands for it."""
+    parts = [(vertices, faces, 1) for vertices, faces, _ in shapes.SHAPES[name]()]
+    if triangles is not None:
+        total = sum(len(faces) for _, faces, _ in parts)
+        parts = [shapes.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
+    return Caster(shapes.mesh_of(parts, name))
+
+
+def body_of(material: int, light: int) -> str:
+    """The name of the body that stands for an entry."""
+    return BODIES[(material + light) % len(BODIES)]
+
+
+def pose_of(whole: Caster, rng: np.random.Generator) -> Pose:
+    """Turned at random, its middle in the middle of the picture, which it fills."""
+    rotation = Rotation.random(rng=rng).as_matrix()
+    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
+    return Pose(rotation, middle - rotation @ whole.centre)
+
+
+def observed(
+    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+) -> dict[str, list[Observed]]:
+    """The entries of each photo, one photo a light, by name."""
+    table = list(materials.values())
+    return {light_name(li): [_entry(case, m, li, table[m], lights[li]) for m, at in case.entries if at == li] for li in case.lights}  # fmt: skip
+
+
+def together(entries: list[Observed]) -> Observations:
+    """A photo's observations.  Pixels of different entries are numbered on."""
+    parts = [each.observations for each in entries]
+    y = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return msgspec.structs.replace(concatenate(parts), y=y)
+
+
+def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> Observed:
+    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), body_of(m, li)
+    truth = pose_of(body(name), rng)
+    true_maps, (mesh, pose) = rasterise(body(name), CAMERA, truth), perturbed(name, truth, how, rng)
+    outline = Silhouette(true_maps.label.astype(np.int16))
+    maps = rasterise(mesh, CAMERA, fitted(mesh, pose, outline) if how.refined else pose)
+    sure = confidence(maps, outline) if how.confidence else np.ones(maps.label.shape)
+    both = (true_maps.label > 0) & (maps.label > 0) & (sure > 0) & (maps.normal @ FRONT > GRAZING)
+    pixels = np.flatnonzero(both.reshape(-1))
+    pixels = np.sort(rng.permutation(pixels)[: how.pixels])
+    true, given = (of.normal.reshape(-1, 3)[pixels] for of in (true_maps, maps))
+    radiance = ball(light, material, true @ YUP_FROM_CAMERA.T)
+    noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
+    labels = np.full(len(pixels), case.materials.index(m))
+    zero = np.zeros(len(pixels), int)
+    table = table_of(case, li, given, radiance * (1 + NOISE * noise), labels, pixels, zero, sure.reshape(-1)[pixels])
+    return Observed(table, angle_deg(true, given))
+
+
+def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
+    """The mesh and the pose that stand for a body whose true pose is `truth`."""
+    whole, mesh = body(name), body(name, how.triangles)
+    if how.larger:
+        mesh = Caster(scaled(mesh.mesh, (1 + how.larger,) * 3))
+    axis, side = (v / np.linalg.norm(v) for v in (rng.normal(size=3), np.append(rng.normal(size=2), 0.0)))
+    rotation = rotation_of_vector(np.radians(how.turned_deg) * axis) @ truth.rotation
+    middle = truth.rotation @ whole.centre + truth.translation + how.shifted * 2 * whole.radius * side
+    return mesh, Pose(rotation, middle - rotation @ (whole.centre * (1 + how.larger)))
+
+
+def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
+    """The pose nearby whose contours lie on those of the mask: how the stages `align` and `refine` end a search."""
+    target, start = target_of(outline, mesh.mesh.labels, WINDOW, MARGIN), state_of(pose, CAMERA, mesh)
+    return refined(mesh, target, CAMERA, start, FocalPrior(CAMERA.focal, 0.0), STEPS).state.pose(mesh)
+
+
+def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"]) -> float:
+    """The median angle between unit vectors, degrees; 180 of none."""
+    cosine = np.clip(np.sum(first * second, axis=1), -1, 1)
+    return float(np.degrees(np.median(np.arccos(cosine)))) if len(cosine) else 180.0

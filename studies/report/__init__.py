@@ -1,1 +1,0 @@
-"""What a study shows: conclusions, tables, figures, the page."""

@@ -1,0 +1,175 @@
+"""What a seed stands for: materials, lights, and spheres of the ones in the others; and what a case observes of them.
+
+Materials  about those of `ABOUT`, each number times exp(.15 · normal).
+Lights     by the project's own generator (`factorlib.generate`): the first of a world is a street by day, the others are rooms.
+           Mean radiance 1.
+Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves: what a solve
+           is judged on is not made by its own approximations.
+Noise      each radiance times 1 + .01 · normal, drawn for each entry by itself, so that an entry that two cases show has
+           the same noise in both.
+Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
+Labels     likewise: the pixel is of one material, its label names another one of the same photo.
+Facets     rendered so: a flat-sided object, whose normals are true but few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.conventions import FRONT, YUP_FROM_CAMERA
+from factorlib.evaluate.ball import Light, ball, ball_normals, light_of_lat_long
+from factorlib.generate.lights import random_light, random_materials
+from factorlib.images.exr import read_rgb_exr
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import Material, look
+from factorlib.urm.observations import Observations
+from studies.study import SEVEN, Case, light_name
+
+ABOUT = dict(
+    zip(
+        SEVEN,
+        (
+            Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+            Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+            Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+            Material((0.6, 0.58, 0.52), (0.04, 0.04, 0.04), 0.7),
+            Material((0.15, 0.1, 0.04), (0.6, 0.45, 0.2), 0.3),
+            Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45),
+            Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38),
+        ),
+        strict=True,
+    )
+)
+SPREAD = 0.15
+GRAZING = 0.15  # n·o below which no pixel is observed
+NOISE = 0.01  # of a radiance
+STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
+CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
+
+
+def materials_of(seed: int, names: Sequence[str] = SEVEN[:5]) -> dict[str, Reflectance]:
+    """The materials of a world by name."""
+    drawn = random_materials(np.random.default_rng([11, seed]), SPREAD, {name: ABOUT[name] for name in names})
+    return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
+
+
+def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "h w 3"]:
+    """Light number `light` of a world, lat-long in the camera's y-up frame, mean radiance 1; the same however many others there are."""
+    rng = np.random.default_rng([12, seed, light])
+    world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
+    lamps = 1 + light % 2 if light else 0  # none: by day
+    radiance = random_light(lamps, world_from_camera, [], rng, rows, spp)
+    return (radiance / radiance.mean()).astype(np.float32)
+
+
+def light_file(seed: int, light: int) -> str:
+    """The name of a light's map in the folder of the step `worlds`."""
+    return f"{seed}-{light}.exr"
+
+
+def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
+    """The maps of lights of a world by number."""
+    return {li: read_rgb_exr(worlds / light_file(seed, li)) for li in lights}
+
+
+def read_lights(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Light]:
+    """The same, ready to be reflected."""
+    return {li: light_of_lat_long(radiance) for li, radiance in read_maps(worlds, seed, lights).items()}
+
+
+def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
+    """Normals in the light's frame of a sphere `size` pixels across, seen orthographically; grazing ones are left out."""
+    normals, _ = ball_normals(size)
+    return normals[normals[:, 2] > GRAZING]
+
+
+def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Normals of the light's frame in the camera's."""
+    return normals @ YUP_FROM_CAMERA.T
+
+
+# ── what a case observes ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def observations_of(
+    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+) -> dict[str, Observations]:
+    """One photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
+    return {light_name(li): _photo(case, li, list(materials.values()), lights[li]) for li in case.lights}
+
+
+def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Light) -> Observations:
+    rows = [m for m, li in case.entries if li == number]
+    normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
+
+    def rng(m: int, what: str) -> np.random.Generator:
+        """The random numbers of an entry."""
+        return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
+
+    exact = [ball(light, materials[m], normals) for m in rows]
+    noisy = [r * (1 + NOISE * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
+    turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
+    others = [index(m) for m in rows]
+    labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]
+    return table_of(case, number, np.concatenate(turned), np.concatenate(noisy), np.concatenate(labels))
+
+
+def table_of(
+    case: Case, light: int, normal: np.ndarray, radiance: np.ndarray, material: np.ndarray, x: np.ndarray | None = None,
+    y: np.ndarray | None = None, confidence: np.ndarray | None = None,
+) -> Observations:  # fmt: skip
+    """Observations of one photo in one light, seen from the front; nothing is clipped.
+
+    normal: camera's frame;  material: numbers among those of the case;  x, y: pixels;  confidence: of normals, which is their weight
+    """
+    n, zero, photo = len(normal), np.zeros(len(normal), int), (light_name(light),)
+    return Observations(
+        normal=normal, view=np.tile(FRONT, (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
+        photo=zero, illumination=zero, x=np.arange(n) if x is None else x, y=zero if y is None else y,
+        weight=np.ones(n) if confidence is None else confidence,
+        materials=tuple(case.material_names), photos=photo, illuminations=photo, confidence=confidence,
+    )  # fmt: skip
+
+
+def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Each normal turned by |N(0, degrees)| toward a random side, at most until it is seen at a grazing angle."""
+    side = np.cross(normals, rng.normal(size=normals.shape))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    angle = np.radians(degrees * np.abs(rng.normal(size=len(normals))))[:, None]
+    turned = np.cos(angle) * normals + np.sin(angle) * side
+    return np.where((turned @ FRONT > GRAZING)[:, None], turned, normals)
+
+
+def mislabelled(
+    n: int, label: int, labels: Sequence[int], share: float, rng: np.random.Generator
+) -> Int[np.ndarray, " n"]:
+    """The label of each pixel: for `share` of them another one of `labels`, where there is any."""
+    others = [other for other in labels if other != label]
+    wrong = rng.random(n) < share
+    return np.where(wrong, rng.choice(others, n), label) if others else np.full(n, label)
+
+
+def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.ndarray, "n 3"]:
+    """Normals of a convex object that shows so many flat faces (`face_normals`).
+
+    Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
+    """
+    if facets is None:
+        return normals
+    faces = face_normals(facets)
+    flat = (1 - CURVED) * faces[(normals @ faces.T).argmax(axis=1)] + CURVED * normals
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    return flat[flat[:, 2] > GRAZING]
+
+
+def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
+    """Normals of faces spread evenly over the cap of n·z > `STEEPEST` about the viewer's z; one face alone looks straight at the viewer."""
+    if facets == 1:
+        return np.array([[0.0, 0.0, 1.0]])
+    z = 1 - (1 - STEEPEST) * (np.arange(facets) + 0.5) / facets
+    turn, radius = np.arange(facets) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=-1)

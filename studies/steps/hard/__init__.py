@@ -1,1 +1,0 @@
-"""Steps of the study of hard cases."""

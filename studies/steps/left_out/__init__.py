@@ -1,1 +1,0 @@
-"""Cases are photos of data/eames: photos and whole once, then for each case solve and score, then conclude."""

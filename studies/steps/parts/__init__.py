@@ -1,1 +1,0 @@
-"""Steps of the study of what each part of the model is worth."""

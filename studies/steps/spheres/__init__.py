@@ -1,1 +1,0 @@
-"""Cases are spheres of some materials in some lights: worlds, then for each case observe, solve and score, then conclude."""

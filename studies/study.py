@@ -1,0 +1,300 @@
+"""What a study says of itself: its size, its cases, its settings and its claims.  Nothing here imports science, for plans are made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import msgspec
+
+NAMES = ("brick", "leaf", "lacquer", "chalk", "gold")  # the materials of every world
+SEVEN = (*NAMES, "tile", "bronze")  # the materials of worlds of objects
+Entry = tuple[int, int]  # a material and a light
+
+
+# ── cases ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Bodies that stand for the entries in place of spheres, and what of each the solve is wrongly told.
+
+    pixels:      the largest number of observations of an entry
+    turned_deg:  rotation about a random axis through the body's middle, degrees
+    shifted:     shift in a random direction of the image, as a share of the mesh's diameter
+    larger:      how much larger the mesh is, as a share of its size
+    triangles:   triangles of the mesh that stands for the body; None: all of its 20,000
+    robust:      whether the solve has its robust loss
+    confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
+    refined:     whether every pose is first fitted to the outline of its mask, from the perturbed pose
+    start:       nothing, or the solution of all photos but the last (the parameter `start` of the stage `solve`)
+    """
+
+    pixels: int
+    turned_deg: float = 0.0
+    shifted: float = 0.0
+    larger: float = 0.0
+    triangles: int | None = None
+    robust: bool = True
+    confidence: bool = True
+    refined: bool = False
+    start: Literal["nothing", "earlier"] = "nothing"
+
+
+class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One set of observations, solved once and compared with the truth of the world that its seed names.
+
+    entries:       observed entries of the matrix of materials × lights
+    size:          pixels across a sphere
+    solve:         parameters of the stage `solve` that differ from their defaults
+    normal_deg:    normals are turned by |N(0, normal_deg)| degrees toward random sides
+    wrong_labels:  share of the pixels whose label names another material of the same photo
+    facets:        faces that an object shows instead of a sphere; None: a sphere
+    objects:       bodies in place of spheres
+    """
+
+    seed: int
+    entries: tuple[Entry, ...]
+    size: int
+    solve: dict[str, Any] = {}
+    normal_deg: float = 0.0
+    wrong_labels: float = 0.0
+    facets: int | None = None
+    objects: Objects | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all materials of the world, in the order of their numbers."""
+        return SEVEN if self.objects else NAMES
+
+    @property
+    def materials(self) -> list[int]:
+        """The numbers of the observed materials, in order."""
+        return sorted({m for m, _ in self.entries})
+
+    @property
+    def material_names(self) -> list[str]:
+        """The names of the observed materials, in the order of their numbers in the observations."""
+        return [self.names[m] for m in self.materials]
+
+    @property
+    def lights(self) -> list[int]:
+        """The numbers of the observed lights, in order."""
+        return sorted({li for _, li in self.entries})
+
+    def names_in(self, light: int) -> list[str]:
+        """The names of the materials that are observed in a light."""
+        return [self.names[m] for m, at in self.entries if at == light]
+
+
+class Comparison(Case, frozen=True, forbid_unknown_fields=True):
+    """The photos that a method sees; `size` is in pixels across a photo.
+
+    pixels, steps:  of Mitsuba's optimisation: pixels across its pictures, and the largest number of its steps
+    """
+
+    method: Literal["ours", "mitsuba", "intrinsic", "projective", "grey"] = "ours"
+    pixels: int = 48
+    steps: int = 2000
+
+
+class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the lights of worlds are made: the seeds, the number of lights of each, rows and samples of their maps."""
+
+    seeds: tuple[int, ...]
+    lights: int
+    rows: int
+    spp: int
+
+
+class Score(msgspec.Struct, frozen=True):
+    """The value of each measure of a case, and what a guess scores that knows mean colours alone (`nulls`)."""
+
+    values: dict[str, float]
+    nulls: dict[str, float] = {}
+
+    def __or__(self, other: Score) -> Score:
+        """The measures of both."""
+        return Score(self.values | other.values, self.nulls | other.nulls)
+
+
+def light_name(light: int) -> str:
+    """The name of an illumination, and of the photo that is in it."""
+    return f"light{light}"
+
+
+def named(lights: Mapping[int, Any]) -> dict[str, Any]:
+    """Lights by their names instead of their numbers."""
+    return {light_name(li): of for li, of in lights.items()}
+
+
+def case_name(setting: str, seed: int) -> str:
+    """The name of a case's files.
+
+    >>> case_name("3x3", 0)
+    '3x3-seed0'
+    """
+    return f"{setting}-seed{seed}"
+
+
+def full_matrix(materials: int, lights: int) -> list[Entry]:
+    """Every material in every light.
+
+    >>> full_matrix(1, 2)
+    [(0, 0), (0, 1)]
+    """
+    return [(m, li) for m in range(materials) for li in range(lights)]
+
+
+# ── scales and settings ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Setting(msgspec.Struct, frozen=True):
+    """One value of what a study varies.
+
+    name:   a word of a-z, 0-9 and -, part of file names;  label: as figures and tables write it
+    case:   the case of a seed; what the study's first step is handed
+    """
+
+    name: str
+    label: str
+    case: Callable[[int], Any]
+
+
+class Scale(msgspec.Struct, frozen=True):
+    """How large a study is: at most `largest` materials and lights; `side` of each where something else is varied."""
+
+    name: Literal["full", "quick"]
+    seeds: tuple[int, ...]
+    largest: int
+    side: int
+    size: int
+    solve: dict[str, Any]
+    light_rows: int = 64
+    light_spp: int = 8
+
+    @property
+    def quick(self) -> bool:
+        """Whether it is the quick scale, which concludes nothing."""
+        return self.name == "quick"
+
+    @property
+    def square(self) -> str:
+        """The name of the setting of all entries of `side` materials in as many lights, unperturbed."""
+        return f"{self.side}x{self.side}"
+
+    def case(self, seed: int, entries: Sequence[Entry], **fields: Any) -> Case:
+        """A case of this size with further `fields` of it."""
+        return Case(seed, tuple(sorted(entries)), self.size, {**self.solve, **fields.pop("solve", {})}, **fields)
+
+    def setting(self, name: str, label: str, entries: Sequence[Entry] | None = None, **fields: Any) -> Setting:
+        """A setting of equal entries for all seeds; None: of `side` materials in as many lights."""
+        entries = full_matrix(self.side, self.side) if entries is None else entries
+        return Setting(name, label, lambda seed: self.case(seed, entries, **fields))
+
+    def matrix(self, materials: int, lights: int) -> Setting:
+        """All entries of so many materials in so many lights."""
+        return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", full_matrix(materials, lights))
+
+    def of_objects(self, name: str, label: str, entries: Sequence[Entry], **fields: Any) -> Setting:
+        """A setting of bodies, about as many observations of each as a sphere has; `fields` of `Objects`."""
+        objects = Objects(round(0.77 * self.size**2), **fields)
+        return Setting(name, label, lambda seed: self.case(seed, entries, objects=objects))
+
+
+FEW_LOBES = {"solver": "few_lobes", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
+FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
+QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, light_rows=32, light_spp=8)
+
+
+# ── claims ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Rise(msgspec.Struct, frozen=True, tag=True):
+    """How much a measure rises from one setting to another, for each of the `per` units that they are apart."""
+
+    start: str
+    end: str
+    per: float
+
+
+class Guess(msgspec.Struct, frozen=True, tag=True):
+    """What a guess that knows mean colours alone scores in a setting: the null of its measure."""
+
+    setting: str
+
+
+Side = str | Rise | Guess  # one side of a comparison; str: a setting
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """A comparison that the study makes: the measure, or its rise, is lower on the side `lower` than on `higher`.
+
+    words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
+    """
+
+    measure: str
+    lower: Side
+    higher: Side
+    words: str
+    paper: bool = True
+
+    @property
+    def settings(self) -> list[str]:
+        """The names of all settings that are compared."""
+        return [name for side in (self.lower, self.higher) for name in settings_of(side)]
+
+
+def own(measure: str, lower: Side, higher: Side, words: str) -> Claim:
+    """A claim of this project, which the paper does not make."""
+    return Claim(measure, lower, higher, words, paper=False)
+
+
+def settings_of(side: Side) -> list[str]:
+    """The names of the settings of one side of a claim."""
+    return [side.start, side.end] if isinstance(side, Rise) else [side.setting if isinstance(side, Guess) else side]
+
+
+class Study(msgspec.Struct, frozen=True):
+    """What is varied and measured.
+
+    paper:     the paper's conclusion;  varied: what is varied, with its unit
+    measures:  those of the figure and the page, the first the main one
+    steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores; none: the study's own module has its `main`
+    lights:    lights that each of its worlds has beyond those of the scale
+    sets:      the data sets that its cases are photos of, as facts of the slice `sets`
+    numbers:   what stands in the place of seeds, where intervals are over something else, which `over` names
+    across:    the measure that stands across in the figure; none: a row for each setting
+    notes:     sentences of a conclusion that are no claims;  answer: to the paper, where no claim can give it
+    pictures:  PNG files by name, with captions, from the scale and the folder of the scores
+    """
+
+    name: str
+    title: str
+    question: str
+    paper: str
+    varied: str
+    measures: tuple[str, ...]
+    settings: Callable[[Scale], list[Setting]]
+    claims: Callable[[Scale], list[Claim]] = lambda scale: []
+    steps: tuple[str, ...] = ("worlds", "observe", "solve", "score")
+    lights: int = 0
+    sets: Callable[[Scale], dict[str, Any]] = lambda scale: {}
+    numbers: Callable[[Scale], tuple[int, ...]] = lambda scale: scale.seeds
+    over: str = "seeds"
+    across: str = ""
+    notes: Callable[[Any], list[str]] = lambda conclusion: []
+    answer: Callable[[Any], str] = lambda conclusion: ""
+    pictures: Callable[[Scale, Any], dict[str, tuple[str, bytes]]] = lambda scale, folder: {}
+
+    @property
+    def module(self) -> str:
+        """The name of the study's own module in `studies.catalogue`."""
+        return self.name.replace("-", "_")
+
+    def worlds(self, scale: Scale) -> World:
+        """The worlds that its cases show, equal for most studies of a scale, so that they are made once."""
+        return World(scale.seeds, scale.largest + self.lights, scale.light_rows, scale.light_spp)
+
+    def cases(self, scale: Scale) -> dict[str, Any]:
+        """All cases by name: settings in order, each with all seeds."""
+        return {case_name(s.name, n): s.case(n) for s in self.settings(scale) for n in self.numbers(scale)}
