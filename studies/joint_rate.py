@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import typer
 
-from benchmarks.markdown import table
-from benchmarks.solve.joint_mitsuba import FLAT
+from benchmarks.tools import table
 from factorlib.errors import InputError
 from studies.catalogue.contents import STUDIES
+from studies.core.baselines.adam import FLAT
 from studies.core.baselines.joint import RATES, Optimised, optimised
 from studies.core.baselines.photos import photographed
 from studies.core.study import FULL

@@ -17,8 +17,7 @@ import msgspec
 import numpy as np
 import typer
 
-from benchmarks.markdown import refresh, table
-from benchmarks.rounded import exact
+from benchmarks.tools import exact, refresh, table
 from factorlib.dataset.schema import LightSlice
 from factorlib.evaluate.ball import Light
 from factorlib.reflection.network import SHIPPED

@@ -12,7 +12,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from benchmarks.markdown import refresh, table
+from benchmarks.tools import refresh, table
 from factorlib.jsonfile import read_json
 from studies.catalogue.contents import STUDIES
 from studies.core.study import FULL, QUICK, Study

@@ -38,7 +38,7 @@ class Row(msgspec.Struct, frozen=True):
         return self.value is not None and COMPARISONS[self.bound.sense](self.value, self.bound.limit)
 
 
-# A quarter beyond the worst of five trained networks × two seeds of the solve (`python -m benchmarks.synthetic_spread`).
+# A quarter beyond the worst of five trained networks × two seeds of the solve.
 SYNTHETIC = (
     Bound("materials.worst_roughness", "≤", 0.040, "", "roughness, worst material"),
     Bound("materials.worst_diffuse", "≤", 0.055, "", "diffuse, worst material and channel, relative"),

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.splits import Split, flat, solved, splits_of, unseen
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.diagnose.answer import Answer
@@ -28,6 +27,7 @@ from studies.core.errors import light_errors, material_errors
 from studies.core.lights import map_of
 from studies.core.part import PARTS, Chairs, Part
 from studies.core.pipeline import run_stages
+from studies.splits import Split, flat, solved, splits_of, unseen
 
 GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
 

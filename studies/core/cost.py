@@ -1,6 +1,6 @@
 """What a solve costs, by the number of its entries: a case is n materials in n lights, solved in a process of its own.
 
-`python -m studies.core.cost <case as JSON>` makes the observations (`benchmarks.solve.scaling`: spheres of 12 × 12 pixels, lights of
+`python -m studies.core.cost <case as JSON>` makes the observations (`tests.scenes.problems.square`: spheres of 12 × 12 pixels, lights of
 six lobes, rendered by the operator that solves, so that only size grows), solves, and prints a `Cost` as JSON.
 
 Time      processor seconds of all threads between the start of the solve and its end, which other work on the machine hardly lengthens.
@@ -51,16 +51,16 @@ def cost_of(case: Sized) -> Cost:
 
 def measured(case: Sized) -> Cost:
     """In this process."""
-    from benchmarks.solve.scaling import problem
     from factorlib.model.problem import JointProblem
     from factorlib.reflection import reflection_operator
     from factorlib.solve.few_lobes.history import Run
     from factorlib.solve.few_lobes.options import FewLobes
     from factorlib.solve.few_lobes.rounds import from_nothing
     from factorlib.solve.few_lobes.solve import few_lobes
+    from tests.scenes.problems import square
 
     operator = reflection_operator("network")
-    joint = JointProblem(problem(case.side, operator, case.seed), operator)
+    joint = JointProblem(square(case.side, operator, case.seed), operator)
     before, start = peak_bytes(), time.process_time()
     few_lobes(joint, from_nothing(case.side), Run(msgspec.convert({**case.solve, "seed": case.seed}, FewLobes)))
     return Cost(time.process_time() - start, before, peak_bytes())

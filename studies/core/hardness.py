@@ -1,7 +1,7 @@
 """What becomes of a hard case: the benchmarks' own measurements, as scores.
 
-operator   `benchmarks.operator.stability`: error of the network's values against quadrature, and rounding of its derivatives in float32
-solve      `benchmarks.solve.hard_cases`: errors of reflectance, of roughness and of re-synthesis, and the largest of these over its bound,
+operator   `benchmarks.operator`: error of the network's values against quadrature, and rounding of its derivatives in float32
+solve      `tests.scenes.hard_cases`: errors of reflectance, of roughness and of re-synthesis, and the largest of these over its bound,
            which the tests of the solve have too; whether the solve says what cannot be determined is tested there
 align      `benchmarks.align`: of a photo of each shape, the share of wrong poses and the median error of normals, where a pose can be
            right; and the share of poses that are wrong, or cannot be right, without any doubt
@@ -23,12 +23,11 @@ def score_of(case: Hard) -> Score:
 
 def operator(case: Hard) -> dict[str, float]:
     """Of the network in float32."""
-    from benchmarks.operator.cases import case as pairs_of
-    from benchmarks.operator.rounding import measures
-    from benchmarks.operator.variants import made
+    from benchmarks.operator import made, measures
+    from tests.scenes.operators import case as pairs_of
 
     float32, float64 = ({f"network {d}": made("network", d)} for d in ("float32", "float64"))
-    found = measures(pairs_of(case.case), float32, float32 | float64, with_reference=True)["network float32"]
+    found = measures(pairs_of(case.case), float32 | float64)["network float32"]
     return {
         "value_error": found["value"],
         "gradient_rounding": found["gradient_rounding"],
@@ -38,7 +37,7 @@ def operator(case: Hard) -> dict[str, float]:
 
 def solve(case: Hard) -> dict[str, float]:
     """With the noise of the seed."""
-    from benchmarks.solve.hard_cases import BOUNDS, CASES, answered
+    from tests.scenes.hard_cases import BOUNDS, CASES, answered
 
     answer, bound = answered(CASES[case.case](case.seed)), BOUNDS[case.case]
     errors = {error: getattr(answer, error) for error in ("k", "roughness", "radiance")}
@@ -51,11 +50,10 @@ def solve(case: Hard) -> dict[str, float]:
 
 def align(case: Hard) -> dict[str, float]:
     """Of a photo of each shape."""
-    from benchmarks.align.cases import RIGHT
-    from benchmarks.align.measure import measured_key
-    from benchmarks.align.shapes import SHAPES
+    from benchmarks.align import RIGHT, measured
+    from tests.scenes.shapes import SHAPES
 
-    rows = [measured_key((case.case, shape, case.seed, 0)) for shape in list(SHAPES)[: case.shapes]]
+    rows = [measured((case.case, shape, case.seed, 0)) for shape in list(SHAPES)[: case.shapes]]
     can_be_right = case.case in RIGHT
     wrong = [row for row in rows if not (can_be_right and row["right"])]
     found = {"undoubted": np.mean([float(row in wrong and not row["doubts"]) for row in rows])}

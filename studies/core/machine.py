@@ -63,7 +63,7 @@ def numbers_of(case: Machine) -> dict[str, float]:
 
 def measured(case: Machine) -> dict[str, float]:
     """In this process."""
-    from benchmarks.numbers import NUMBERS
+    from benchmarks.reference import NUMBERS
     from factorlib.evaluate.table import value_at
     from factorlib.jsonfile import read_json
     from studies.core.pipeline import run_stages

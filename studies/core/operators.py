@@ -1,10 +1,10 @@
 """How far an operator is from the exact reflection, for roughnesses of a band: a case is an operator, a band, and samples of a seed.
 
-median, p95, worst   of |R − S| / (S + E/100), specular, as in docs/operator.md (`benchmarks.operator.errors`), S exact and E the
+median, p95, worst   of |R − S| / (S + E/100), specular, as in docs/operator.md (`benchmarks.operator`), S exact and E the
                      lobe's integral; float32
 rendering            DSSIM of a sphere of k_s = 1 in light of `LOBES` lobes, against the same by `reference`, after the tone map of
                      `factorlib.evaluate.picture`; null: the mean radiance everywhere
-microseconds         processor time of value and gradients, an evaluation (`benchmarks.operator.timing`)
+microseconds         processor time of value and gradients, an evaluation (`benchmarks.operator`)
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from benchmarks.operator.errors import specular_errors
-from benchmarks.operator.timing import LOBES as TIMED
-from benchmarks.operator.timing import point, values_and_gradients
+from benchmarks.operator import LOBES as TIMED
+from benchmarks.operator import point, specular_errors, values_and_gradients
 from factorlib.evaluate.ball import VIEW, ball_normals
 from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.light.lobes import Lobes

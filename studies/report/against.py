@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from benchmarks.figure import COLOURS, LogAxis, dot, line, page, text
 from factorlib.report.plot import log_ticks
 from studies.core.table import Conclusion, Row, Spread
 from studies.report.heads import with_unit
+from studies.svg import COLOURS, LogAxis, dot, line, page, text
 
 WIDTH, HEIGHT, COLUMNS = 380, 290, 2  # of a panel; panels side by side
 LEFT, RIGHT, TOP, BOTTOM = 62, 18, 44, 46

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from benchmarks.figure import COLOURS, LogAxis, dot, line, page, text
 from factorlib.report.plot import log_ticks
 from studies.core.table import Conclusion, Row
 from studies.report.heads import with_unit
+from studies.svg import COLOURS, LogAxis, dot, line, page, text
 
 LABEL, WIDTH, GAP, LINE, HEAD, FOOT = (
     270,

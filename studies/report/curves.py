@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from benchmarks.figure import COLOURS, LogAxis, dot, line, page, path, text
 from factorlib.report.plot import log_ticks
 from studies.core.table import Cell, Conclusion
 from studies.report.heads import with_unit
+from studies.svg import COLOURS, LogAxis, dot, line, page, path, text
 
 WIDTH, HEIGHT, COLUMNS = 380, 250, 2  # of a panel; panels side by side
 LEFT, RIGHT, TOP, BOTTOM = 66, 14, 40, 50

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from benchmarks.figure import COLOURS, SOFT, dot, line, page, path, text
 from factorlib.report.plot import ticks
 from studies.core.table import Cell, Conclusion
 from studies.report.heads import with_unit
+from studies.svg import COLOURS, SOFT, dot, line, page, path, text
 
 WIDTH, HEIGHT, COLUMNS = 380, 230, 2  # of a panel; panels side by side, one alone where labels need the room
 LETTER, TURN = (

@@ -10,7 +10,7 @@ from typing import Any
 import jinja2
 import msgspec
 
-from benchmarks.rounded import exact
+from benchmarks.tools import exact
 from studies.core.measures import MEASURES
 from studies.core.table import Cell, Conclusion, Picture
 from studies.report.heads import with_unit

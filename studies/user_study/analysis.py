@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
-from benchmarks.figure import COLOURS, dot, line, page, text
+from studies.svg import COLOURS, dot, line, page, text
 from studies.user_study.answers import Answers
 
 PAPER, PAPER_ERROR = 0.865, 0.021

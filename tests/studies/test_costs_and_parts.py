@@ -9,9 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.operator import cases as operator_cases
-from benchmarks.solve import hard_cases
-from benchmarks.splits import CHANGES, splits_of
 from factorlib.evaluate.ball import constant_light
 from factorlib.runner.project import LIBRARY
 from factorlib.solve.few_lobes.options import FewLobes
@@ -30,6 +27,8 @@ from studies.report.bars import bars
 from studies.report.best import best
 from studies.report.curves import curves
 from studies.report.tables import answer_to_the_paper
+from studies.splits import CHANGES, splits_of
+from tests.scenes import hard_cases, operators
 
 OWN = ("prior", "network-evaluation", "cost", "speed", "parts", "hard-cases")
 
@@ -48,12 +47,12 @@ def test_settings_have_names_of_their_own_and_claims_compare_them(name, scale):
 
 def test_hard_cases_are_those_of_the_benchmarks():
     assert hard.CASES["solve"] == tuple(hard_cases.CASES)
-    assert hard.CASES["operator"] == tuple(operator_cases.CASES)
+    assert hard.CASES["operator"] == tuple(operators.CASES)
     assert hard.CASES["align"] == operator_free_kinds()
 
 
 def operator_free_kinds():
-    from benchmarks.align.cases import RIGHT, WRONG
+    from benchmarks.align import RIGHT, WRONG
 
     return (*RIGHT, *WRONG)
 

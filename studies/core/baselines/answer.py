@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.solve.clock import Clock
+from benchmarks.tools import Clock
 from factorlib.jsonfile import read_json
 from factorlib.results.materials import Reflectance
 from studies.core.baselines.case import Comparison

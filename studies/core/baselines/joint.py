@@ -1,4 +1,4 @@
-"""Mitsuba's joint optimisation (`benchmarks.solve.joint_mitsuba`) of the same photos: Adam on texels of lights and numbers of materials.
+"""Mitsuba's joint optimisation (`studies.core.baselines.adam`) of the same photos: Adam on texels of lights and numbers of materials.
 
 It knows the body's mesh and place, the camera, which pixels are of which material, and that there is no light that bounces.
 Unknowns, loss and sampling are the benchmark's; here the scene is the body, seen by an orthographic camera, its pictures
@@ -25,8 +25,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.solve.clock import Clock
-from benchmarks.solve.joint_mitsuba import FLAT, ROWS, Joint
+from benchmarks.tools import Clock
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.meshes.ply import write_ply
@@ -34,6 +33,7 @@ from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import MITSUBA_FROM_CAMERA, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 from studies.core.baselines import body, case
+from studies.core.baselines.adam import FLAT, ROWS, Joint
 from studies.core.baselines.photos import Photos
 from studies.core.baselines.scene import Map
 from studies.core.case import light_name

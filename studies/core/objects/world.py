@@ -12,7 +12,6 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.align import shapes
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
@@ -21,6 +20,7 @@ from factorlib.tracing.scene import Material
 from studies.core import world
 from studies.core.case import World
 from studies.core.objects.case import SEVEN
+from tests.scenes import shapes
 
 FURTHER = (Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45), Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38))
 BODIES = ("blob", "jug", "hook")

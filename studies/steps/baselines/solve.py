@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.solve.clock import Clock
+from benchmarks.tools import Clock
 from factorlib.dataset.schema import LightSlice
 from factorlib.jsonfile import write_json
 from factorlib.reflection.network import SHIPPED

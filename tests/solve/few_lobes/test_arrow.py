@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
@@ -17,6 +16,7 @@ from factorlib.solve.few_lobes.iterate import evaluate
 from factorlib.solve.few_lobes.jacobian import fit_loss, fitted, linearise
 from factorlib.solve.few_lobes.step import damped_step
 from factorlib.solve.few_lobes.unknowns import moved_light, moved_point, unknowns
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2

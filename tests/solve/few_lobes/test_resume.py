@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.problem import JointProblem
@@ -16,6 +15,7 @@ from factorlib.solve.few_lobes.rounds import from_nothing
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.resume import Journal
 from factorlib.stage import serial_map
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 OPTIONS = FewLobes(lobes=40, insert=1, rounds=2, iterations=2, polish=6, settle=6, sample=30)
