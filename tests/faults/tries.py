@@ -1,4 +1,4 @@
-"""What a test of faults tried and what was lost by it, for the tables that `python -m benchmarks.faults` makes of it.
+"""What a test of faults tried and what was lost by it, for the tables that `make results ONLY=faults` makes of it.
 
 Where FAULTS_LOG names a file, each test adds lines to it, JSON objects; otherwise nothing is written.
 """
