@@ -47,6 +47,15 @@ HEAD = [
     "after (°)",
     "s",
 ]
+POSED_HEAD = [
+    "case",
+    "photos",
+    "changed: better, worse",
+    "normal error before: median, worst (°)",
+    "after (°)",
+    "of the mesh alone (°)",
+    "s",
+]
 
 
 def measured(shape: str, axis: int, off: float, rough: bool) -> list[str]:
@@ -83,9 +92,8 @@ def solved_materials(photos: list[posed.Photo], operator: Operator) -> Materials
     seen = []
     for k, photo in enumerate(photos):
         maps = rasterise(photo.given, photo.camera, photo.pose)
-        geometry = {f"normal.{a}": maps.normal[..., i] for i, a in enumerate("xyz")} | {
-            f"view.{a}": maps.view[..., i] for i, a in enumerate("xyz")
-        }
+        vectors = {"normal": maps.normal, "view": maps.view}
+        geometry = {f"{name}.{a}": v[..., i] for name, v in vectors.items() for i, a in enumerate("xyz")}
         geometry |= {"label": maps.label, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
@@ -112,19 +120,9 @@ def shading() -> list[list[str]]:
         before, after, mesh, seconds, moved = (np.array(column) for column in zip(*measures, strict=True))
         better, worse = np.sum(moved & (after < before)), np.sum(moved & (after >= before))
         spans = [f"{np.median(errors):.2g}, {errors.max():.2g}" for errors in (before, after)]
-        lines.append(
-            [kind, str(len(moved)), f"{better}, {worse}", *spans, *(f"{np.median(n):.2g}" for n in (mesh, seconds))]
-        )
-    head = [
-        "case",
-        "photos",
-        "changed: better, worse",
-        "normal error before: median, worst (°)",
-        "after (°)",
-        "of the mesh alone (°)",
-        "s",
-    ]
-    return [head, *lines]
+        medians = [f"{np.median(numbers):.2g}" for numbers in (mesh, seconds)]
+        lines.append([kind, str(len(moved)), f"{better}, {worse}", *spans, *medians])
+    return [POSED_HEAD, *lines]
 
 
 def rows() -> Tables:
@@ -133,6 +131,5 @@ def rows() -> Tables:
         title: [HEAD, *(measured(shape, k % 3, off, rough) for k, shape in enumerate(shapes.SHAPES) for off in offs)]
         for title, offs, rough in (("exact", OFF, False), ("rough", ROUGH_OFF, True))
     }
-    return {f"Poses: {SETS} sets of four photos": shading()} | {
-        f"Proportions, {k} meshes": of for k, of in lines.items()
-    }
+    tables = {f"Proportions, {kind} meshes": of for kind, of in lines.items()}
+    return {f"Poses: {SETS} sets of four photos": shading()} | tables

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import psutil
 
 from benchmarks.tools import ROOT, Tables, exact
 from factorlib.errors import InputError
@@ -39,7 +40,6 @@ SETTINGS = (
     "urm.directions=0 solve.solver=few_lobes solve.lobes=12 solve.insert=12 solve.rounds=1 solve.iterations=5 solve.polish=0 "
     "solve.settle=0 solve.sample=400 solve.specular=on"
 )
-TICKS = os.sysconf("SC_CLK_TCK")
 ROLES = {  # word of the command line -> what the process is for; the first that fits
     "dask_scheduler": "scheduler",
     "factorlib.runner.child": "steps",
@@ -79,25 +79,13 @@ class Watch:
 
     def _look_often(self) -> None:
         while not self._over.wait(0.5):
-            for pid in _offspring(os.getpid()):
-                with contextlib.suppress(OSError, ValueError, LookupError):
-                    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-                    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-                    command = Path(f"/proc/{pid}/cmdline").read_text()
+            for process in psutil.Process().children(recursive=True):
+                with contextlib.suppress(psutil.Error, OSError, LookupError):
+                    command, cpu = " ".join(process.cmdline()), process.cpu_times()
+                    status = Path(f"/proc/{process.pid}/status").read_text()
                     role = next((role for word, role in ROLES.items() if word in command), "other")
-                    peak = int(status["VmHWM"].split()[0]) / 1024
-                    self._looks[pid] = role, (int(fields[11]) + int(fields[12])) / TICKS, peak
-
-
-def _offspring(pid: int) -> list[int]:
-    below: dict[int, list[int]] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError, ValueError):
-            below.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
-    pids = [pid]
-    for one in pids:
-        pids += below.get(one, [])
-    return pids[1:]
+                    peak = int(status.partition("VmHWM:")[2].split()[0]) / 1024
+                    self._looks[process.pid] = role, cpu.user + cpu.system, peak
 
 
 class Measured(msgspec.Struct):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 
-# `python -m benchmarks.shipped constants` fits these
+# benchmarks/operator_fit.py of version 0.1.0 fitted these
 REMAINDER = torch.tensor(
     [
         [0.117057442, 0.883729683, -4.79232173, 6.88170859, -3.04039177],
