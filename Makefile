@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long results study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph logs params new compare validate verify $(STAGES): .venv/ready
@@ -40,10 +40,9 @@ test: .venv/ready
 test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
-bench-%: .venv/ready
-	@name="$${GOAL#bench-}"; test -e "benchmarks/$$name.py" || test -e "benchmarks/$$name/__main__.py" || \
-	  { echo "error: there is no benchmark '$$name'; make help names them, and make studies the experiments" >&2; exit 2; }
-	@OMP_NUM_THREADS=1 $(PY) -m "benchmarks.$${GOAL#bench-}"
+# reads ONLY, LIGHTS and REAL from the environment
+results: .venv/ready
+	@OMP_NUM_THREADS=1 $(PY) -m benchmarks.results
 
 # each reads STUDY, QUICK and FORCE from the environment
 study: .venv/ready
@@ -75,12 +74,7 @@ help:
 	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
-	@echo 'make bench-operator                  time and error of the reflection operators, to build/bench/operator'
-	@echo 'make bench-parts DATASETS="…"        what each part of the model is worth on data sets, with few lobes, to build/bench/parts'
-	@echo 'make bench-align                     time, success and error of poses against rendered truth, to build/bench/align'
-	@echo 'make bench-eames_like                data/eames, and sets made alike that no setting was chosen on: captured lights too by $(PY) -m benchmarks.eames_like --lights FOLDER'
-	@echo 'make bench-viewer                    the relighting viewer of a report: error against the pipeline, time of a frame'
-	@echo 'make bench-reference REASON="…"         the numbers of data/synthetic that make test compares with, and README.md, anew'
+	@echo 'make results [ONLY=operator]          measure what docs/results.md shows, all of it (hours) or one section, and write it there'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
 	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
 	@echo 'make data                            make data/ again'

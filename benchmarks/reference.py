@@ -1,9 +1,8 @@
-"""The numbers of data/synthetic that a run must reproduce: `make bench-reference REASON="why they changed"` writes them anew.
+"""The numbers of data/synthetic that a run must reproduce: `python -m benchmarks.reference "why they changed"` writes them anew.
 
-Runs the pipeline on data/synthetic with several seeds of the solve (what is current is not run again) and writes
-tests/regression/synthetic.json: of each number its value with the default seed, how far other seeds lie apart, the tolerance that
-follows, and below them the reasons of all refreshes with what each changed; and the paragraph of README.md that quotes them.
-`make test` runs the default seed and compares.
+It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again) and writes
+tests/regression/synthetic.json: of each number its value with the default seed, its range and deviation over seeds, the tolerance that
+follows, and the reasons of all refreshes with what each changed.  `make test` runs the default seed and compares.
 
 Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's of n − 1 degrees of freedom at 1 − DOUBT / 2: two runs that
              differ by nothing but their seeds lie further apart once in 1 / DOUBT times, a number.  On the processors of
@@ -14,29 +13,27 @@ Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import numpy as np
-import typer
 from scipy.stats import t as student
 
-from benchmarks.markdown import refresh
-from benchmarks.numbers import NUMBERS
+from benchmarks.tools import ROOT, Tables, evaluated
 from factorlib.errors import InputError
-from factorlib.evaluate.table import value_at
+from factorlib.evaluate.table import SYNTHETIC, value_at
 from factorlib.jsonfile import read_json, write_json
-from factorlib.results.metrics import read_metrics
-from factorlib.runner import verbs
-from factorlib.runner.project import LIBRARY, Project, photo_sets
 
-DATASET = "synthetic"
-STORED = LIBRARY / "tests" / "regression" / "synthetic.json"
-SEEDS = 5
-DOUBT = 0.01
-COMMAND = 'make bench-reference REASON="why the numbers changed"'
+DATASET, SEEDS, DOUBT = "synthetic", 5, 0.01
+STORED = ROOT / "tests" / "regression" / "synthetic.json"
+COMMAND = '.venv/bin/python -m benchmarks.reference "why the numbers changed"'
+NUMBERS = {  # dotted path in metrics.json -> meaning
+    **{bound.path: bound.meaning for bound in SYNTHETIC},
+    "materials.mean_roughness": "roughness, mean over materials",
+    "materials.mean_diffuse": "diffuse, mean, relative",
+    "materials.mean_specular": "specular, mean, relative",
+}
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,14 +48,14 @@ class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Refresh(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Why numbers were written anew, and those that became others: path -> [old, new]."""
+    """Why numbers were written anew, and those that became others: path -> (old, new)."""
 
     reason: str
     changed: dict[str, tuple[float, float]]
 
 
 class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All of the file.  numbers: by their dotted path in metrics.json;  refreshes: the newest first."""
+    """The whole file.  numbers: by their dotted path in metrics.json;  refreshes: the newest first."""
 
     dataset: str
     seeds: int
@@ -67,117 +64,75 @@ class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refreshes: list[Refresh]
 
 
-class Difference(msgspec.Struct, frozen=True):
-    """A number that is not what is stored; new: None where it is missing."""
-
-    path: str
-    old: Number
-    new: float | None
-
-    def line(self) -> str:
-        """Old and new, for people.
-
-        >>> Difference("a.b", Number("roughness", 0.01, 0.009, 0.011, 0.001, 0.005), 0.02).line()
-        'roughness: old 0.01, new 0.02, by +0.01, tolerance 0.005 (a.b)'
-        """
-        found = "missing" if self.new is None else f"{self.new:.4g}, by {self.new - self.old.value:+.2g}"
-        return f"{self.old.meaning}: old {self.old.value:.4g}, new {found}, tolerance {self.old.tolerance:.2g} ({self.path})"
-
-
 def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
-    """Of a number whose values with some seeds are these.
+    """The tolerance of a number that has these values with some seeds.
 
     >>> round(tolerance([0.0, 1.0, 2.0, 3.0, 4.0]), 3)
     10.295
     """
-    n = len(values)
-    return float(student.ppf(1 - doubt / 2, n - 1) * np.sqrt(2) * np.std(values, ddof=1))
+    return float(student.ppf(1 - doubt / 2, len(values) - 1) * np.sqrt(2) * np.std(values, ddof=1))
 
 
-def differences(metrics: object, stored: Stored) -> list[Difference]:
-    """The numbers that are further from what is stored than their tolerance, or missing; a better one too, for it has to be stored."""
-    found = [Difference(path, number, value_at(metrics, path)) for path, number in stored.numbers.items()]
-    return [d for d in found if d.new is None or not abs(d.new - d.old.value) <= d.old.tolerance]
+def differences(metrics: object, stored: Stored) -> dict[str, str]:
+    """Path -> a line for people, of each number that is missing or further from the stored one than its tolerance, for better or worse."""
+    lines = {}
+    for path, old in stored.numbers.items():
+        new = value_at(metrics, path)
+        if new is None or not abs(new - old.value) <= old.tolerance:
+            change = "missing" if new is None else f"{new:.4g}, by {new - old.value:+.2g}"
+            lines[path] = f"{old.meaning}: old {old.value:.4g}, new {change}, tolerance {old.tolerance:.2g} ({path})"
+    return lines
 
 
-def complaint(found: Sequence[Difference]) -> str:
-    """What to do about them."""
-    lines = "\n".join(f"  {d.line()}" for d in found)
-    return f"{len(found)} number(s) of data/{DATASET} are not those stored:\n{lines}\nif that is meant, store them: {COMMAND}"
+def complaint(lines: dict[str, str]) -> str:
+    """The differences, and what to do about them."""
+    listed = "\n".join(f"  {line}" for line in lines.values())
+    return f"{len(lines)} number(s) of data/{DATASET} are not those stored:\n{listed}\nif that is meant, store them: {COMMAND}"
 
 
-def read_stored(path: Path = STORED) -> Stored:
+def read_stored() -> Stored:
     """The stored numbers."""
-    return msgspec.convert(read_json(path), Stored)
+    return msgspec.convert(read_json(STORED), Stored)
 
 
 def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored:
-    """From the metrics of all seeds, the default one first.  InputError where a number is missing."""
+    """The numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
     values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
-    for path in (p for p, v in values.items() if None in v):
+    if missing := [path for path, of in values.items() if None in of]:
         raise InputError(
-            "there is no such number", file=Path("metrics.json"), key=path, cure="correct benchmarks/numbers.py"
-        )
+            "there is no such number", file=Path("metrics.json"), key=missing[0], cure="correct NUMBERS in benchmarks/reference.py"
+        )  # fmt: skip
     numbers = {
         p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()
     }
-    old: Mapping[str, Number] = before.numbers if before else {}
+    old = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
-    return Stored(DATASET, len(runs), DOUBT, numbers, [Refresh(reason, changed), *(before.refreshes if before else [])])
+    refreshes = [Refresh(reason, changed), *(before.refreshes if before else [])]
+    return Stored(DATASET, len(runs), DOUBT, numbers, refreshes)
 
 
-def checked(reason: str) -> str:
-    """The reason without blanks around it.  InputError where nothing is left."""
-    if not reason.strip():
+def rows() -> Tables:
+    """The stored numbers, which `make test` holds the pipeline to."""
+    kept = read_stored()
+    lines = [[n.meaning, *(f"{v:.4g}" for v in (n.value, n.low, n.high))] for n in kept.numbers.values()]
+    return {
+        f"Default seed of the solve, and {kept.seeds} seeds": [["number", "default seed", "least", "largest"], *lines]
+    }
+
+
+def main(reason: str) -> None:
+    """Run all seeds, the default one last, so that build/ has it afterwards; write, and print what changed."""
+    if not reason:
         raise InputError("no reason is given", key="reason", cure=COMMAND)
-    return reason.strip()
-
-
-def quoted(found: Stored) -> str:
-    """The paragraph of README.md."""
-
-    def shown(path: str, form: str, scale: float = 1.0) -> str:
-        """A number and its range."""
-        n = found.numbers[path]
-        value, low, high = (
-            (form % (scale * v)).replace("0.", ".", 1 if scale * v < 1 else 0) for v in (n.value, n.low, n.high)
-        )
-        return f"{value} ({low} to {high})"
-
-    return (
-        f"On `data/{found.dataset}` (known answer, exact meshes; the default seed, and the range of {found.seeds} seeds of the solve,\n"
-        f"`python -m benchmarks.reference`): roughness is wrong by {shown('materials.worst_roughness', '%.3f')},\n"
-        f"diffuse by {shown('materials.worst_diffuse', '%.1f', 100)} %, specular by {shown('materials.worst_specular', '%.1f', 100)} %\n"
-        f"of the worst material and channel, after one factor a channel; re-synthesis "
-        f"{shown('resynthesis.worst_psnr_linear_db', '%.1f')} dB linear in\nthe worst photo; balls of the materials in the true light "
-        f"{shown('relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db', '%.1f')} dB."
-    )
-
-
-def run(project: Project, seed: int) -> object:
-    """The metrics of a run of the pipeline with that seed of the solve."""
-    if verbs.make(project, verbs.Wish(DATASET, ["evaluate"], [f"solve.seed={seed}"])) != 0:
-        raise SystemExit(1)
-    return msgspec.to_builtins(read_metrics(project.build / DATASET / "evaluate" / "metrics.json"))
-
-
-def main(
-    reason: Annotated[str, typer.Argument(help="why the numbers changed; it is stored beside them", envvar="REASON")],
-    seeds: Annotated[int, typer.Option(help="of the solve, the default one among them", min=3)] = SEEDS,
-) -> None:
-    """Run all seeds, the default one last, so that build/ shows it afterwards; write, and print what changed."""
-    why, project, before = checked(reason), Project(LIBRARY, photo_sets()), read_stored() if STORED.exists() else None
-    runs = [run(project, seed) for seed in reversed(range(seeds))][::-1]
-    write_json(STORED, found := stored(runs, why, before))
-    refresh(LIBRARY / "README.md", {"synthetic": quoted(found)})
-    print(
-        "\n".join(f"{found.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in found.refreshes[0].changed.items())
-        or "nothing changed"
-    )
+    before = read_stored() if STORED.exists() else None
+    runs = [evaluated(DATASET, SET=f"solve.seed={seed}") for seed in reversed(range(SEEDS))][::-1]
+    write_json(STORED, new := stored(runs, reason, before))
+    changed = [f"{new.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in new.refreshes[0].changed.items()]
+    print("\n".join(changed) or "nothing changed")
 
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        main(" ".join(sys.argv[1:]).strip())
     except InputError as error:
         sys.exit(f"error: {error}")

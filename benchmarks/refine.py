@@ -1,44 +1,30 @@
-"""Whether shading mends poses, and whether it leaves right ones alone: `python -m benchmarks.refine [--sets 4]`.
+"""Whether shading mends poses and leaves right ones alone, and whether contours mend proportions: `make results ONLY=refine`.
 
-A set is four photos that share three materials, each of one object in a light of its own, rendered by the operator itself on
-meshes and poses that are known, with 1 % noise.  What the pipeline has is worse: the poses of all photos are off, and materials
-are solved with the wrong poses before any is refined.
-
-    turned 2–8°     every pose turned about a random axis           as found    by contours from the true pose: right already
-    rough           as found, the mesh coarse and warped by 3 %
-    front/back      a symmetric seat, far away, in two of the photos: its mirror image, seen from the other side, has its outline
+Poses: sets of four photos of `tests/scenes/posed.py`, refined as `refine` does, with materials that were solved with the wrong poses.
+Proportions: photos of a shape with a mesh of it, one axis of which is too long.  Poses and focal lengths are searched with the wrong
+mesh, as `align` does; then factors of the axes are fitted, as `fit_mesh` does.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
+import zlib
 
-import msgspec
 import numpy as np
-import typer
-from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
-from benchmarks.align import shapes
-from factorlib.align.refine import FocalPrior, refined
+from benchmarks.align import FILLS, normal_error_deg, photographed
+from benchmarks.tools import Tables, exacts
+from factorlib.align.proportions import Sighting, proportions
+from factorlib.align.search import find, focal_prior
 from factorlib.align.silhouette import Silhouette
-from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
-from factorlib.generate.chair import chair, labelled
-from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.jsonfile import write_json
-from factorlib.meshes.mesh import Mesh
-from factorlib.model.blocks import Block
-from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light
+from factorlib.meshes.mesh import scaled
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.refine.light import Surfaces
-from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
-from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
 from factorlib.solve.few_lobes.history import Run
@@ -47,114 +33,66 @@ from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
+from tests.scenes import posed, shapes
 
-WIDTH, HEIGHT = 320, 240
-NOISE = 0.01
-TRUE = Materials(
-    np.array([[0.5, 0.12, 0.1], [0.15, 0.4, 0.2], [0.2, 0.22, 0.35]]),
-    np.array([[0.06, 0.06, 0.06], [0.2, 0.2, 0.2], [0.35, 0.33, 0.3]]),
-    np.array([0.6, 0.4, 0.25]),
-)
-OBJECTS = (("chair", (0, 1)), ("jug", (1, 2)), ("blob", (0,)), ("stack", (2,)))  # shape, material of each label
-AMBIGUOUS = (("seat", (2,)), ("jug", (1, 2)), ("chair", (0, 1)), ("seat", (1,)))
-KINDS = ("turned", "as found", "rough", "front/back")
-
-
-class Photo(msgspec.Struct, frozen=True):
-    """What was photographed, and what is had of it: a mesh, a wrong pose, and in front/back the true one as runner-up."""
-
-    shape: str
-    camera: Camera
-    truth: Pose
-    caster: Caster
-    given: Caster
-    channels: dict
-    pose: Pose
-    runner_up: Pose | None
+SETS = 3
+PHOTOS, OFF, ROUGH_OFF = 4, (1.0, 1.1, 1.15), (1.0, 1.12)
+HEAD = [
+    "shape",
+    "axis times",
+    "used",
+    "factors off by at most (%)",
+    "normal error before: median, worst (°)",
+    "after (°)",
+    "s",
+]
+POSED_HEAD = [
+    "case",
+    "photos",
+    "changed: better, worse",
+    "normal error before: median, worst (°)",
+    "after (°)",
+    "of the mesh alone (°)",
+    "s",
+]
 
 
-def mesh_of(shape: str, materials: tuple[int, ...], rough: int | None = None) -> Mesh:
-    """The shape with the set's labels."""
-    if shape == "seat":
-        return labelled({"shell": chair()["shell"]}, {"shell": materials[0] + 1})
-    mesh = shapes.mesh(shape) if rough is None else shapes.rough(shape, rough)
-    return msgspec.structs.replace(mesh, face_label=(np.array(materials) + 1)[mesh.face_label - 1].astype(np.int16))
+def measured(shape: str, axis: int, off: float, rough: bool) -> list[str]:
+    """A line of the table: what is fitted where the mesh's axis of that number is `off` times too long."""
+    rng, factors = np.random.default_rng(zlib.crc32(f"{shape} {axis} {off} {rough}".encode())), np.ones(3)
+    factors[axis] = off
+    true = shapes.mesh(shape)
+    given = scaled(shapes.rough(shape, 0) if rough else true, factors)
+    caster, sightings, truths = Caster(given), [], []
+    for _ in range(PHOTOS):
+        camera, pose, label = photographed(true, rng, rng.uniform(*FILLS))
+        silhouette, prior = Silhouette(label.astype(np.int16)), focal_prior(None, None, camera.width, camera.height)
+        state, target = find(caster, silhouette, camera, prior).state, target_of(silhouette, given.labels, 200, 0.15)
+        sightings.append(Sighting(given, target, state.camera(camera), prior, state))
+        truths.append(rasterise(true, camera, pose))
+    start = time.perf_counter()
+    verdict = proportions(sightings)
+    seconds, wanted = time.perf_counter() - start, 1 / factors / (1 / factors).prod() ** (1 / 3)
+    meshes = (given, [one.state for one in sightings]), (scaled(given, verdict.fitted.factors), verdict.fitted.states)
+    before, after = (
+        [
+            normal_error_deg(truth, rasterise(mesh, state.camera(one.camera), state.pose(mesh)))
+            for truth, one, state in zip(truths, sightings, states, strict=True)
+        ]
+        for mesh, states in meshes
+    )
+    error = float(100 * np.abs(verdict.fitted.factors / wanted - 1).max())
+    errors = [exacts((np.median(of), max(of))) for of in (before, after)]
+    return [shape, f"{off:g}", "yes" if verdict.used else "no", f"{error:.2g}", *errors, f"{seconds:.2g}"]
 
 
-def random_light(rng: np.random.Generator, lobes: int = 40) -> Light:
-    axis = rng.normal(size=(lobes, 3))
-    log_sharpness = rng.uniform(0, 5.5, lobes)
-    weight = rng.lognormal(0, 0.8, (lobes, 1)) * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
-    return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
-
-
-def photographed(kind: str, number: int, rng: np.random.Generator, operator: Operator) -> Photo:
-    shape, materials = (AMBIGUOUS if kind == "front/back" else OBJECTS)[number]
-    caster = Caster(mesh_of(shape, materials))
-    given = Caster(mesh_of(shape, materials, number)) if kind == "rough" else caster
-    flipped = kind == "front/back" and shape == "seat"
-    camera = Camera(WIDTH, HEIGHT, (30.0 if flipped else 1.5) * WIDTH, (WIDTH / 2, HEIGHT / 2))
-    if flipped:  # from a little above, from any side
-        turn, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0.05, 0.4)
-        rotation = rotation_of_vector(np.array([np.pi - tilt, 0, 0])) @ rotation_of_vector(np.array([0, turn, 0]))
-    else:
-        rotation = Rotation.random(rng=rng).as_matrix()
-    middle = np.array([0, 0, 2 * camera.focal * caster.radius / (0.9 * HEIGHT)])
-    truth = Pose(rotation, middle - rotation @ caster.centre)
-    channels = rendered(caster, camera, truth, random_light(rng), rng, operator)
-    silhouette = Silhouette(channels["label"].astype(np.int16))
-    if flipped:
-        mirrored = np.diag([1.0, 1, -1]) @ rotation @ np.diag([-1.0, 1, 1])  # x is the chair's left and right
-        wrong = by_contours(
-            given, silhouette, camera, state_of(Pose(mirrored, middle - mirrored @ given.centre), camera, given)
-        )
-        return Photo(shape, camera, truth, caster, given, channels, wrong.pose(given), truth)
-    by = np.deg2rad(rng.uniform(2, 8)) if kind == "turned" else 0.0
-    turned = rotation_of_vector(by * unit(rng.normal(size=3))) @ rotation
-    start = state_of(Pose(turned, middle - turned @ given.centre), camera, given)
-    pose = (start if kind == "turned" else by_contours(given, silhouette, camera, start)).pose(given)
-    return Photo(shape, camera, truth, caster, given, channels, pose, None)
-
-
-def unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
-
-
-def by_contours(caster: Caster, silhouette: Silhouette, camera: Camera, start: State) -> State:
-    target = target_of(silhouette, caster.mesh.labels, 200, 0.1)
-    return refined(caster, target, camera, start, FocalPrior(camera.focal, 0.0), 12).state
-
-
-def rendered(
-    caster: Caster, camera: Camera, pose: Pose, light: Light, rng: np.random.Generator, operator: Operator
-) -> dict:
-    """The channels that `masks` would write."""
-    maps = rasterise(caster, camera, pose)
-    y, x = np.nonzero(maps.label)
-    order = np.argsort(maps.label[y, x], kind="stable")
-    y, x = y[order], x[order]
-    n, material = len(y), maps.label[y, x] - 1
-    block = Block(
-        "light", ("photo",), 1.0, maps.normal[y, x], maps.view[y, x], np.zeros((n, 3)), np.zeros((n, 3), bool), np.ones((n, 3)),
-        material.astype(int), np.zeros(n, int), np.zeros(n, bool),
-    )  # fmt: skip
-    radiance = Illumination(block, light, TRUE, operator).radiance()
-    picture = np.zeros((HEIGHT, WIDTH, 3))
-    picture[y, x] = radiance / np.quantile(radiance.max(1), 0.99) * 0.9
-    picture += NOISE * rng.normal(size=picture.shape)
-    channels = {c: np.clip(picture[..., k], 0, 1) for k, c in enumerate("RGB")}
-    channels |= {f"clipped.{c}": (picture[..., k] >= 1).astype(float) for k, c in enumerate("RGB")}
-    return channels | {"label": maps.label.astype(float), "valid": np.ones(maps.label.shape)}
-
-
-def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
+def solved_materials(photos: list[posed.Photo], operator: Operator) -> Materials:
     """As the pipeline would, with the poses that are had."""
     seen = []
     for k, photo in enumerate(photos):
         maps = rasterise(photo.given, photo.camera, photo.pose)
-        geometry = {f"normal.{a}": maps.normal[..., i] for i, a in enumerate("xyz")} | {
-            f"view.{a}": maps.view[..., i] for i, a in enumerate("xyz")
-        }
+        vectors = {"normal": maps.normal, "view": maps.view}
+        geometry = {f"{name}.{a}": v[..., i] for name, v in vectors.items() for i, a in enumerate("xyz")}
         geometry |= {"label": maps.label, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
@@ -163,84 +101,34 @@ def solved_materials(photos: list[Photo], operator: Operator) -> Materials:
     return few_lobes(JointProblem(blocks, operator), 3, Run(options)).point.materials
 
 
-def normal_error(photo: Photo, pose: Pose) -> float:
-    """Median angle over the true silhouette where both see the object, degrees."""
-    truth, found = rasterise(photo.caster, photo.camera, photo.truth), rasterise(photo.given, photo.camera, pose)
-    both = (truth.label > 0) & (found.label > 0)
-    return float(
-        np.rad2deg(np.median(np.arccos(np.clip(np.sum(truth.normal[both] * found.normal[both], axis=1), -1, 1))))
-    )
-
-
-def row(kind: str, seed: int, photo: Photo, result: Refined, seconds: float) -> dict:
-    """What is reported of one photo."""
-    errors = {
-        name: normal_error(photo, state.pose(photo.given))
-        for name, state in (("before", result.before), ("after", result.after))
-    }
-    errors["mesh"] = normal_error(photo, photo.truth)
-    verdict = result.settled
-    each = (
-        {
-            name: [
-                *np.round(c.gain(verdict.candidates["found"]), 3).tolist(),
-                round(c.score, 4),
-                round(normal_error(photo, c.state.pose(photo.given)), 2),
-            ]
-            for name, c in verdict.candidates.items()
-        }
-        if verdict
-        else {}
-    )
-    return {"kind": kind, "seed": seed, "shape": photo.shape, **errors, "chosen": verdict and verdict.chosen,
-            "ruled_out": verdict and verdict.ruled_out, "seconds": seconds, "candidates": each}  # fmt: skip
-
-
-def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
-    pixels = pixels_of(photo.channels, [True] * 3, 2400)
-    own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
-    return refined_photo(
-        Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator)
-    )[0]
-
-
-def table(rows: list[dict]) -> str:
-    """One line a kind: of photos changed, how many became better; normal errors before and after."""
-    lines = [
-        "| case | photos | changed: better, worse | normal error before: median, worst (°) | after (°) | of the mesh alone (°) | s |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
-    for kind in dict.fromkeys(row["kind"] for row in rows):
-        of = [row for row in rows if row["kind"] == kind]
-        changed = [row["after"] - row["before"] for row in of if row["chosen"] not in (None, "found")]
-        before, after, mesh, seconds = (
-            np.array([row[name] for row in of]) for name in ("before", "after", "mesh", "seconds")
-        )
-        lines.append(
-            f"| {kind} | {len(of)} | {sum(c < 0 for c in changed)}, {sum(c >= 0 for c in changed)} | {np.median(before):.2g}, {before.max():.2g} "
-            f"| {np.median(after):.2g}, {after.max():.2g} | {np.median(mesh):.2g} | {np.median(seconds):.2g} |"
-        )
-    return "\n".join(lines)
-
-
-def main(
-    sets: int = 2, kinds: str = ",".join(KINDS), true_materials: bool = False, out: Path = Path("build/bench/refine")
-) -> None:
-    operator, rows = reflection_operator("network"), []
-    for kind in kinds.split(","):
-        for seed in range(sets):
-            rng = np.random.default_rng([11, seed, KINDS.index(kind)])
-            photos = [photographed(kind, k, rng, operator) for k in range(4)]
-            materials = TRUE if true_materials else solved_materials(photos, operator)
+def shading() -> list[list[str]]:
+    """One line a kind: of photos that changed, how many became better; normal errors before and after."""
+    operator, lines = reflection_operator("network"), []
+    for kind in posed.KINDS:
+        measures = []
+        for seed in tqdm(range(SETS), desc=kind):
+            rng = np.random.default_rng([11, seed, posed.KINDS.index(kind)])
+            photos = [posed.photographed(kind, k, rng, operator) for k in range(4)]
+            materials = solved_materials(photos, operator)
             for photo in photos:
                 start = time.perf_counter()
-                result = refined_of(photo, materials, operator)
-                rows.append(row(kind, seed, photo, result, time.perf_counter() - start))
-                print(rows[-1], flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "rows.json", rows)
-    print(table(rows))
+                result = posed.refined_of(photo, materials, operator)
+                seconds, moved = time.perf_counter() - start, result.settled and result.settled.chosen != "found"
+                poses = (result.before.pose(photo.given), result.after.pose(photo.given), photo.truth)
+                measures.append((*(posed.normal_error(photo, pose) for pose in poses), seconds, bool(moved)))
+        before, after, mesh, seconds, moved = (np.array(column) for column in zip(*measures, strict=True))
+        better, worse = np.sum(moved & (after < before)), np.sum(moved & (after >= before))
+        spans = [f"{np.median(errors):.2g}, {errors.max():.2g}" for errors in (before, after)]
+        medians = [f"{np.median(numbers):.2g}" for numbers in (mesh, seconds)]
+        lines.append([kind, str(len(moved)), f"{better}, {worse}", *spans, *medians])
+    return [POSED_HEAD, *lines]
 
 
-if __name__ == "__main__":
-    typer.run(main)
+def rows() -> Tables:
+    """Poses by shading, and proportions of exact and of rough meshes, an axis of each too long."""
+    lines = {
+        title: [HEAD, *(measured(shape, k % 3, off, rough) for k, shape in enumerate(shapes.SHAPES) for off in offs)]
+        for title, offs, rough in (("exact", OFF, False), ("rough", ROUGH_OFF, True))
+    }
+    tables = {f"Proportions, {kind} meshes": of for kind, of in lines.items()}
+    return {f"Poses: {SETS} sets of four photos": shading()} | tables

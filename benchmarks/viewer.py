@@ -1,28 +1,38 @@
-"""The report's relighting viewer against the pipeline's own rendering: `make bench-viewer [DATASET=eames]`, from `build/<dataset>`.
+"""The report's relighting viewer against the pipeline's own rendering: `make results ONLY=viewer`, of `build/eames`, in headless Chromium.
 
-Error: balls of every material in every light, drawn by headless Chromium in software, against the reflection operator on the same pixels,
-|shown − rendered| / max over channels of the rendered.  Time: a frame while something moves (`QUICK` samples), waiting for its last pixel;
-the smallest and the median of several, for other programs only ever add to it.
+Error: balls of every material in every light, drawn in software, against the reflection operator on the same pixels,
+|viewer − operator| / max over channels of the operator's.  Time: a frame while something moves (`QUICK` samples), waiting for its last
+pixel; the smallest and the median of several, for other programs only ever add to it.
 """
 
 from __future__ import annotations
 
-import os
+import atexit
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
-from benchmarks.browser import opened
-from benchmarks.markdown import ROOT, refresh, table
+from benchmarks.tools import ROOT, Tables
 from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, read_materials, reflectances
 
+CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+FLAGS = [
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+]  # fmt: skip
 HALF_FIELD = np.radians(15)  # of the viewer's camera
 BACK = 1.04 / np.sin(HALF_FIELD)  # its distance, in radii
 EDGE = 2  # pixels inside the outline that are left out: there a pixel is filled in part
@@ -34,8 +44,33 @@ RADIANCE = """([mesh, photo, chosen, size]) => {
 START = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stops": 0}
 
 
+@cache
+def _browser() -> Any:
+    """One browser a process: Playwright allows no second."""
+    from playwright.sync_api import sync_playwright
+
+    playwright = sync_playwright().start()
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    atexit.register(lambda: (browser.close(), playwright.stop()))
+    return browser
+
+
+@contextmanager
+def opened(file: Path, **context) -> Iterator[tuple[Any, list[str]]]:
+    """The page and a list that gathers what it complains of; context: what Playwright's `new_context` takes."""
+    here = _browser().new_context(**context)
+    page, complaints = here.new_page(), []
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda r: complaints.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+    page.set_default_timeout(120000)  # software draws slowly on a busy machine
+    page.goto(file.resolve().as_uri())
+    yield page, complaints
+    here.close()
+
+
 def shown(
-    page, mesh: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
+    page: Any, mesh: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
 ) -> Float[np.ndarray, "size size 4"]:
     """The viewer's finished picture, radiance and coverage, the uppermost row first.  mesh: −1 is the ball;  view: see START"""
     chosen = {**START, **(view or {}), "material": material}
@@ -59,11 +94,7 @@ def ball_seen(
 
 
 def rendered(
-    light: Lobes,
-    material: Reflectance,
-    normals: Float[np.ndarray, "n 3"],
-    views: Float[np.ndarray, "n 3"],
-    turn: float = 0.0,
+    light: Lobes, material: Reflectance, normals: np.ndarray, views: np.ndarray, turn: float = 0.0
 ) -> Float[np.ndarray, "n 3"]:
     """The same by the reflection operator.  light: in a camera's frame;  turn: of the light about the upright axis, radians"""
     c, s = np.cos(turn), np.sin(turn)
@@ -71,48 +102,35 @@ def rendered(
     return Reflector(reflection_operator("network"), turned, 0.0)(material, normals, views)
 
 
-def error(found: Float[np.ndarray, "n 3"], wanted: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """By pixel."""
-    return np.abs(found - wanted).max(axis=1) / np.maximum(wanted.max(axis=1), 1e-12)
+def error(radiance: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """The error of each pixel."""
+    return np.abs(radiance - true).max(axis=1) / np.maximum(true.max(axis=1), 1e-12)
 
 
-def main(build: Path) -> None:
-    """Print the two tables, and write them into docs/formats.md where they are of data/eames."""
-    materials = reflectances(read_materials(build / "export/materials.json"))
-    lights = read_lobes(build / "export/lobes.parquet")
-    normals, views, inside = ball_seen(0.0, 0.0)
+def rows() -> Tables:
+    """Errors by material, and times of a frame by its size.  InputError without the report or a browser."""
+    build = ROOT / "build/eames"
+    if CHROMIUM is None or not (build / "report/index.html").is_file():
+        raise InputError(
+            "no report, or no Chromium", file=build, cure="make all DATASET=eames; apt-get install chromium"
+        )
+    lights, (normals, views, inside) = read_lobes(build / "export/lobes.parquet"), ball_seen(0.0, 0.0)
     with opened(build / "report/index.html", viewport={"width": 1440, "height": 900}) as (page, _):
-        photos = {
-            p["name"]: p["light"]
-            for p in page.evaluate("viewer.data.photos.map((p) => ({name: p.name, light: p.light}))")
-        }
+        photos = page.evaluate("viewer.data.photos.map((p) => [p.name, p.light])")
         page.evaluate("viewer.canvas.style.width = '64px'")
-        rows = []
-        for material, reflectance in materials.items():
-            errors = np.concatenate([
-                error(shown(page, -1, material, photo)[inside][:, :3], rendered(lights[light], reflectance, normals, views))
-                for photo, light in photos.items()
-            ])  # fmt: skip
-            rows.append(
-                [
-                    material,
-                    f"{reflectance.roughness:.2f}",
-                    *(f"{100 * e:.2f} %" for e in np.percentile(errors, [50, 95, 100])),
-                ]
+        errors, times = [], []
+        for name, material in reflectances(read_materials(build / "export/materials.json")).items():
+            pairs = (
+                (shown(page, -1, name, p)[inside][:, :3], rendered(lights[light], material, normals, views))
+                for p, light in photos
             )
-        errors_of = table(["material", "roughness", "median", "95th percentile", "worst"], rows)
-        print(errors_of, flush=True)
-        times = []
+            quantiles = np.percentile(np.concatenate([error(*pair) for pair in pairs]), [50, 95, 100])
+            errors.append([name, f"{material.roughness:.2f}", *(f"{100 * e:.2f} %" for e in quantiles)])
         for size in (512, 256, 128):
             page.evaluate(f"viewer.seconds(3, {size})")
             seconds = page.evaluate(f"Array.from({{length: {FRAMES}}}, () => viewer.seconds(1, {size}))")
             times.append([f"{size}²", f"{1000 * min(seconds):.0f} ms", f"{1000 * np.median(seconds):.0f} ms"])
-    times_of = table(["pixels", "smallest", "median"], times)
-    print(times_of)
-    if build.name == "eames":
-        text = f"{errors_of}\n\nA frame, of {FRAMES}:\n\n{times_of}"
-        refresh(ROOT / "docs/formats.md", {"viewer": text})
-
-
-if __name__ == "__main__":
-    main(ROOT / "build" / os.environ.get("DATASET", "eames"))
+    return {
+        "Error": [["material", "roughness", "median", "95th percentile", "worst"], *errors],
+        f"A frame, of {FRAMES}": [["pixels", "smallest", "median"], *times],
+    }

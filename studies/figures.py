@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from benchmarks.figure import COLOURS, SOFT, LogAxis, dot, line, page, text
 from factorlib.report.plot import log_ticks, ticks
 from studies.conclusion import MEASURES, Conclusion, Row
+from studies.svg import COLOURS, SOFT, LogAxis, dot, line, page, text
 
 LABEL, WIDTH, GAP, LINE, HEAD, FOOT, COLUMNS = 280, 220, 26, 18, 40, 34, 3  # of rows, pixels; columns side by side
 PANEL, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, KEY = 380, 290, 62, 18, 44, 46, 190  # of one measure against another

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from benchmarks.align import shapes
 from factorlib.align.confidence import confidence
 from factorlib.align.refine import FocalPrior, refined
 from factorlib.align.silhouette import Silhouette
@@ -33,6 +32,7 @@ from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.spheres import GRAZING, NOISE, table_of
 from studies.study import Case, Objects, light_name
+from tests.scenes import shapes
 
 BODIES = ("blob", "jug", "hook")
 SIDE, FILL, FAR = (

@@ -14,8 +14,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.markdown import refresh, table
-from benchmarks.rounded import exact
+from benchmarks.tools import exact, refresh, table
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets

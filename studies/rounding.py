@@ -17,8 +17,7 @@ import msgspec
 import numpy as np
 import typer
 
-from benchmarks.markdown import refresh, table
-from benchmarks.rounded import exact
+from benchmarks.tools import exact, refresh, table
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent

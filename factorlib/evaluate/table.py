@@ -36,7 +36,7 @@ class Row(msgspec.Struct, frozen=True):
         return self.value is not None and sign * self.value <= sign * self.bound.limit
 
 
-# A quarter beyond the worst of five trained networks × two seeds of the solve (`python -m benchmarks.synthetic_spread`).
+# A quarter beyond the worst of five trained networks × two seeds of the solve.
 SPHERE, RMS = "light.mean.channel_per_photo.{}.estimate.rmse", "sphere, of the truth's RMS"
 SYNTHETIC = (
     Bound("materials.worst_roughness", "≤", 0.040, "", "roughness, worst material"),

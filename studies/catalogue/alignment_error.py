@@ -9,7 +9,7 @@ Varied     every object of a set is turned by 0 … 20° about a random axis, sh
 Measured   materials and predictions, on whole spheres; and the median error of the normals that the solve is given.  Renderings are
            of the true normals, of pixels that both the object and what stands for it show.
 
-Poses by shading (the stage `refine`) are not among them: `python -m benchmarks.refine` measures these.
+Poses by shading (the stage `refine`) are not among them: `make results ONLY=refine` measures these.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Cost: how do time and memory grow with the entries of the matrix?
 
-Varied     the full matrix of n materials in n lights, n = 3 … 40 (9 to 1,600 entries), of small spheres (`benchmarks.solve.scaling`), so
+Varied     the full matrix of n materials in n lights, n = 3 … 40 (9 to 1,600 entries), of small spheres (`tests.scenes.problems.square`), so
            that the largest fits in memory and time; with the 6 lobes a light that they are made of, in one round, and as the solver of few
            lobes is by default for the first of them.
 Measured   seconds   of the processor, of all threads between the start of the solve and its end, which other work hardly lengthens
@@ -128,15 +128,15 @@ def measured(seed: int, side: int, solve: dict[str, Any]) -> dict[str, float]:
     """In this process: `side` materials in as many lights; solve: options of the solver that differ from their defaults."""
     import msgspec
 
-    from benchmarks.solve.scaling import problem
     from factorlib.model.problem import JointProblem
     from factorlib.reflection import reflection_operator
     from factorlib.solve.few_lobes.history import Run
     from factorlib.solve.few_lobes.options import FewLobes
     from factorlib.solve.few_lobes.solve import few_lobes
+    from tests.scenes.problems import square
 
     operator = reflection_operator("network")
-    joint = JointProblem(problem(side, operator, seed), operator)
+    joint = JointProblem(square(side, operator, seed), operator)
     before, start = peak_bytes(), time.process_time()
     few_lobes(joint, side, Run(msgspec.convert({**solve, "seed": seed}, FewLobes)))
     seconds, peak = time.process_time() - start, peak_bytes()

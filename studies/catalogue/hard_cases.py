@@ -85,12 +85,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def operator(case: dict[str, Any]) -> dict[str, float]:
     """The network in float32."""
-    from benchmarks.operator.cases import case as pairs_of
-    from benchmarks.operator.rounding import measures
-    from benchmarks.operator.variants import made
+    from benchmarks.operator import made, measures
+    from tests.scenes.operators import case as pairs_of
 
     float32, float64 = ({f"network {d}": made("network", d)} for d in ("float32", "float64"))
-    of = measures(pairs_of(case["name"]), float32, float32 | float64, with_reference=True)["network float32"]
+    of = measures(pairs_of(case["name"]), float32 | float64)["network float32"]
     return {"value_error": of["value"], "gradient_rounding": of["gradient_rounding"], "not_finite": not of["finite"]}
 
 
@@ -98,7 +97,7 @@ def solve(case: dict[str, Any]) -> dict[str, float]:
     """With the noise of the seed."""
     import math
 
-    from benchmarks.solve.hard_cases import BOUNDS, CASES, answered
+    from tests.scenes.hard_cases import BOUNDS, CASES, answered
 
     answer, bound = answered(CASES[case["name"]](case["seed"])), BOUNDS[case["name"]]
     bounds = {e: b for e in ("k", "roughness", "radiance") if (b := getattr(bound, e)) is not None}
@@ -111,11 +110,10 @@ def align(case: dict[str, Any]) -> dict[str, float]:
     """A photo of each shape."""
     from statistics import median
 
-    from benchmarks.align.cases import RIGHT
-    from benchmarks.align.measure import measured_key
-    from benchmarks.align.shapes import SHAPES
+    from benchmarks.align import RIGHT, measured
+    from tests.scenes.shapes import SHAPES
 
-    rows = [measured_key((case["name"], shape, case["seed"], 0)) for shape in list(SHAPES)[: case["shapes"]]]
+    rows = [measured((case["name"], shape, case["seed"], 0)) for shape in list(SHAPES)[: case["shapes"]]]
     can_be_right = case["name"] in RIGHT
     wrong = [row for row in rows if not (can_be_right and row["right"])]
     values = {"undoubted": sum(not row["doubts"] for row in wrong) / len(rows)}

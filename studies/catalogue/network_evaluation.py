@@ -81,9 +81,8 @@ def score_of(seed: int, operator: str, low: float, high: float, samples: int) ->
     import numpy as np
     import torch
 
-    from benchmarks.operator.errors import specular_errors
-    from benchmarks.operator.timing import LOBES as TIMED
-    from benchmarks.operator.timing import point, values_and_gradients
+    from benchmarks.operator import LOBES as TIMED
+    from benchmarks.operator import point, specular_errors, values_and_gradients
     from factorlib.evaluate.ball import VIEW, ball_normals
     from factorlib.evaluate.picture import picture_error, white_of
     from factorlib.reflection import reflection_operator

@@ -2,7 +2,7 @@
 
 Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, how sure normals are, the
            robust loss, and clipping (clipped values taken as they are, or their pixels left out).  Lights are few lobes.
-           Sets of chairs as data/eames, smaller and of other seeds; real ones by `make bench-parts DATASETS=…`.
+           Sets of chairs as data/eames, smaller and of other seeds.
 Measured   a tenth of the sphere's width of mirror cells that no solve has seen, the same whatever is off; materials and lights against
            the truth.
 What cannot be switched off: the gauge.

@@ -115,7 +115,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def measured(case: dict[str, Any]) -> dict[str, float]:
     """The numbers by their path in metrics.json, in this process."""
-    from benchmarks.numbers import NUMBERS
+    from benchmarks.reference import NUMBERS
     from factorlib.evaluate.table import value_at
     from factorlib.jsonfile import read_json
     from stages import align, evaluate, export, masks, render, solve, urm

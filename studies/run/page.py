@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 import msgspec
 
-from benchmarks.markdown import refresh, table
+from benchmarks.tools import refresh, table
 from factorlib.jsonfile import read_json
 from factorlib.runner.project import LIBRARY
 from studies.conclusion import MEASURES, Conclusion

@@ -1,6 +1,6 @@
 """Mitsuba's joint optimisation of the same photos, on the cases that are its own: writes <case>/optimised.json, and <case>/method.json for all.
 
-Adam on texels of lights and numbers of materials (`benchmarks.solve.joint_mitsuba`, which has unknowns, loss and sampling).  It knows the
+Adam on texels of lights and numbers of materials (`studies.steps.adam`, which has unknowns, loss and sampling).  It knows the
 body's mesh and place, the camera, which pixels are of which material, and that there is no light that bounces.  Its pictures are means of
 the photos over squares of pixels.  The seconds that it took are a result of this study; they differ from run to run.
 
@@ -26,7 +26,6 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.solve.joint_mitsuba import FLAT, ROWS, Joint
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
@@ -37,6 +36,7 @@ from factorlib.tracing.scene import MITSUBA_FROM_CAMERA, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 from studies.body import REACH, Map, Photos, View, mesh, read_photos
 from studies.steps import Params
+from studies.steps.adam import FLAT, ROWS, Joint
 from studies.study import Comparison, light_name
 
 log = logging.getLogger("factorlib.studies.optimise")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.splits import flat, solved, splits_of, unseen
 from factorlib.dataset.read import read_dataset
 from factorlib.diagnose.answer import Answer
 from factorlib.evaluate.ball import light_of_lat_long
@@ -20,6 +19,7 @@ from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import read_observations
 from studies.errors import light_errors, map_of, material_errors
+from studies.splits import flat, solved, splits_of, unseen
 from studies.steps import Params
 from studies.study import Score
 
@@ -36,7 +36,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def score_of(how: dict[str, Any], folder: Path, urm: Path) -> Score:
     """Solve what a set shows but for the cells that are asked for, and compare with these and with the truth.
 
-    how: options of `benchmarks.splits.solved`
+    how: options of `studies.splits.solved`
     """
     truth, operator = read_dataset(folder), reflection_operator("network")
     names = list(truth.spec.materials)

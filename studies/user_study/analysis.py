@@ -17,10 +17,10 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from benchmarks.figure import page
 from factorlib.errors import InputError
 from factorlib.reading import read_text
 from studies.figures import Mark, rows_of_marks
+from studies.svg import page
 
 FORMAT = 1
 CURE = "give files as the page saved them (the button “Save answers (JSON)”), or leave this one out"

@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.diagnose.identifiability import tinted_alike
 from factorlib.reflection import reflection_operator
+from tests.scenes.problems import MATERIALS, block, random_light
 
 NAMES = ("a", "b", "c")
 

@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, factor_between
 from factorlib.diagnose.coverage import LARGEST
 from factorlib.diagnose.posterior import MODEL_ERROR, Posterior, in_gauge_of
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.solve.fit import Schedule, fitted
+from tests.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import FREE, PRIOR, begun, photographed
 
 

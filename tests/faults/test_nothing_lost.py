@@ -1,7 +1,7 @@
 """Whatever befalls a run, what was finished is kept and the next run ends in the same bytes.
 
-With real processes and a seed for each try.  `make test` makes a few tries of each fault, `make test-long` all of them,
-which are the numbers of docs/reliability.md (`python -m benchmarks.faults`).
+With real processes and a seed for each try.  `make test` makes a few tries of each fault, `make test-long` all of them, which
+are the numbers of docs/reliability.md (`make results ONLY=faults`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Lines for the tables of docs/reliability.md: what a test of faults tried and what was lost by it."""
+"""Lines for the tables of faults (`make results ONLY=faults`): what a test tried and what was lost by it."""
 
 import json
 import os

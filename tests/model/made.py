@@ -3,12 +3,12 @@
 import msgspec
 import numpy as np
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.light.lobes import lobe_integral
 from factorlib.model.gauge import BRIGHTEST, in_gauge
 from factorlib.model.lights import Light
 from factorlib.model.point import Point
 from factorlib.reflection import reflection_operator
+from tests.scenes.problems import MATERIALS, block, random_light
 
 
 def test_a_lobe_made_sharper_at_its_energy_moves_no_tint():

@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
@@ -16,6 +15,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.urm.observations import Observations, concatenate
 from tests.model.made import OPERATOR, bounced_photos
+from tests.scenes.problems import MATERIALS
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])

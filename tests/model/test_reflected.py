@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.solve.problems import MATERIALS, block
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes, even_cells
@@ -14,6 +13,7 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.reflected import NODES, Reflections, lagrange
 from factorlib.model.responses import diffuse_response, specular_response
+from tests.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
 CELLS, ALL = 60, Loss(1e6)  # no outliers

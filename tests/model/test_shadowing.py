@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, random_light, sphere_normals
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
@@ -13,6 +12,7 @@ from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.urm.observations import Observations
+from tests.scenes.problems import MATERIALS, random_light, sphere_normals
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 NAMES = ("red", "green", "blue")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from benchmarks.refine import KINDS, TRUE, normal_error, photographed
 from factorlib.align.refine import FocalPrior
 from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.align.state import state_of
@@ -13,6 +12,7 @@ from factorlib.refine import descent
 from factorlib.refine.light import Surfaces, pursued_light
 from factorlib.refine.pixels import View, pixels_of
 from factorlib.reflection import reflection_operator
+from tests.scenes.posed import KINDS, TRUE, normal_error, photographed
 
 OPERATOR = reflection_operator("network")
 

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.refine import KINDS, TRUE, normal_error, photographed, refined_of
 from factorlib.align.refine import FocalPrior
 from factorlib.align.silhouette import Silhouette
 from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Scene, refined_photo
 from factorlib.refine.pixels import View, pixels_of
 from factorlib.reflection import reflection_operator
+from tests.scenes.posed import KINDS, TRUE, normal_error, photographed, refined_of
 
 OPERATOR = reflection_operator("network")
 

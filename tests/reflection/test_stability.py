@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.operator import laws
-from benchmarks.operator.cases import ALL, CASES, case, found, gradient_error, value_error
-from benchmarks.operator.variants import made
+from benchmarks.operator import made
 from factorlib.reflection import reflection_operator
+from tests.scenes import operators as laws
+from tests.scenes.operators import ALL, CASES, answers, case, gradient_error, reference_values, value_error
 
 COMPILED, TORCH = (
     reflection_operator("network"),
@@ -22,7 +22,6 @@ FAST = {
     "closed_form": reflection_operator("closed_form"), "network": COMPILED, "network in torch": TORCH,
     "closed_form float64": reflection_operator("closed_form", dtype="float64"), "network float64": reflection_operator("network", dtype="float64"),
 }  # fmt: skip
-REFERENCE = reflection_operator("reference")
 fast = pytest.mark.parametrize("name", FAST)
 single = pytest.mark.parametrize("name", ["closed_form", "network", "network in torch"])
 cases = pytest.mark.parametrize("changed", [*CASES, ALL])
@@ -41,7 +40,7 @@ BRIGHTEST = 1.0  # S of a unit lobe is at most that, exactly: the operators hold
 
 @lru_cache(maxsize=256)
 def answer_of(name: str, changed: str):
-    return found(FAST[name], case(changed))
+    return answers(FAST[name], case(changed))
 
 
 @fast
@@ -76,17 +75,6 @@ def test_the_network_is_near_the_reference(changed):
     for part in true:
         error = (answer.fields[part][some] - true[part]).abs() / (true[part] + given.scale()[some])
         assert error.max() < VALUE.get(changed, 0.08), part
-
-
-def reference_values(given, some) -> dict:
-    n, o, z = given.normal[some], given.view[some], given.axis[some]
-    no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
-    sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
-    with torch.no_grad():
-        return {
-            "diffuse": REFERENCE.diffuse(sharpness, nz)[:, 0],
-            "specular": REFERENCE.specular(roughness, sharpness, no, nz, oz)[:, 0],
-        }
 
 
 # gradients of the call ------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.browser import CHROMIUM, opened
+from benchmarks.viewer import CHROMIUM, opened
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, silent

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.browser import CHROMIUM, opened
-from benchmarks.viewer import ball_seen, error, rendered, shown
+from benchmarks.viewer import CHROMIUM, ball_seen, error, opened, rendered, shown
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf import write_glb

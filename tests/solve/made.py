@@ -3,7 +3,6 @@
 import msgspec
 import numpy as np
 
-from benchmarks.solve.problems import MATERIALS, block
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import PEAK, Light, even_cells
@@ -15,6 +14,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve.fit import Fit, Hyperparameters, field_of, start_of
 from factorlib.solve.marginal import Field
 from factorlib.solve.start import constant_light
+from tests.scenes.problems import MATERIALS, block
 
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()

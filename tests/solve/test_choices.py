@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, factor_between, sphere_normals
 from factorlib.diagnose.identifiability import unlikely_curves
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -20,6 +19,7 @@ from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.urm.observations import Observations
 from tests.model.test_shadowing import bowls, rough_light
+from tests.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)

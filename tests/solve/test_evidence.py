@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.solve.problems import MATERIALS
 from factorlib.model.point import Point
 from factorlib.solve.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
+from tests.scenes.problems import MATERIALS
 from tests.solve.made import photographed
 
 

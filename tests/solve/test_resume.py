@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.problem import JointProblem
@@ -15,6 +14,7 @@ from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.stage import serial_map
+from tests.scenes.problems import MATERIALS, block, random_light
 from tests.solve.made import OPERATOR, PRIOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)

@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, factor_between
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
@@ -17,6 +16,7 @@ from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.solve.warm import from_earlier, known_point, with_decided
+from tests.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40

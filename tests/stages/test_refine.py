@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.refine import TRUE, photographed
 from factorlib.errors import InputError
 from factorlib.images.exr import write_exr
 from factorlib.images.tone import shown
@@ -19,6 +18,7 @@ from factorlib.reflection.network import SHIPPED
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, silent
 from stages import align, refine
+from tests.scenes.posed import TRUE, photographed
 
 OPERATOR = reflection_operator("network")
 NAMES = ["red", "green", "blue"]

@@ -5,7 +5,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, random_light, sphere_normals
 from factorlib.errors import InputError
 from factorlib.geometry.met import BINS, UNMET
 from factorlib.jsonfile import read_json
@@ -19,6 +18,7 @@ from factorlib.solve.evidence import FOR
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
+from tests.scenes.problems import MATERIALS, random_light, sphere_normals
 
 NAMES = ("red", "green", "blue")
 

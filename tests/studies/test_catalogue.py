@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.align.cases import RIGHT, WRONG
-from benchmarks.operator import cases as operator_cases
-from benchmarks.solve import hard_cases as solve_cases
-from benchmarks.splits import CHANGES
+from benchmarks.align import RIGHT, WRONG
 from factorlib.arithmetic import VARIABLES
 from factorlib.evaluate.gauge import connected_components
 from factorlib.runner.closure import Sources
@@ -23,7 +20,10 @@ from studies.catalogue.paper_sets import patterns
 from studies.catalogue.structure import PATTERNS, random
 from studies.conclusion import MEASURES
 from studies.run import STUDIES, sets_of, studies
+from studies.splits import CHANGES
 from studies.study import FULL, QUICK, Case, Objects, light_name
+from tests.scenes import hard_cases as solve_cases
+from tests.scenes import operators as operator_cases
 
 SCALES = pytest.mark.parametrize("scale", [FULL, QUICK], ids=["full", "quick"])
 EVERY = pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))

@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.browser import CHROMIUM, opened
+from benchmarks.viewer import CHROMIUM, opened
 from factorlib.errors import InputError
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
@@ -21,6 +20,7 @@ from factorlib.solve.few_lobes.unknowns import (
     moved_point,
     unknowns,
 )
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2

@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import block, random_light
 from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
@@ -15,6 +14,7 @@ from factorlib.solve.few_lobes.descent import descend
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.solve import few_lobes
+from tests.scenes.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
 MIXED = Materials(

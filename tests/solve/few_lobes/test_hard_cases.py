@@ -6,20 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.hard_cases import (
-    BOUNDS,
-    CASES,
-    FLAT,
-    OPERATOR,
-    ROOMS,
-    Answer,
-    Case,
-    answered,
-    chosen,
-    is_finite,
-    observed,
-    of_random_starts,
-)
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.model.illumination import material_slices
@@ -31,6 +17,19 @@ from factorlib.reflection import reflection_operator
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import write_observations
 from stages import solve as stage
+from tests.scenes.hard_cases import (
+    BOUNDS,
+    CASES,
+    FLAT,
+    OPERATOR,
+    ROOMS,
+    Answer,
+    Case,
+    answered,
+    chosen,
+    observed,
+    of_random_starts,
+)
 
 ONE = "1 material × 1 light"
 
@@ -86,7 +85,7 @@ def numbers(value) -> list[float]:
 @pytest.mark.parametrize("name", CASES)
 def test_the_answer_is_within_its_bound_or_says_why_not(name):
     answer, bound = answered(CASES[name](0)), BOUNDS[name]
-    assert is_finite(answer)
+    assert answer.finite()
     assert answer.radiance <= bound.radiance
     assert bound.k is None or answer.k <= bound.k
     assert bound.roughness is None or answer.roughness <= bound.roughness
@@ -108,7 +107,7 @@ def test_two_equal_materials_come_out_equal():
 
 def test_ten_random_starts_find_one_answer():
     answers = of_random_starts(CASES[ONE](0))
-    assert all(is_finite(a) for a in answers)
+    assert all(a.finite() for a in answers)
     assert sum(a.k < BOUNDS[ONE].k and a.roughness < BOUNDS[ONE].roughness for a in answers) >= 8
 
 

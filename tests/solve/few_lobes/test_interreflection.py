@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
@@ -12,6 +11,7 @@ from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.jacobian import fit_loss, responses, with_light
 from factorlib.solve.few_lobes.normal_equations import energy_equations, normal_equations, with_weights_fitted
 from tests.model.made import OPERATOR, bounced_photos
+from tests.scenes.problems import MATERIALS
 
 LOSS = Loss(robust_scale=3.0, prior=0.0)
 

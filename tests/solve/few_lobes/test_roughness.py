@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.roughness import materials_of_best_roughness, reflectances
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 

@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
@@ -18,6 +17,7 @@ from factorlib.solve.few_lobes.jacobian import fit_loss
 from factorlib.solve.few_lobes.normal_equations import normal_equations
 from factorlib.solve.few_lobes.unknowns import moved_light
 from tests.model.test_shadowing import bowls, rough_light
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=3.0, prior=0.0)

@@ -5,7 +5,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, factor_between, random_light
 from factorlib.model import bounds
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
@@ -16,6 +15,7 @@ from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.rounds import answer_of, chosen_round, gained
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.stage import serial_map
+from tests.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 QUICK = FewLobes(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)

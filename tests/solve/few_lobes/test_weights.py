@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.solve.problems import MATERIALS, block, random_light
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
 from factorlib.reflection import reflection_operator
@@ -16,6 +15,7 @@ from factorlib.solve.few_lobes.normal_equations import (
     normal_equations,
     with_weights_fitted,
 )
+from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=1e6, prior=0.0)

@@ -1,14 +1,13 @@
-"""The generated set: photos of a row of balls, each of one of many materials, in a light of a few lobes.
+"""A large set in little time: photos of a row of balls, each of one of many materials, in a light of a few lobes.
 
-A ball's normals are known in closed form and its radiance is that of the model (`factorlib.reflection`), so a photo takes
-milliseconds.  Materials and lights are linked at random: with 1,000 photos of 5 out of 100 materials, each material stands in
-50 lights.
+A ball's normals are known in closed form and its radiance is that of the model (`factorlib.reflection`), so a photo takes milliseconds.
+Materials and lights are linked at random: with 1,000 photos of 5 out of 100 materials, each material stands in 50 lights.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,13 +21,13 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 from factorlib.reflection import reflection_operator
-from factorlib.reflection.operator import Operator
 
 BALLS, RADIUS, PITCH = 5, 10, 24  # in a photo; pixels; pixels from centre to centre
 FOCAL, DISTANCE = 400.0, 40.0  # a ball of radius 1 there is RADIUS pixels wide
 WIDTH, HEIGHT = PITCH * BALLS, PITCH
 LOBES, SHARPNESS = (3, 12), (2.0, 200.0)  # how many in a light; log-uniform
-GRAZING = 0.2  # n·o of what is labelled: the mesh's silhouette is not the ball's
+GRAZING = 0.2  # least n·o of what is labelled: the mesh's silhouette is not the ball's
+UPRIGHT = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
 class Ball(NamedTuple):
@@ -40,28 +39,40 @@ class Ball(NamedTuple):
 
 
 def write_set(folder: Path, photos: int, materials: int, seed: int = 0) -> None:
-    """dataset.yaml with its photos, masks, mesh and true materials; the same bytes for the same arguments."""
+    """Write dataset.yaml with its photos, masks, mesh and true materials; the same bytes for the same arguments."""
     rng, operator = np.random.default_rng(seed), reflection_operator("network")
     for name in ("photos", "masks", "meshes", "truth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    write_ply(folder / "meshes" / "ball.ply", ball())
+    coarse = trimesh.creation.icosphere(subdivisions=3)
+    corners, faces = np.asarray(coarse.vertices), np.asarray(coarse.faces, dtype=np.int32)
+    write_ply(folder / "meshes" / "ball.ply", Mesh(corners, faces, corners, np.ones(len(faces), dtype=np.int16)))
     names = [f"m{k:03d}" for k in range(materials)]
     true = {name: drawn_material(rng) for name in names}
     shown = [rng.choice(materials, size=min(BALLS, materials), replace=False).tolist() for _ in range(photos)]
-    entries = []
+    entries, balls = [], [ball_at(place) for place in range(BALLS)]
     for number, some in enumerate(shown):
-        photo = f"p{number:06d}"
-        _write_photo(folder, photo, some, [true[names[m]] for m in some], drawn_light(rng), operator)
-        entries.append(_entry(photo, [names[m] for m in some]))
-    meshes = {name: {"file": "meshes/ball.ply", "material": name} for name in names}
+        photo, light = f"p{number:06d}", drawn_light(rng)
+        radiance, label = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH), np.uint8)
+        for place, (ball, m) in enumerate(zip(balls, some)):
+            columns = slice(place * PITCH, (place + 1) * PITCH)
+            with torch.no_grad():
+                radiance[:, columns][ball.inside] = operator(light, true[names[m]], ball.normal, ball.view).numpy()
+            label[:, columns][ball.inside] = m + 1
+        write_photo(folder / "photos" / f"{photo}.exr", radiance)
+        write_labels(folder / "masks" / f"{photo}.png", label)
+        poses = [{"rotation": UPRIGHT, "translation": [centre_of(k), 0.0, DISTANCE]} for k in range(len(some))]
+        objects = [{"name": f"ball{k}", "mesh": names[some[k]], "pose": pose} for k, pose in enumerate(poses)]
+        files = {"image": f"photos/{photo}.exr", "masks": f"masks/{photo}.png"}
+        entries.append({"name": photo, **files, "camera": {"focal_px": FOCAL}, "objects": objects})
     truth = {"materials": {name: msgspec.to_builtins(material) for name, material in true.items()}}
     write_yaml(folder / "truth" / "truth.yaml", truth, "What the photos were made of")
+    meshes = {name: {"file": "meshes/ball.ply", "material": name} for name in names}
     record = {"format": 1, "materials": names, "meshes": meshes, "photos": entries, "truth": "truth/truth.yaml"}
-    write_yaml(folder / "dataset.yaml", record, f"Generated: python -m benchmarks.scale --photos {photos}")
+    write_yaml(folder / "dataset.yaml", record, f"Generated: {photos} photos of {materials} materials, seed {seed}")
 
 
 def drawn_material(rng: np.random.Generator) -> TrueMaterial:
-    """k_d and k_s with k_d + k_s < .9, roughness between .15 and .7."""
+    """A material with k_d + k_s < .9 and roughness between .15 and .7."""
     return TrueMaterial(
         tuple(rng.uniform(0.05, 0.6, 3).tolist()), (float(rng.uniform(0.03, 0.3)),) * 3, float(rng.uniform(0.15, 0.7))
     )
@@ -74,20 +85,8 @@ def drawn_light(rng: np.random.Generator) -> Lobes:
     sharpness = np.exp(rng.uniform(*np.log(SHARPNESS), count))
     sharpness[0] = 0.5
     energy = rng.uniform(0.3, 1.0, (count, 1)) * rng.uniform(0.6, 1.0, (count, 3))
-    return Lobes(
-        axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        sharpness,
-        energy * np.maximum(sharpness, 1.0)[:, None] / count,
-    )
-
-
-def ball() -> Mesh:
-    """The unit ball in 1,280 triangles, with its own normals."""
-    coarse = trimesh.creation.icosphere(subdivisions=3)
-    vertices = np.asarray(coarse.vertices)
-    return Mesh(
-        vertices, np.asarray(coarse.faces, dtype=np.int32), vertices, np.ones(len(coarse.faces), dtype=np.int16)
-    )
+    weight = energy * np.maximum(sharpness, 1.0)[:, None] / count
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), sharpness, weight)
 
 
 def ball_at(place: int) -> Ball:
@@ -106,35 +105,3 @@ def ball_at(place: int) -> Ball:
 def centre_of(place: int) -> float:
     """x of a ball's centre, in radii."""
     return (place - (BALLS - 1) / 2) * PITCH * DISTANCE / FOCAL
-
-
-def _write_photo(
-    folder: Path, name: str, labels: list[int], materials: list[TrueMaterial], light: Lobes, operator: Operator
-) -> None:
-    radiance, label = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH), np.uint8)
-    for place, (number, material) in enumerate(zip(labels, materials, strict=True)):
-        ball, columns = ball_at(place), slice(place * PITCH, (place + 1) * PITCH)
-        with torch.no_grad():
-            radiance[:, columns][ball.inside] = operator(light, material, ball.normal, ball.view).numpy()
-        label[:, columns][ball.inside] = number + 1
-    write_photo(folder / "photos" / f"{name}.exr", radiance)
-    write_labels(folder / "masks" / f"{name}.png", label)
-
-
-def _entry(name: str, materials: list[str]) -> dict[str, Any]:
-    upright = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    objects = [
-        {
-            "name": f"ball{k}",
-            "mesh": material,
-            "pose": {"rotation": upright, "translation": [centre_of(k), 0.0, DISTANCE]},
-        }
-        for k, material in enumerate(materials)
-    ]
-    return {
-        "name": name,
-        "image": f"photos/{name}.exr",
-        "masks": f"masks/{name}.png",
-        "camera": {"focal_px": FOCAL},
-        "objects": objects,
-    }

@@ -8,6 +8,8 @@ Loss       mean squared difference over the picture's peak, all pairs together; 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from factorlib.model.bounds import ROUGHNESS
@@ -67,7 +69,7 @@ class Joint:
             self.optimiser[name] = dr.clip(self.optimiser[name], low, high)
         return losses
 
-    def _set(self, parameters, pair: tuple[str, str]) -> None:
+    def _set(self, parameters: Any, pair: tuple[str, str]) -> None:
         material, light = pair
         parameters["light.data"] = self.optimiser[light]
         parameters["ball.bsdf.bsdf_0.reflectance.value"] = 2 * self.optimiser[f"{material} diffuse"]

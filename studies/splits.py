@@ -1,7 +1,4 @@
-"""Cells of observations that no solve has seen: how a set is split, what may be done to what a solve sees, and how well it predicts the rest.
-
-Used by `benchmarks.parts` on data sets, and by the study of parts on rendered sets of many seeds.
-"""
+"""Cells of mirror directions that no solve has seen: how a set is split, what may be done to what a solve sees, and how well it predicts the rest."""
 
 from __future__ import annotations
 
@@ -9,9 +6,9 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from benchmarks.solve.workers import threaded
+from benchmarks.tools import threaded
 from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -30,6 +27,11 @@ from factorlib.urm.observations import Observations, concatenate
 
 CELL, SHARE, MERGE_DEGREES = 0.1, 0.15, 2.0
 DEFAULT = FewLobes(tolerance=1e-3)
+CHANGES = {  # what is done to the observations that a solve may see
+    "sure": lambda o: msgspec.structs.replace(o, confidence=None, weight=np.ones(len(o), o.weight.dtype)),
+    "unclipped": lambda o: msgspec.structs.replace(o, clipped=np.zeros_like(o.clipped)),
+    "dropped": lambda o: o.take(~o.clipped.any(axis=1)),
+}
 
 
 class Split(msgspec.Struct, frozen=True):
@@ -39,26 +41,8 @@ class Split(msgspec.Struct, frozen=True):
     asked: Block
 
 
-def as_sure(seen: Observations) -> Observations:
-    """All normals are believed alike."""
-    return msgspec.structs.replace(seen, confidence=None, weight=np.ones(len(seen), seen.weight.dtype))
-
-
-def unclipped(seen: Observations) -> Observations:
-    """Clipped values are taken for what they are."""
-    return msgspec.structs.replace(seen, clipped=np.zeros_like(seen.clipped))
-
-
-def dropped(seen: Observations) -> Observations:
-    """Without any pixel of which a channel is clipped."""
-    return seen.take(~seen.clipped.any(axis=1))
-
-
-CHANGES = {"sure": as_sure, "unclipped": unclipped, "dropped": dropped}
-
-
 def splits_of(photos: Sequence[Observations], rotations: Rotations, change: str | None = None) -> list[Split]:
-    """Every light's observations.  change: what is done to those that a solve may see; those asked for are the same whatever is done."""
+    """Every light's observations.  change: of `CHANGES`, to those that a solve may see; those asked for are the same whatever is done."""
     changed = [CHANGES[change](photo) for photo in photos] if change else photos
     whole, seen = (
         blocks_of_observations(concatenate([merge(p, MERGE_DEGREES) for p in of]), Noise(), world_from_camera=rotations)
@@ -80,7 +64,7 @@ def _cells(block: Block) -> Int[np.ndarray, " n"]:
 
 
 def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dict) -> Solution:
-    """With lights of few lobes.  how: options of `FewLobes`, of the loss and of the start, and effects that are off."""
+    """The solution with lights of few lobes.  how: options of `FewLobes`, of the loss and of the start, and effects that are off."""
     how = {key: value for key, value in how.items() if key not in ("seen", "solver")}
     usual = Loss()
     loss = Loss(how.pop("robust_scale", usual.robust_scale), how.pop("prior", usual.prior))
@@ -89,29 +73,31 @@ def solved(blocks: Sequence[Block], materials: int, operator: Operator, how: dic
     return few_lobes(problem, materials, Run(msgspec.structs.replace(DEFAULT, **how)))
 
 
-def shown(solution: Solution, block: Block, operator: Operator) -> Block:
-    """With what the solve took of visibility."""
+def effective(solution: Solution, block: Block, operator: Operator) -> Block:
+    """The block with what the solve took of visibility."""
     return solution.shown(JointProblem([block], operator)).blocks[0]
 
 
-def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> np.ndarray:
+def predicted(solution: Solution, block: Block, light: Light, operator: Operator) -> Float[np.ndarray, "n 3"]:
     """Radiance of a block's observations in a light, by the materials and the model of a solution."""
-    return Illumination(shown(solution, block, operator), light, solution.point.materials, operator).radiance()
+    block = effective(solution, block, operator)
+    return Illumination(block, light, solution.point.materials, operator).radiance()
 
 
-def decibels(of: Block, radiance: np.ndarray, whole: Block) -> float:
-    """PSNR of observations that are not clipped."""
-    error = np.where(of.clipped, 0.0, radiance - of.radiance)
+def decibels(asked: Block, radiance: Float[np.ndarray, "n 3"], whole: Block) -> float:
+    """PSNR of observations that are not clipped; whole: the light's, whose peak counts."""
+    error = np.where(asked.clipped, 0.0, radiance - asked.radiance)
     return -10 * float(np.log10(max(np.mean(error**2), 1e-12) / np.quantile(whole.radiance, 0.999) ** 2))
 
 
 def unseen(splits: Sequence[Split], solution: Solution, operator: Operator) -> list[float]:
-    found = zip(splits, solution.point.lights, strict=True)
-    return [decibels(s.asked, predicted(solution, s.asked, light, operator), s.seen) for s, light in found]
+    """Decibels of each light on the observations that it is asked for."""
+    pairs = zip(splits, solution.point.lights, strict=True)
+    return [decibels(s.asked, predicted(solution, s.asked, light, operator), s.seen) for s, light in pairs]
 
 
 def flat(split: Split) -> float:
-    """Of each material's mean colour in each photo."""
+    """Decibels of each material's mean colour in each photo."""
     guess = np.zeros_like(split.asked.radiance)
     for m, f in {*zip(split.asked.material.tolist(), split.asked.photo.tolist(), strict=True)}:
         of, like = ((b.material == m) & (b.photo == f) for b in (split.asked, split.seen))

@@ -1,11 +1,11 @@
-"""Five shapes without any symmetry, of some 20,000 triangles each, and what a user might have of them.
+"""Five shapes without any symmetry, of some 20,000 triangles each, and coarse, warped copies of them: photographs of them have one right pose.
 
 blob    a smooth body with broad bumps                  hook    a tapering tube along a space curve
 stack   three boxes, each turned and moved, sharp edges
 chair   a chair with one arm: shell 1, legs and arm 2   jug     body 1, handle and spout 2
 
-None looks the same from two sides, but a smooth body of one material and its mirror image have the same outline when seen
-from opposite sides from far away; that is what a mirrored mask of the first three is hard for.
+None looks the same from two sides. But a smooth body of one material and its mirror image have the same outline when seen
+from opposite sides from far away, so a mirrored mask of the first three is hard to tell.
 """
 
 from __future__ import annotations
@@ -26,68 +26,55 @@ from factorlib.meshes.soup import Soup, no_normals
 Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], label
 
 ROWS, COLUMNS = 100, 100
-ROUGH_TRIANGLES, WARP = 500, 0.03  # of the mesh's extent, the largest shift of a vertex
-BOXES = (
-    ((1.0, 0.45, 0.7), (0, 0, 0), 0.0),
-    ((0.55, 0.5, 0.45), (-0.2, 0.42, 0.1), 0.5),
-    ((0.3, 0.6, 0.25), (0.3, 0.3, -0.2), -0.3),
-)
-BODY = (
-    (0.0, 0.5),
-    (0.20, 0.5),
-    (0.22, 0.45),
-    (0.17, 0.34),
-    (0.26, 0.15),
-    (0.34, -0.1),
-    (0.30, -0.34),
-    (0.2, -0.45),
-    (0.0, -0.45),
-)
+ROUGH_TRIANGLES, WARP = 500, 0.03  # WARP: the largest shift of a vertex, in the mesh's extent
+BOXES = (((1.0, 0.45, 0.7), (0, 0, 0), 0.0), ((0.55, 0.5, 0.45), (-0.2, 0.42, 0.1), 0.5),
+         ((0.3, 0.6, 0.25), (0.3, 0.3, -0.2), -0.3))  # size, place, turn about y  # fmt: skip
+BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34, -0.1), (0.30, -0.34), (0.2, -0.45),
+        (0.0, -0.45))  # the jug's profile: radius, y  # fmt: skip
 
 
 def blob() -> list[Part]:
+    """A ball with the bumps of data/synthetic's blob."""
     theta = np.arange(1, ROWS) / ROWS * np.pi
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     sin = np.sin(theta)[:, None]
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
-    poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    top, bottom = poles * _bumpy(poles)[:, None]
-    return [_grid(direction * _bumpy(direction)[..., None], top, bottom, 1)]
 
+    def surface(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        size = np.full(direction.shape[:-1], 0.42)
+        for axis, height, sharpness in BUMPS:
+            size += 0.45 * height * np.exp(sharpness * (direction @ (np.array(axis) / np.linalg.norm(axis)) - 1))
+        return direction * size[..., None]
 
-def _bumpy(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    size = np.full(direction.shape[:-1], 0.42)
-    for axis, height, sharpness in BUMPS:
-        size += 0.45 * height * np.exp(sharpness * (direction @ (np.array(axis) / np.linalg.norm(axis)) - 1))
-    return size
+    top, bottom = surface(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
+    return [_grid(surface(direction), top, bottom, 1)]
 
 
 def hook() -> list[Part]:
+    """A tube whose radius falls from .17 to .06."""
     t = np.linspace(0, 1, ROWS + 1)
-    angle = 4.2 * t**1.3
-    curve = np.stack(
-        [0.5 * np.cos(angle), 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t), (0.5 - 0.3 * t) * np.sin(angle)], axis=1
-    )
+    angle, height = 4.2 * t**1.3, 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t)
+    curve = np.stack([0.5 * np.cos(angle), height, (0.5 - 0.3 * t) * np.sin(angle)], axis=1)
     return [tube(curve, np.interp(t, (0, 0.35, 1), (0.17, 0.11, 0.06)), 1)]
 
 
 def stack() -> list[Part]:
+    """Three boxes."""
     return [_box(np.array(size), np.array(place, float), turn) for size, place, turn in BOXES]
 
 
 def jug() -> list[Part]:
+    """A solid of revolution with a handle on one side and a spout on another."""
     t = np.linspace(0, 1, 24)
     handle = np.stack([0.2 + 0.32 * np.sin(np.pi * t), 0.4 - 0.55 * t, 0 * t], axis=1)
     spout = np.stack([-0.05 * t, 0.02 + 0.4 * t**1.5, 0.2 + 0.36 * t], axis=1)
     body = revolved(np.array(BODY))
-    return [
-        (body.vertices, body.faces, 1),
-        tube(handle, np.full(24, 0.04), 2),
-        tube(spout, np.linspace(0.1, 0.05, 24), 2),
-    ]
+    tubes = tube(handle, np.full(24, 0.04), 2), tube(spout, np.linspace(0.1, 0.05, 24), 2)
+    return [(body.vertices, body.faces, 1), *tubes]
 
 
 def chair() -> list[Part]:
+    """The chair of data/eames, of fewer triangles, with an arm on one side."""
     arm, post = ((0.2, 0.62, -0.2), (0.22, 0.64, 0.15)), ((0.21, 0.43, 0.1), (0.22, 0.66, 0.12))
     rods = [(*dowel(np.array(a), np.array(b), (0.018, 0.02, 0.016), 20, 12), 2) for a, b in (arm, post)]
     return [(*shell(48, 72), 1), (*legs(20, 12), 2), *rods]
@@ -128,11 +115,8 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
             faces.append((quad if sign > 0 else quad[:, ::-1]) + len(vertices) * len(u))
             vertices.append(points)
     cos, sin = np.cos(turn), np.sin(turn)
-    return (
-        np.concatenate(vertices) * size @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) + place,
-        np.concatenate(faces),
-        1,
-    )
+    turned = np.concatenate(vertices) * size @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
+    return turned + place, np.concatenate(faces), 1
 
 
 @cache
@@ -152,7 +136,7 @@ def rough(shape: str, seed: int) -> Mesh:
     rng = np.random.default_rng(seed)
     waves, phases, shifts = rng.normal(0, 4 / extent, (4, 3)), rng.uniform(0, 2 * np.pi, 4), rng.normal(0, 1, (4, 3))
 
-    def field(points):
+    def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return np.sin(points @ waves.T + phases) @ shifts
 
     scale = WARP * extent / np.linalg.norm(field(vertices), axis=1).max()
@@ -160,7 +144,7 @@ def rough(shape: str, seed: int) -> Mesh:
 
 
 def decimated(part: Part, triangles: int) -> Part:
-    """By quadric error metrics (Garland and Heckbert 1997), as Open3D does it."""
+    """The part of about so many triangles, by quadric error metrics (Garland and Heckbert 1997) as Open3D does it."""
     vertices, faces, label = part
     whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
     few = whole.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
@@ -168,6 +152,7 @@ def decimated(part: Part, triangles: int) -> Part:
 
 
 def mesh_of(parts: list[Part], name: str) -> Mesh:
+    """The parts as one mesh; name: what an error calls it."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)
     label = np.repeat([label for _, _, label in parts], [len(faces) for _, faces, _ in parts])

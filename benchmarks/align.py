@@ -1,0 +1,173 @@
+"""Poses against rendered truth: success, doubts, time.  `make results ONLY=align`.
+
+Photographed are the shapes of `tests/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal lengths
+log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without any of these.
+
+    exact      the mesh that was photographed                   rough          500 triangles, warped by 3 %
+    wrong mesh      the mesh of another shape                   wrong mask     a random blot where the object was
+    mirrored mask   left and right exchanged                    tiny mask      the object so far away that some 20 pixels show it
+"""
+
+from __future__ import annotations
+
+import resource
+import zlib
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+from factorlib.align.doubts import doubts
+from jaxtyping import Int
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from benchmarks.tools import Clock, Tables, exacts
+from factorlib.align.place import KnownFocal, ObjectToPlace, placed
+from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
+from factorlib.align.trust import trust_in
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster, Maps, rasterise
+from factorlib.meshes.mesh import Mesh
+from tests.scenes import shapes
+from tests.scenes.shapes import SHAPES
+
+WIDTH, HEIGHT = 640, 480
+FOCALS = (0.8, 2.5)  # of the width
+FILLS, TINY_FILL = (0.5, 0.9), 0.015  # bounding sphere's diameter in the image, of the height
+RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
+RIGHT, WRONG = tuple(RIGHT_DEG), ("wrong mesh", "wrong mask", "mirrored mask", "tiny mask")
+SEEDS, JOBS = 3, 2
+VIEWS = {"exact": 20, "rough": 4} | dict.fromkeys(WRONG, 1)  # photos of each shape and seed
+Key = tuple[str, str, int, int]  # kind, shape, seed, number
+
+
+class Case(NamedTuple):
+    """A photo at a known pose, and what is given of it: a mask with labels [h, w] (0 is background), and a mesh.  truth: what is seen"""
+
+    camera: Camera
+    pose: Pose
+    label: Int[np.ndarray, "h w"]
+    mesh: Mesh
+    truth: Maps
+
+
+def case(kind: str, shape: str, seed: int, number: int) -> Case:
+    """The photo of that kind; the same one for the same arguments."""
+    rng, given = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode())), shape
+    fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
+    camera, pose, label = photographed(shapes.mesh(shape), rng, fill)
+    if kind == "mirrored mask":
+        label = label[:, ::-1]
+    if kind == "wrong mask":
+        label = _blot(label, shapes.mesh(shape).labels, rng)
+    if kind == "wrong mesh":
+        given = str(rng.choice([other for other in SHAPES if other != shape]))
+        label = np.minimum(label, max(shapes.mesh(given).labels))
+    mesh = shapes.rough(given, seed) if kind == "rough" else shapes.mesh(given)
+    truth = rasterise(shapes.mesh(shape), camera, pose)
+    return Case(camera, pose, np.ascontiguousarray(label), mesh, truth)
+
+
+def photographed(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
+    """A camera, a pose that the frame does not cut, and the labels of what is seen."""
+    focal = WIDTH * float(np.exp(rng.uniform(*np.log(FOCALS))))
+    camera = Camera(WIDTH, HEIGHT, focal, (WIDTH / 2, HEIGHT / 2))
+    rotation = Rotation.random(rng=rng).as_matrix()
+    depth = 2 * focal * mesh.radius / (fill * HEIGHT)
+    while True:
+        place = rng.uniform(-0.5, 0.5, 2) * (WIDTH, HEIGHT) / focal
+        pose = Pose(rotation, depth * np.array([*place, 1.0]) - rotation @ mesh.centre)
+        label = rasterise(mesh, camera, pose).label
+        if label.any() and not any(rim.any() for rim in (label[:2], label[-2:], label[:, :2], label[:, -2:])):
+            return camera, pose, label
+
+
+def _blot(label: np.ndarray, labels: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """A star-shaped region of about the mask's area about its middle, with a straight border between its materials."""
+    rows, columns = np.nonzero(label)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    y, x = y - rows.mean(), x - columns.mean()
+    angle, order = np.arctan2(y, x), np.arange(1, 6)[:, None, None]
+    height, phase = rng.normal(0, 0.35, (5, 1, 1)), rng.uniform(0, 6.3, (5, 1, 1))
+    wave = np.sum(height / order**0.5 * np.sin(order * angle + phase), axis=0)
+    inside = np.hypot(x, y) < np.sqrt(len(rows) / np.pi) * np.exp(wave)
+    turn = rng.uniform(0, 2 * np.pi)
+    return np.where(inside, np.where(np.cos(turn) * x + np.sin(turn) * y > 0, labels[-1], labels[0]), 0)
+
+
+def measured(key: Key) -> dict:
+    """Seconds of the search, memory (the most that the process held so far), doubts and, where a pose can be right, errors of normals."""
+    kind, given = key[0], case(*key)
+    caster = Caster(given.mesh)
+    truth, blind, clock = given.truth, Camera(WIDTH, HEIGHT, 1.0, given.camera.centre), Clock()
+    silhouette = silhouette_of_object({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
+    obj = ObjectToPlace("object", caster, silhouette)
+    result = placed([obj], blind, KnownFocal(), " ".join(map(str, key)))
+    seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(obj, result, 0)
+    taken, megabytes = clock.taken(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    fit = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
+    row = {"kind": kind, "shape": key[1], "wall_s": taken.wall, "processor_s": taken.processor, "memory_mb": megabytes,
+           "doubts": doubts(*fit, trust, result.found[0])}  # fmt: skip
+    if kind in RIGHT_DEG:
+        row["normal_error_deg"] = normal_error_deg(truth, seen)
+        row["of_the_mesh_deg"] = normal_error_deg(truth, rasterise(caster, given.camera, given.pose))
+        row["right"] = row["normal_error_deg"] <= RIGHT_DEG[kind]
+    return row
+
+
+def normal_error_deg(truth: Maps, found: Maps) -> float:
+    """Median angle between normals over the true mask; a pixel without the found mesh counts as 180°."""
+    cosine = np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)
+    return float(np.median(np.where(found.label > 0, np.rad2deg(np.arccos(cosine)), 180.0)[truth.label > 0]))
+
+
+def share(flags: list[bool]) -> str:
+    """How many of the flags are set.
+
+    >>> share([True, False]), share([])
+    ('1 of 2', '–')
+    """
+    return f"{sum(flags)} of {len(flags)}" if flags else "–"
+
+
+def rows() -> Tables:
+    """Success by kind and shape, doubts about what was provoked, time and memory by kind."""
+    keys = [(k, shape, s, n) for k in VIEWS for s in range(SEEDS) for shape in SHAPES for n in range(VIEWS[k])]
+    with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
+        return tables_of(list(tqdm(pool.map(measured, keys), total=len(keys), desc="poses")))
+
+
+def tables_of(measures: list[dict]) -> Tables:
+    """The tables of all photos that were measured."""
+
+    def doubted(of: list[dict]) -> str:
+        """How many of these are."""
+        return share([bool(row["doubts"]) for row in of])
+
+    def quantiles(of: list[dict], measure: str, *levels: float) -> str:
+        """Of a measure."""
+        return exacts(np.quantile([row[measure] for row in of], levels))
+
+    success, flags, times = [], [], []
+    for kind, shape in ((kind, shape) for kind in RIGHT for shape in (*SHAPES, "all")):
+        if of := [row for row in measures if row["kind"] == kind and shape in (row["shape"], "all")]:
+            right, wrong = ([row for row in of if row["right"] is is_right] for is_right in (True, False))
+            errors = quantiles(of, "normal_error_deg", 0.5, 0.9, 1), quantiles(of, "of_the_mesh_deg", 0.5)
+            cells = share([row["right"] for row in of]), *errors, doubted(right), doubted(wrong)
+            success.append([f"{kind}, {shape}", *cells])
+    for kind in (*WRONG, "all"):
+        of = [row for row in measures if row["kind"] == kind or (kind == "all" and row["kind"] in WRONG)]
+        flags.append([kind, doubted(of), *(doubted([row for row in of if row["shape"] == s]) for s in SHAPES)])
+    for kind in VIEWS:
+        if of := [row for row in measures if row["kind"] == kind]:
+            seconds = [quantiles(of, measure, 0.5, 1) for measure in ("processor_s", "wall_s")]
+            times.append([kind, *seconds, f"{max(row['memory_mb'] for row in of):.0f}"])
+    of_errors = "right (≤ 2°, rough ≤ 6°)|normal error: median, 90 %, worst (°)|of the mesh alone (°)"
+    return {
+        "Success": [["case", *of_errors.split("|"), "right but flagged", "wrong and flagged"], *success],
+        "Provoked failures": [["provoked", "flagged", *SHAPES], *flags],
+        "From mask to pose with all that says how far to believe it, 640×480": [
+            ["case", "processor: median, worst (s)", "wall: median, worst (s)", "memory (MB)"], *times,
+        ],
+    }  # fmt: skip

@@ -1,0 +1,260 @@
+"""Time, error and stability of every reflection operator: `make results ONLY=operator`.
+
+Error      of values |R − S| / (S + E/100), of gradients |∂R − ∂S| / (|∂S| + S + E/100); S by quadrature, E the lobe's integral
+Time       of one evaluation, that is, one observation and one lobe, diffuse and specular: processor time of one thread, the operators in
+           turn within each repeat, so that whatever else the machine does falls on all of them; the least and the median of the repeats.
+           Ratios between operators hold; absolute times are the machine's.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+
+from benchmarks.tools import Tables, exact
+from factorlib.errors import InputError
+from factorlib.reflection import Operator, reflection_operator
+from factorlib.reflection.accuracy import QUANTILES, diffuse_table, quantiles, specular_table
+from factorlib.reflection.lobe import lobe_integral
+from factorlib.reflection.operator import NAMES
+from factorlib.reflection.reference import Reference
+from factorlib.reflection.samples import DiffuseSamples, Samples, diffuse_samples, specular_inputs, specular_samples
+from tests.scenes import operators as laws
+
+REFERENCE, FAST = "reference", [name for name in NAMES if name != "reference"]
+TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, REFERENCE: 1e-7}
+SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}
+INPUTS = ("roughness", "sharpness", "cosine of the view", "degrees from the mirror direction")
+SAMPLES, GRADIENTS = 16384, 512
+LOBES, REPEATS = 64, 7
+
+# ── The operators as they can be run ─────────────────────────────────────────────────────────────────────────────────
+
+
+def made(name: str, dtype: str, *, compiled: bool = True) -> Operator | None:
+    """The operator in this precision; None where there is no such one, or nothing of it is compiled to leave out."""
+    with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
+        try:
+            operator = reflection_operator(name, dtype=dtype)
+        except InputError:
+            return None
+    return operator if compiled or hasattr(operator, "fused") else None
+
+
+def variants() -> dict[str, Operator]:
+    """Fast operators by label, e.g. "network float32"; "network float32 torch" is its torch path where C is there too."""
+    operators: dict[str, Operator | None] = {}
+    for name in FAST:
+        operators |= {f"{name} {dtype}": made(name, dtype) for dtype in ("float32", "float64")}
+        if any(getattr(operators[f"{name} float32"], "fused", {}).values()):
+            operators[f"{name} float32 torch"] = made(name, "float32", compiled=False)
+    return {label: operator for label, operator in operators.items() if operator is not None}
+
+
+def in_bfloat16(name: str) -> Operator:
+    """The operator in bfloat16, which `reflection_operator` does not offer: formulas in torch, weights and inputs rounded to it."""
+    operator = made(name, "float64")
+    operator.dtype = torch.bfloat16
+    if hasattr(operator, "layers"):
+        operator.layers = {part: layers.to(torch.bfloat16) for part, layers in operator.layers.items()}
+    return operator
+
+
+def label_of(label: str) -> str:
+    """The label as tables have it."""
+    return label.replace("_", " ").replace("float", "f")
+
+
+# ── Errors ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def specular_errors(operator: Operator, samples: Samples) -> dict:
+    """Quantiles of the error over all samples, and by roughness, sharpness, cosine of the view and angle from the mirror direction."""
+    a, lam, no, nz, oz = (t.to(operator.dtype) for t in samples.inputs())
+    with torch.no_grad():
+        value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
+    error = (value - samples.value) / samples.scale()
+    return _of_finite(lambda some: specular_table(error[some], *(t[some] for t in samples.inputs())), value)
+
+
+def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
+    """Quantiles of the error over all samples, and by sharpness and the lobe's angle from the normal."""
+    sharpness, nz = (t[:, None].to(operator.dtype) for t in (samples.sharpness, samples.nz))
+    with torch.no_grad():
+        value = operator.diffuse(sharpness, nz)[:, 0].double()
+    error = (value - samples.value) / samples.scale()
+    return _of_finite(lambda some: diffuse_table(error[some], samples.sharpness[some], samples.nz[some]), value)
+
+
+def _of_finite(table: Callable[[Tensor], dict], value: Tensor) -> dict:
+    """The table of the samples whose value is finite, and how many are not, if any."""
+    some = value.isfinite()
+    return (table(some) if some.any() else {}) | ({} if some.all() else {"not finite": int((~some).sum())})
+
+
+def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
+    """Quantiles of the error by input; true: `gradients` of the reference."""
+    scale = true[0] + lobe_integral(specular_inputs(GRADIENTS, 5)[1]) / 100
+    errors = [(a - b) / (b.abs() + scale) for a, b in zip(gradients(operator)[1:], true[1:], strict=True)]
+    return {
+        name: _of_finite(lambda some, e=error: quantiles(e[some]), error)
+        for name, error in zip(SLOPES, errors, strict=True)
+    }
+
+
+def gradients(operator: Operator) -> list[Tensor]:
+    """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
+    alpha, sharpness, no, nz, oz = specular_inputs(GRADIENTS, 5)
+    inputs = (alpha.sqrt(), sharpness.log(), no, nz, oz)
+    leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in inputs]
+    value = operator.specular(leaves[0], leaves[1].exp(), *leaves[2:])
+    return [t.detach()[:, 0].double() for t in (value, *torch.autograd.grad(value.sum(), leaves))]
+
+
+# ── Time ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def point(operator: Operator, count: int) -> tuple[Tensor, ...]:
+    """Roughness, λ, n·o, n·z, o·z of random points under `LOBES` lobes of sharpness .3 to 3000."""
+    g = torch.Generator().manual_seed(0)
+    n, o, z = (
+        torch.nn.functional.normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1)
+        for k in (count, count, LOBES)
+    )
+    o = torch.where(((n * o).sum(1) > 0)[:, None], o, -o)
+    inputs = (torch.tensor(0.4), torch.logspace(-0.5, 3.5, LOBES), (n * o).sum(1), n @ z.T, o @ z.T)
+    return tuple(t.to(operator.dtype) for t in inputs)
+
+
+def values(operator: Operator, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> None:
+    """Compute values alone."""
+    with torch.no_grad():
+        operator.diffuse(sharpness, nz)
+        operator.specular(roughness, sharpness, no, nz, oz)
+
+
+def values_and_gradients(operator: Operator, *inputs: Tensor) -> None:
+    """Compute values and all derivatives."""
+    operator.response(*inputs)
+
+
+def microseconds(operators: dict[str, Operator]) -> dict[str, list[tuple[float, float]]]:
+    """(least, median) of the repeats, of values alone and of values with gradients, by operator."""
+    counts = {label: 8 if label in TOLERANCES else 1024 for label in operators}
+    inputs = {label: point(operator, counts[label]) for label, operator in operators.items()}
+    taken: dict[tuple[str, Callable], list[float]] = {}
+    for repeat in range(REPEATS + 1):  # the first one compiles
+        for label, operator in operators.items():
+            for measure in (values, values_and_gradients):
+                start = time.process_time()
+                measure(operator, *inputs[label])
+                seconds = time.process_time() - start
+                if repeat:
+                    taken.setdefault((label, measure), []).append(seconds / (counts[label] * LOBES) * 1e6)
+    pairs = [[taken[label, measure] for measure in (values, values_and_gradients)] for label in operators]
+    return {k: [(min(t), statistics.median(t)) for t in pair] for k, pair in zip(operators, pairs, strict=True)}
+
+
+# ── Special cases and laws of `tests/scenes/operators.py`, which `tests/reflection/test_stability.py` has bounds for ─────────────────────
+
+
+def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool = True) -> dict[str, dict[str, float]]:
+    """Worst errors of every operator in float32 of `fast`: of values against the reference, and by rounding against its float64."""
+    exactly = {label.split()[0]: laws.answers(o, given) for label, o in fast.items() if label.endswith("float64")}
+    true, table = laws.reference_values(given) if with_reference else None, {}
+    for label, operator in fast.items():
+        if "float64" not in label:
+            answer, wide = laws.answers(operator, given), exactly[label.split()[0]]
+            kinds = {"value": laws.value_error, "gradient": laws.gradient_error}
+            errors = {f"{kind}_rounding": error(answer, wide, given) for kind, error in kinds.items()}
+            if true:
+                errors["value"] = laws.value_error(answer, laws.Answers(true, answer.turning), given)
+            table[label] = {name: float(error.max()) for name, error in errors.items()} | {"finite": answer.finite()}
+    return table
+
+
+LAWS: dict[str, Callable[[Operator], tuple[float, ...]]] = {
+    "reflection of a unit lobe, at most 1: roughness ≥ .1, n·o ≥ .02": lambda o: laws.unit_lobes(o, laws.USUAL),
+    "… roughness ≥ .1, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WIDER),
+    "… roughness ≥ .03, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WHOLE),
+    "least of it, at least 0": laws.least_reflected,
+    "GGX of k_s = 1 under constant light, at most 1": laws.constant_light,
+    "white Lambert under constant light, distance from 1": laws.white_lambert,
+    "point light (λ = 10⁶), distance from the BRDF": laws.point_light,
+    "everything turned: change over the largest radiance": laws.turned,
+    "weights times 10⁶: relative change of radiance / 10⁶": laws.scaled,
+}
+
+
+def special(fast: dict[str, Operator]) -> Tables:
+    """Rounding and errors of values in special cases, and how far each operator breaks the laws."""
+    single = {label_of(label).replace(" f32", ""): o for label, o in fast.items() if "float64" not in label}
+    cases = {name: list(measures(laws.case(name), fast, name != laws.ALL).values()) for name in (*laws.CASES, laws.ALL)}
+    broken = [
+        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in measure(o)) for o in single.values())]
+        for law, measure in LAWS.items()
+    ]
+    return {
+        "Worst error of float32 against float64 in the same operator: of values / of derivatives": [
+            ["changed", *single],
+            *([name, *(f"{exact(e['value_rounding'])} / {exact(e['gradient_rounding'])}" for e in row)] for name, row in cases.items()),
+        ],
+        "Worst error of values against the reference": [
+            ["changed", *single], *([name, *(exact(e["value"]) for e in row)] for name, row in cases.items() if name != laws.ALL),
+        ],
+        "Laws: 99th percentile / worst, or the worst alone": [["law", *single], *broken],
+    }  # fmt: skip
+
+
+# ── Tables ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def rows() -> Tables:
+    """Time of all operators, errors of their values and derivatives, of values by what is asked, and in bfloat16."""
+    fast, references = variants(), {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
+    times = microseconds(fast | references)
+    specular, diffuse = specular_samples(SAMPLES, 99, tolerance=1e-7), diffuse_samples(SAMPLES, 98)
+    glossy = {label: specular_errors(o, specular) for label, o in (fast | references).items() if label != REFERENCE}
+    matte = {label: diffuse_errors(operator, diffuse) for label, operator in fast.items()}
+    true, single = gradients(references[REFERENCE]), [label for label in fast if label.endswith("float32")]
+    slopes = {label: gradient_errors(fast[label], true) for label in single}
+    coarse = {name: in_bfloat16(name) for name in FAST}
+    rounded = {f"{name}, specular": specular_errors(o, specular) for name, o in coarse.items()}
+    rounded |= {f"{name}, diffuse": diffuse_errors(o, diffuse) for name, o in coarse.items()}
+    errors = {f"{k}, specular": e for k, e in glossy.items()} | {f"{k}, diffuse": e for k, e in matte.items()}
+    fastest = min(pair[1][1] for pair in times.values())
+    by_input = [
+        [f"{quantity} {part}", *(f"{_percent(e, 'median')}, {_percent(e, 'p95')}" for e in (glossy[k][quantity][part] for k in single))]
+        for quantity in INPUTS
+        for part in glossy[single[0]][quantity]
+    ]  # fmt: skip
+    return {
+        "µs per evaluation: least, median": [
+            ["operator", "values", "values and gradients", "of the fastest"],
+            *([label_of(k), *(", ".join(map(exact, p)) for p in pair), f"{exact(pair[1][1] / fastest)} ×"] for k, pair in times.items()),
+        ],
+        "Errors of values": [["operator", *QUANTILES], *([label_of(k), *_percents(e)] for k, e in errors.items())],
+        "Errors of derivatives": [
+            ["operator", *QUANTILES],
+            *([f"{label_of(k)}, by {word}", *_percents(e[slope])] for k, e in slopes.items() for slope, word in SLOPES.items()),
+        ],
+        "Specular errors by what is asked: median, p95": [["asked", *map(label_of, single)], *by_input],
+        "Errors of values in bfloat16": [
+            ["operator", *QUANTILES, "not finite"],
+            *([label_of(k), *_percents(e), str(e.get("not finite", 0))] for k, e in rounded.items()),
+        ],
+    } | special(fast)  # fmt: skip
+
+
+def _percents(errors: dict) -> list[str]:
+    return [_percent(errors, quantile) for quantile in QUANTILES]
+
+
+def _percent(errors: dict, quantile: str) -> str:
+    return f"{exact(100 * errors[quantile])} %" if quantile in errors else "–"

@@ -1,1 +1,0 @@
-"""Time, error and stability of every reflection operator: `python -m benchmarks.operator`, `make bench-operator`."""

@@ -1,0 +1,154 @@
+"""Real photographs whose poses are known from elsewhere: `make results ONLY=real_poses REAL="FOLDER …"`.
+
+Each folder is a data set with a `reference_poses.json` in the layout of align's poses.json.  Every photo is aligned by the stages
+`masks` and `align` with all that is said of cameras and poses withheld; EXIF belongs to the photo and stays.
+
+Not every turn between the two answers is an error of the alignment.  Taken off, one at a time:
+
+    the ray's turn     a longer lens from further away shows nearly the same picture, and every ray to the object leans less:
+                       the turn of the ray to the object's middle follows from the focal length, not from the mask
+    the common turn    of all photos of a set, about the mesh's axes: how the mesh lies in the reference's frame
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from benchmarks.align import normal_error_deg, share
+from benchmarks.tools import Clock, Tables, needed
+from factorlib.align.coarse import toward
+from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import Dataset
+from factorlib.dataset.slices import dataset_slice
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose, angle_between
+from factorlib.geometry.raster import Caster, rasterise
+from factorlib.meshes.read import read_mesh
+from factorlib.results.file import read_result
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import PhotoPoses, read_photo_poses
+from factorlib.stage import Inputs, silent
+from stages import align, masks
+
+REFERENCE = "reference_poses.json"
+CURE = "name a dataset whose poses are known, as align's poses.json has them"
+ANGLES = {
+    "normal_error_deg": "normals (°)",
+    "rotation_error_deg": "rotation (°)",
+    "about_the_ray_deg": "less the ray's turn (°)",
+}
+
+
+class Reference(PhotoPoses, frozen=True):
+    """A photo's entry of reference_poses.json; silhouette_iou: of all its objects together, None where it is not known."""
+
+    silhouette_iou: float | None = None
+
+
+def references(folder: Path) -> dict[str, Reference]:
+    """The known poses by photo.  InputError for a folder without any."""
+    if not (folder / REFERENCE).is_file():
+        raise InputError(f"there is no {REFERENCE}", file=folder, cure=CURE)
+    return read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)
+
+
+def withheld(dataset: Dataset) -> Dataset:
+    """The dataset without cameras, poses, keypoints and what a source of cameras says."""
+    replace = msgspec.structs.replace
+    photos = [
+        replace(photo, camera=None, objects=[replace(obj, pose=None, keypoints=[]) for obj in photo.objects])
+        for photo in dataset.spec.photos
+    ]
+    return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
+
+
+def measured(folder: Path, photo: str) -> list[dict]:
+    """One row per object of the photo: errors against the reference, and what the stage itself says of the pose."""
+    dataset, reference = withheld(read_dataset(folder)), references(folder)[photo]
+    slices = {name: dataset_slice(dataset, name, photo) for name in ("photo", "materials", "objects")}
+    facts = {f"dataset.{name}": part.facts for name, part in slices.items()}
+    files = {path: dataset.folder / path for part in slices.values() for path in part.files}
+    with TemporaryDirectory() as made:
+        clock, folders = Clock(), {name: Path(made) / name for name in ("masks", "align")}
+        inputs = Inputs(folders, facts, files, photo)
+        for stage, out in zip((masks, align), folders.values(), strict=True):
+            out.mkdir()
+            stage.main(stage.Params(), inputs, out, silent)
+        picture = read_photo_facts(folders["masks"] / f"{photo}.json")
+        answer, taken = read_photo_poses(folders["align"] / f"{photo}.json"), clock.taken()
+    rows = []
+    for obj in dataset.photo(photo).objects:
+        file, said = dataset.spec.meshes[obj.mesh], answer.objects[obj.name]
+        mesh = read_mesh(dataset.folder / file.file, dataset.spec.materials, file.made_of, obj.materials)
+        caster, pose, true = Caster(mesh), said.pose, reference.objects[obj.name].pose
+        camera, true_camera = (entry.camera.camera(picture.width, picture.height) for entry in (answer, reference))
+        normals = rasterise(caster, true_camera, true), rasterise(caster, camera, pose)
+        rows.append({
+            "set": folder.resolve().name, "photo": photo, "object": obj.name, "wall_s": taken.wall, "processor_s": taken.processor,
+            "turn": Rotation.from_matrix(true.rotation.T @ pose.rotation).as_rotvec().tolist(),
+            "rotation_error_deg": angle_between(pose.rotation, true.rotation), "normal_error_deg": normal_error_deg(*normals),
+            "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true))),
+            "focal_ratio": camera.focal / true_camera.focal, "focal_source": answer.camera.focal_source,
+            "reference_iou": reference.silhouette_iou, "silhouette_iou": said.silhouette_iou, "doubts": said.doubts,
+        })  # fmt: skip
+    return rows
+
+
+def about_the_ray(pose: Pose, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation as a camera sees it that looks straight at the object's centre: cam_from_object less the ray's turn."""
+    middle = pose.apply(centre[None])[0]
+    return toward(middle[:2] / middle[2]).T @ pose.rotation
+
+
+def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
+    """Angle of the mean of rotation vectors, and what is left of each without it, degrees.
+
+    >>> [round(float(angle), 6) for angle in common_turn([[0, 0, 0.1], [0, 0, 0.3]])[1]]
+    [5.729578, 5.729578]
+    """
+    each = Rotation.from_rotvec(turns)
+    return float(np.rad2deg(each.mean().magnitude())), np.rad2deg((each * each.mean().inv()).magnitude()).tolist()
+
+
+def rows() -> Tables:
+    """Sets with medians and worst values, and all photos."""
+    folders = [Path(word) for word in needed("REAL", "folders of photographs with known poses")]
+    photos = [(f, p.name) for f in folders for p in read_dataset(f).spec.photos if p.name in references(f)]
+    return tables_of([row for key in photos for row in measured(*key)])
+
+
+def tables_of(measures: list[dict]) -> Tables:
+    """The tables of all photos that were measured."""
+    sets, photos = [], []
+    for name in dict.fromkeys((row["set"], row["object"]) for row in measures):
+        of = [row for row in measures if (row["set"], row["object"]) == name]
+        common, left = common_turn([row["turn"] for row in of])
+        angles = [f"{np.median(a):.1f}, {max(a):.1f}" for a in ([row[key] for row in of] for key in ANGLES)]
+        ratios, seconds = ([row[key] for row in of] for key in ("focal_ratio", "processor_s"))
+        cells = [f"{common:.1f}", f"{np.median(left):.1f}, {max(left):.1f}", f"{min(ratios):.2f} to {max(ratios):.2f}"]
+        cells += [share([bool(row["doubts"]) for row in of]), f"{np.median(seconds):.0f}, {max(seconds):.0f}"]
+        sets.append([" ".join(name), str(len(of)), *angles, *cells])
+    for row in measures:
+        known = f" ({row['reference_iou']:.3f})" if row["reference_iou"] is not None else ""
+        cells = [f"{row['focal_ratio']:.2f} ({row['focal_source']})", f"{row['silhouette_iou']:.3f}{known}"]
+        cells += ["; ".join(row["doubts"]) or "–", f"{row['processor_s']:.0f}, {row['wall_s']:.0f}"]
+        photos.append([f"{row['set']}, {row['photo']}", *(f"{row[key]:.1f}" for key in ANGLES), *cells])
+    focal = "focal length, of the reference's"
+    head = [
+        "set, object",
+        "photos",
+        *ANGLES.values(),
+        "common turn (°)",
+        "less that (°)",
+        focal,
+        "doubtful",
+        "processor (s)",
+    ]
+    each = ["photo", *ANGLES.values(), focal, "IoU (the reference's)", "doubts", "processor, wall (s)"]
+    return {"Sets: median, worst": [head, *sets], "Photographs": [each, *photos]}

@@ -1,0 +1,80 @@
+"""All measured tables, as docs/results.md: `make results`, or `make results ONLY="operator align"` for some of its sections.
+
+A section is the function `rows()` of one module of `benchmarks`, which gives its tables.  On top of it stand the version, the commit, the
+date and the kind of machine that it was measured on.  A section that needs what is not here (LIGHTS, REAL: see its module)
+is left as it was, and named at the end.  All of it takes many hours.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from datetime import date
+from importlib import import_module
+from pathlib import Path
+
+import torch
+
+from benchmarks.tools import ROOT, Tables, refresh, table
+from factorlib.errors import InputError, did_you_mean
+
+PAGE = ROOT / "docs" / "results.md"
+SECTIONS = {  # module -> title
+    "reference": "data/synthetic",
+    "eames_like": "data/eames, and sets made alike",
+    "operator": "Reflection operators",
+    "align": "Poses",
+    "real_poses": "Poses of real photographs",
+    "refine": "Poses by shading, and proportions of meshes",
+    "faults": "Faults, reruns and fuzz",
+    "scale": "Large sets on a cluster",
+    "viewer": "The viewer of the report",
+}
+
+
+def machine() -> str:
+    """The version, commit, date and kind of machine of this run."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
+    facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
+    commit = git.stdout.strip() or "unknown"
+    return f"Version {version}, commit {commit}, {date.today()}, {os.cpu_count()} × {model}"
+
+
+def section(name: str, tables: Tables, measured: str) -> str:
+    """The Markdown of a section."""
+    parts = [f"**{title}**\n\n{table(rows[0], rows[1:])}" for title, rows in tables.items()]
+    return "\n\n".join([f"## {SECTIONS[name]}", f"*{measured}; `make results ONLY={name}`*", *parts])
+
+
+def main() -> int:
+    """Measure the sections that ONLY names, or all, and write each as soon as it is measured; 1 where one is left as it was."""
+    wanted = os.environ.get("ONLY", "").split() or list(SECTIONS)
+    for name in wanted:
+        if name not in SECTIONS:
+            raise InputError(f"there is no section '{name}'", key="ONLY", cure=did_you_mean(name, list(SECTIONS)))
+    torch.set_num_threads(1)
+    left = {}
+    for name in wanted:
+        start = time.perf_counter()
+        try:
+            tables = import_module(f"benchmarks.{name}").rows()
+        except (InputError, SystemExit) as error:
+            left[name] = error
+            continue
+        refresh(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
+        print(f"{PAGE}: {SECTIONS[name]}", flush=True)
+    for name, error in left.items():
+        print(f"'{SECTIONS[name]}' is left as it was: {error}", file=sys.stderr)
+    return 1 if left else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except InputError as error:
+        sys.exit(f"error: {error}")

@@ -1,1 +1,0 @@
-"""Problems of the joint solve whose every truth is known, which tests and studies share."""

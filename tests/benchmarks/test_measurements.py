@@ -1,0 +1,84 @@
+"""What measurements promise: sections of docs/results.md, maps that a prior must not know, deviations in standard errors."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import results
+from benchmarks.eames_like import MAPS, drawn, folder_of
+from benchmarks.standard_errors import light_deviations, material_deviations
+from benchmarks.tools import refresh
+from factorlib.errors import InputError
+from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+
+
+def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
+    page = tmp_path / "results.md"
+    page.write_text(before := results.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    for name in results.SECTIONS:
+        assert find_spec(f"benchmarks.{name}")
+        inner = before.partition(f"<!-- begin {name} -->\n")[2].partition(f"\n<!-- end {name} -->")[0]
+        refresh(page, {name: inner})
+        assert page.read_text(encoding="utf-8") == before
+    new = results.section("align", {"Success": [["case", "right"], ["all", "1 of 1"]]}, "today")
+    refresh(page, {"align": new})
+    assert "**Success**\n\n| case | right |\n|---|---:|\n| all | 1 of 1 |\n<!-- end align -->" in page.read_text(
+        "utf-8"
+    )
+    with pytest.raises(InputError, match="no place for the table 'other'"):
+        refresh(page, {"other": ""})
+
+
+def test_what_is_not_here_is_left_as_it_was_and_a_wrong_name_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(results, "PAGE", tmp_path / "none.md")
+    monkeypatch.delenv("REAL", raising=False)
+    monkeypatch.setenv("ONLY", "real_poses")
+    assert results.main() == 1 and "no folders of photographs with known poses" in capsys.readouterr().err
+    monkeypatch.setenv("ONLY", "aling")
+    with pytest.raises(InputError, match="did you mean 'align'"):
+        results.main()
+
+
+def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):
+    maps = [Path(f"maps/{name}.exr") for name in "abcdefghijkl"]
+    lit, others = drawn(maps, 6)
+    assert len(lit) == MAPS and sorted(lit + others) == maps
+    assert drawn(maps, 6) == (lit, others) and drawn(maps, 7)[0] != lit
+    with pytest.raises(InputError, match="7 maps"):
+        drawn(maps[:7], 6)
+    for folder in ("b", "a"):  # maps of one name both light a set
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "sky.exr").write_text(folder)
+    both = folder_of([tmp_path / "b/sky.exr", tmp_path / "a/sky.exr"], tmp_path / "both")
+    assert [path.read_text() for path in sorted(both.iterdir())] == ["b", "a"]
+
+
+def written(folder, roughness, scale, light, names=("one", "two")):
+    """Two materials times a scale, and one light with a relative standard error of .1."""
+    stderr = StandardErrors((0.02, 0.02, 0.02), (0.01, 0.01, 0.01), 0.05)
+    one = solved(Reflectance((0.4 * scale,) * 3, (0.1 * scale,) * 3, roughness), stderr)
+    two = solved(Reflectance((0.2 * scale,) * 3, (0.04 * scale,) * 3, 0.5), stderr)
+    for kind in ("illumination", "coverage"):
+        (folder / "export" / kind).mkdir(parents=True)
+    write_materials(folder / "export/materials.json", MaterialTable(dict(zip(names, (one, two), strict=True))))
+    write_rgb_exr(folder / "export/illumination/room.exr", light, LAT_LONG)
+    write_rgb_exr(folder / "export/coverage/room.exr", 0.1 * light / light.mean(), LAT_LONG)
+    return folder
+
+
+def test_deviations_between_two_runs_are_in_standard_errors_after_the_free_factor(tmp_path):
+    light = np.ones((64, 128, 3))
+    brighter = light.copy()
+    brighter[:16] *= np.exp(0.2)  # the upper quarter of the rows: two standard errors
+    one, other = written(tmp_path / "a", 0.3, 1.0, light), written(tmp_path / "b", 0.4, 2.0, 3 * brighter)
+    deviations = material_deviations(one, other)
+    assert deviations["diffuse"] == pytest.approx(np.zeros(6), abs=1e-9)
+    assert deviations["roughness"] == pytest.approx([2, 0])
+    off = light_deviations(one, other)
+    assert np.median(off) == pytest.approx(0, abs=1e-4) and off.max() == pytest.approx(2, rel=0.02)
+    assert np.mean(off > 1.5) == pytest.approx((1 - np.cos(np.pi / 4)) / 2, abs=0.02)  # their share of the sphere
+    with pytest.raises(InputError, match="'one' is missing"):
+        material_deviations(one, written(tmp_path / "c", 0.3, 1.0, light, ("three", "four")))
