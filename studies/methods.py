@@ -15,15 +15,14 @@ Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): alb
    new light   its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over photos.
 Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: what does not beat it has recovered
              nothing.
-Rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as the truth is.
+rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as the truth is.
 
 Truths are handed to methods for the gauge alone: photos link all materials and all lights.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+from collections.abc import Callable, Mapping
 
 import msgspec
 import numpy as np
@@ -48,25 +47,22 @@ Coefficients = Float[np.ndarray, "9 3"]
 Truths = Mapping[str, Reflectance]
 
 
-class Prediction(Protocol):
+class Prediction(msgspec.Struct, frozen=True):
     """A method's answer.
 
-    materials: reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
-    lambertian: that it states no specular part, rather than none being there
+    materials:    reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
+    lambertian:   that it states no specular part, rather than none being there
+    new_view:     radiance of a material that was photographed in the light of that number, by another camera
+    new_light:    of a material that was photographed, in another light, which is given
+    new_material: of another material, which is given, in the light of a photo; None where the method has nothing to say
     """
 
     materials: dict[str, Reflectance]
     lights: dict[int, Map]
     lambertian: bool
-
-    def new_view(self, material: str, light: int, view: View) -> Radiance:
-        """A body that was photographed in that light, by another camera."""
-
-    def new_light(self, material: str, light: Map, view: View) -> Radiance:
-        """A body that was photographed, in another light, which is given."""
-
-    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
-        """A body of another material, which is given, in the light of a photo; None where the method has nothing to say."""
+    new_view: Callable[[str, int, View], Radiance]
+    new_light: Callable[[str, Map, View], Radiance]
+    new_material: Callable[[Reflectance, int, View], Radiance | None]
 
 
 def in_gauge(
@@ -82,32 +78,24 @@ def lambertian_part(materials: Mapping[str, Reflectance]) -> dict[str, Reflectan
     return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
 
 
-class Rendered(msgspec.Struct, frozen=True):
-    """Materials and maps of lights."""
-
-    materials: dict[str, Reflectance]
-    lights: dict[int, Map]
-    lambertian: bool = False
-
-    def new_view(self, material: str, light: int, view: View) -> Radiance:
-        """Recovered material, recovered light."""
-        return Scene(self.lights[light], view).of(self.materials[material])
-
-    def new_light(self, material: str, light: Map, view: View) -> Radiance:
-        """Recovered material, given light."""
-        return Scene(light, view).of(self.materials[material])
-
-    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
-        """Given material, recovered light."""
-        return Scene(self.lights[light], view).of(material)
+def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lambertian: bool = False) -> Prediction:
+    """The answer of a method that finds a reflectance for each material and a map for each light."""
+    return Prediction(
+        materials,
+        lights,
+        lambertian,
+        lambda material, light, view: Scene(lights[light], view).of(materials[material]),
+        lambda material, light, view: Scene(light, view).of(materials[material]),
+        lambda material, light, view: Scene(lights[light], view).of(material),
+    )
 
 
-def grey(photos: Photos, truths: Truths) -> Rendered:
+def grey(photos: Photos, truths: Truths) -> Prediction:
     """Of the photos' mean colours."""
     radiance, ball = photos.radiance, Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
     means = {li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights}  # fmt: skip
     lights = {li: np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3)) for li, colour in means.items()}
-    return Rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths), lambertian=True)
+    return rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths), lambertian=True)
 
 
 # ── projective texturing ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -139,32 +127,22 @@ def _weighted(tree: cKDTree, at: np.ndarray, values: Radiance, count: int) -> Ra
     return np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
 
 
-class Projective(msgspec.Struct, frozen=True):
-    """Textures by material and light."""
+def projective(photos: Photos, truths: Truths) -> Prediction:
+    """The photos as textures; a texture knows no light apart from its material."""
+    texture, radiance = Texture(photos.view), photos.radiance
 
-    photos: Photos
-    texture: Texture
-    materials: dict[str, Reflectance] = {}
-    lights: dict[int, Map] = {}
-    lambertian: bool = False
+    def mean(material: str) -> Radiance:
+        """Of the material's photos, whatever the light."""
+        return np.mean([of for (name, _), of in radiance.items() if name == material], axis=0)
 
-    def new_view(self, material: str, light: int, view: View) -> Radiance:
-        """The photo in that light, carried over."""
-        return self.texture.at(view, self.photos.radiance[material, light])
-
-    def new_light(self, material: str, light: Map, view: View) -> Radiance:
-        """The mean of the material's photos, whatever the light."""
-        photos = [radiance for (name, _), radiance in self.photos.radiance.items() if name == material]
-        return self.texture.at(view, np.mean(photos, axis=0))
-
-    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
-        """A texture knows no light apart from its material."""
-        return None
-
-
-def projective(photos: Photos, truths: Truths) -> Projective:
-    """The photos as textures."""
-    return Projective(photos, Texture(photos.view))
+    return Prediction(
+        {},
+        {},
+        False,
+        lambda material, light, view: texture.at(view, radiance[material, light]),
+        lambda material, light, view: texture.at(view, mean(material)),
+        lambda material, light, view: None,
+    )
 
 
 # ── intrinsic decomposition ──────────────────────────────────────────────────────────────────────────────────────────
@@ -233,37 +211,13 @@ def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], d
     return dict(zip(names, parts[: len(names)], strict=True)), dict(zip(numbers, parts[len(names) :], strict=True))
 
 
-class Intrinsic(msgspec.Struct, frozen=True):
-    """Average albedos, each photo's shading, and highlights, which are carried as textures."""
+def intrinsic(photos: Photos, truths: Truths) -> Prediction:
+    """Decompose each photo, average.  Truths count by their Lambertian parts, for it states only those.
 
-    materials: dict[str, Reflectance]
-    lights: dict[int, Map]
-    shading: dict[int, Coefficients]
-    photos: dict[int, Decomposed]
-    texture: Texture
-    lambertian: bool = True
-
-    def new_view(self, material: str, light: int, view: View) -> Radiance:
-        """Average albedo, the photo's shading there, its highlight where the photo saw the point."""
-        return self._shaded(material, self.shading[light], self.photos[light].highlight[material], view)
-
-    def new_light(self, material: str, light: Map, view: View) -> Radiance:
-        """Average albedo, shading of the new light, the mean highlight of the photos."""
-        highlight = np.mean([p.highlight[material] for p in self.photos.values() if material in p.highlight], axis=0)
-        return self._shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, view)
-
-    def new_material(self, material: Reflectance, light: int, view: View) -> Radiance | None:
-        """The light that the shading determines, of nine harmonics, reflected by the given material."""
-        return Scene(self.lights[light], view).of(material)
-
-    def _shaded(self, material: str, shading: Coefficients, highlight: Radiance, view: View) -> Radiance:
-        lit = np.maximum(harmonics(view.normals) @ shading, 0)
-        return np.array(self.materials[material].diffuse) * lit + self.texture.at(view, highlight, unseen=False)
-
-
-def intrinsic(photos: Photos, truths: Truths) -> Intrinsic:
-    """Decompose each photo, average.  Truths count by their Lambertian parts, for it states only those."""
-    normals, radiance = photos.view.normals, photos.radiance
+    New views have the average albedo, the photo's shading there, and its highlight, a texture, where the photo saw the point; new
+    lights their own shading and the mean highlight of the photos; new materials the light that nine harmonics of shading determine.
+    """
+    normals, radiance, texture = photos.view.normals, photos.radiance, Texture(photos.view)
     parts = {li: decomposed(normals, {n: v for (n, at), v in radiance.items() if at == li}) for li in photos.lights}
     albedo, scale = averaged(parts)
     relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
@@ -273,4 +227,22 @@ def intrinsic(photos: Photos, truths: Truths) -> Intrinsic:
         {n: times(m, factor) for n, m in relative.items()},
         {li: light_map(e) for li, e in shading.items()},
     )
-    return Intrinsic(materials, lights, shading, parts, Texture(photos.view))
+
+    def shaded(material: str, coefficients: Coefficients, highlight: Radiance, view: View) -> Radiance:
+        """Albedo × shading + highlight."""
+        lit = np.maximum(harmonics(view.normals) @ coefficients, 0)
+        return np.array(materials[material].diffuse) * lit + texture.at(view, highlight, unseen=False)
+
+    def new_light(material: str, light: Map, view: View) -> Radiance:
+        """In a given light."""
+        highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
+        return shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, view)
+
+    return Prediction(
+        materials,
+        lights,
+        True,
+        lambda material, light, view: shaded(material, shading[light], parts[light].highlight[material], view),
+        new_light,
+        lambda material, light, view: Scene(lights[light], view).of(material),
+    )

@@ -265,7 +265,7 @@ class Study(msgspec.Struct, frozen=True):
     numbers:   what stands in the place of seeds, where intervals are over something else, which `over` names
     across:    the measure that stands across in the figure; none: a row for each setting
     notes:     sentences of a conclusion that are no claims;  answer: to the paper, where no claim can give it
-    pictures:  PNG files by name, with captions, from the scale and the folder of the scores
+    pictures:  the function that makes its pictures by name, captions and PNG files, of settings, seeds and the folder of the scores
     """
 
     name: str
@@ -284,7 +284,7 @@ class Study(msgspec.Struct, frozen=True):
     across: str = ""
     notes: Callable[[Any], list[str]] = lambda conclusion: []
     answer: Callable[[Any], str] = lambda conclusion: ""
-    pictures: Callable[[Scale, Any], dict[str, tuple[str, bytes]]] = lambda scale, folder: {}
+    pictures: str = ""
 
     @property
     def module(self) -> str:

@@ -14,7 +14,6 @@ Poses by shading (the stage `refine`) are not among them: `make results ONLY=ref
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from studies.study import Claim, Scale, Setting, Study, full_matrix, own
@@ -68,13 +67,6 @@ def claims(scale: Scale) -> list[Claim]:
     return [claim for claim in every if set(claim.settings) <= names]
 
 
-def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """Spheres of the recovered materials, a column for each setting."""
-    from studies.steps.score import spheres_by_setting
-
-    return spheres_by_setting(settings(scale), scale.seeds[0], scores)
-
-
 STUDY = Study(
     name="alignment-error",
     title="Alignment error",
@@ -85,5 +77,5 @@ STUDY = Study(
     settings=settings,
     claims=claims,
     lights=1,
-    pictures=pictures,
+    pictures="studies.steps.score.spheres_by_setting",
 )

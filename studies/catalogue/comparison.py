@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 
 from studies.study import FULL, Claim, Comparison, Scale, Setting, Study, full_matrix
 
@@ -49,13 +48,6 @@ def claims(scale: Scale) -> list[Claim]:
     return [Claim(f"novel_{k}", "ours", m, words[k, m], paper=(k, m) in papers) for k, m in asked]
 
 
-def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """What each method makes of photos that were not taken, a sheet for each kind, of the first seed."""
-    from studies.steps.compare import sheets
-
-    return sheets(LABELS, scale.seeds[0], scores)
-
-
 STUDY = Study(
     name="comparison",
     title="Comparison",
@@ -69,7 +61,7 @@ STUDY = Study(
     settings=settings,
     claims=claims,
     steps=("worlds", "observe", "solve", "optimise", "compare"),
-    pictures=pictures,
+    pictures="studies.steps.compare.sheets",
 )  # fmt: skip
 
 

@@ -13,7 +13,6 @@ Spread     the six photos (of a photo with two chairs, the mean of both): one se
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -76,13 +75,6 @@ def by_photo(table: Any) -> list[str]:
     return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
 
 
-def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """The photos' shells above the predicted ones, a picture for each way to predict."""
-    from studies.steps.chairs import shells_of_photos
-
-    return shells_of_photos(settings(scale), numbers(scale), scores)
-
-
 STUDY = Study(
     name="leave-one-out",
     title="Leave one out",
@@ -97,5 +89,5 @@ STUDY = Study(
     numbers=numbers,
     over="photos",
     notes=by_photo,
-    pictures=pictures,
+    pictures="studies.steps.chairs.shells_of_photos",
 )

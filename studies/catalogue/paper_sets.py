@@ -11,9 +11,7 @@ Measured   entries that were observed and those that were not.  The paper's phot
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from studies.study import Claim, Entry, Guess, Scale, Setting, Study, case_name, full_matrix, own
+from studies.study import Claim, Entry, Guess, Scale, Setting, Study, full_matrix, own
 
 
 def patterns(scale: Scale) -> dict[str, list[Entry]]:
@@ -56,19 +54,6 @@ def claims(scale: Scale) -> list[Claim]:
     ]
 
 
-def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """Each set's materials (rows) in its lights (columns), true and recovered."""
-    seed = scale.seeds[0]
-    words = "(rows) in the set's lights (columns); left the truth, right recovered materials in recovered lights.  Frames: observed entries."
-    return {
-        f"{s.name}.png": (
-            f"{s.label}, seed {seed}: {', '.join(s.case(seed).material_names)} {words}",
-            (scores / f"matrix-{case_name(s.name, seed)}.png").read_bytes(),
-        )
-        for s in settings(scale)
-    }
-
-
 STUDY = Study(
     name="paper-sets",
     title="Sets of the paper",
@@ -79,5 +64,5 @@ STUDY = Study(
     settings=settings,
     claims=claims,
     lights=1,
-    pictures=pictures,
+    pictures="studies.steps.score.matrices",
 )

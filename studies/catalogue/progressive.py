@@ -8,8 +8,6 @@ Measured   the materials in every light of the world, all materials of the world
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from studies.study import Claim, Scale, Setting, Study, full_matrix, own
 
 
@@ -36,13 +34,6 @@ def claims(scale: Scale) -> list[Claim]:
     ]
 
 
-def pictures(scale: Scale, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """Spheres of the recovered materials, a column for each setting."""
-    from studies.steps.score import spheres_by_setting
-
-    return spheres_by_setting(settings(scale), scale.seeds[0], scores)
-
-
 STUDY = Study(
     name="progressive",
     title="Progressive",
@@ -53,5 +44,5 @@ STUDY = Study(
     settings=settings,
     claims=claims,
     lights=1,
-    pictures=pictures,
+    pictures="studies.steps.score.spheres_by_setting",
 )

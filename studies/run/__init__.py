@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,33 +22,14 @@ from factorlib.runner import verbs
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from factorlib.wholefile import replace_file
-from studies import catalogue
-from studies.catalogue import (
-    alignment_error,
-    comparison,
-    cost,
-    gauss_sphere,
-    hard_cases,
-    label_quality,
-    leave_one_out,
-    matrix_size,
-    network_evaluation,
-    paper_sets,
-    parts,
-    prior,
-    progressive,
-    row_and_column,
-    seeds_and_machines,
-    speed,
-    structure,
-)
 from studies.study import FULL, QUICK, Scale, Score, Study
 
-MODULES = (
-    matrix_size, row_and_column, structure, label_quality, alignment_error, progressive, leave_one_out, paper_sets, gauss_sphere,
-    comparison, prior, network_evaluation, cost, speed, parts, hard_cases, seeds_and_machines,
-)  # in the order of the page  # fmt: skip
-STUDIES: dict[str, Study] = {module.STUDY.name: module.STUDY for module in MODULES}
+ORDER = (  # of the page
+    "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets gauss-sphere comparison "
+    "prior network-evaluation cost speed parts hard-cases seeds-and-machines"
+)
+CATALOGUE = "studies.catalogue"
+STUDIES: dict[str, Study] = {n: import_module(f"{CATALOGUE}.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
 SLICES = ("case", "worlds", "sets")
 FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
 
@@ -87,7 +69,7 @@ class Studies(Project, frozen=True):
 
 def studies(scale: Scale = FULL, root: Path = LIBRARY, name: str = "") -> Studies:
     """The project of the studies of a scale; name: of the one that is to run, for steps of a study may be its own module's."""
-    package = catalogue.__name__ if name in STUDIES and not STUDIES[name].steps else "studies.steps"
+    package = CATALOGUE if name in STUDIES and not STUDIES[name].steps else "studies.steps"
     return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), package, scale)
 
 
@@ -147,7 +129,9 @@ def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
     from studies.figures import figure
 
     table = concluded(study, scale, msgspec.convert(read_json(scores / "scores.json"), dict[str, Score]))
-    pictures = study.pictures(scale, scores)
+    module, _, function = study.pictures.rpartition(".")
+    drawn = getattr(import_module(module), function) if function else lambda *of: {}
+    pictures = drawn(study.settings(scale), study.numbers(scale), scores)
     table = msgspec.structs.replace(table, pictures={name: caption for name, (caption, _) in pictures.items()})
     texts = (figure(table, study.across), csv_text(table), json_text(table), paragraph(table))
     for file, words in zip(FINISHED, texts, strict=True):

@@ -24,7 +24,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
 
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.gauge import gauge_factors
@@ -35,11 +34,11 @@ from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from studies.body import Map, Photos, Radiance, Scene, View, read_photos, turn, view
 from studies.errors import PARTS, light_errors, maps_of, material_errors
-from studies.methods import Prediction, Rendered, grey, in_gauge, intrinsic, lambertian_part, projective
+from studies.methods import Prediction, grey, in_gauge, intrinsic, lambertian_part, projective, rendered
 from studies.spheres import materials_of, read_maps
 from studies.steps import Params
 from studies.steps.optimise import Optimised
-from studies.study import Comparison, Score, case_name, named
+from studies.study import Comparison, Score, Setting, case_name, named
 from studies.study import World as Lights
 
 VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0)}  # azimuth and elevation of the camera, degrees
@@ -47,14 +46,7 @@ FRONT = {"front": (0.0, 0.0)}  # the photos' own side
 KINDS = ("novel_view", "novel_light", "novel_material")
 SUFFIXES = {"none": "", "scalar_per_set": "_scaled", "channel_per_photo": "_balanced"}
 INSTANT = {"projective": projective, "intrinsic": intrinsic, "grey": grey}  # methods that take less than a second
-INK = (27, 29, 33)
-LEFT, TOP, GAP, LETTERS, LEAST = (
-    150,
-    44,
-    6,
-    13,
-    96,
-)  # pixels of a sheet; the last: across a picture, smaller ones are enlarged
+LEAST = 96  # pixels across a picture of a sheet: smaller ones are enlarged
 MOST_COLUMNS = 6
 
 Pixels = UInt8[np.ndarray, "h w 3"]
@@ -137,9 +129,9 @@ def answer(
     if case.method == "mitsuba":
         end = msgspec.convert(read_json(folder / "optimised.json"), Optimised, str_keys=True)
         lights = {li: np.array(of) for li, of in end.lights.items()}
-        return Rendered(*in_gauge(end.materials, lights, truths)), end.processor
+        return rendered(*in_gauge(end.materials, lights, truths)), end.processor
     table = {name: m.reflectance for name, m in read_materials(folder / "materials.json").materials.items()}
-    return Rendered(*in_gauge(table, maps_of(folder, case.lights), truths)), read_json(folder / "seconds.json")
+    return rendered(*in_gauge(table, maps_of(folder, case.lights), truths)), read_json(folder / "seconds.json")
 
 
 def shots(case: Comparison, world: World, prediction: Prediction) -> list[Shot]:
@@ -208,45 +200,36 @@ def read_shots(folder: Path) -> list[ScoredShot]:
     return msgspec.convert(read_json(folder / "shots.json"), list[ScoredShot])
 
 
-def sheets(labels: Mapping[str, str], seed: int, scores: Path) -> dict[str, tuple[str, bytes]]:
-    """PNG files by name, with captions: a sheet for each kind of picture, a row for each method; labels: of methods."""
+def sheets(settings: Sequence[Setting], seeds: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
+    """PNG files by name, with captions: a sheet for each kind of picture, a row for each method."""
     captions = {
-        "novel_view": "New views, in the light of a photo: the photo, the truth, and what each method makes of it.",
-        "novel_light": "New light: the material in a photo, the truth in another light, and what each method makes of it.",
-        "novel_material": "Materials that no photo shows, in the light of a photo.  Projective texturing has no answer.",
+        "novel_view": "New views, in the light of a photo.",
+        "novel_light": "New light: the material in another light than the photo's.",
+        "novel_material": "Materials that no photo shows, in the light of a photo.",
     }
-    about = f"Seed {seed}; every column at its truth's exposure, nothing scaled."
-    folders = {method: scores / case_name(method, seed) for method in labels}
-    answered = {method: {shot.asked.name for shot in read_shots(folder)} for method, folder in folders.items()}
-    first, files = folders["ours"], {}
+    folders = {s.label: scores / case_name(s.name, seeds[0]) for s in settings}
+    answered = {label: {shot.asked.name for shot in read_shots(folder)} for label, folder in folders.items()}
+    first, files = next(iter(folders.values())), {}
     for kind, caption in captions.items():
         every = [shot.asked for shot in read_shots(first) if shot.asked.kind == kind]
         some = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, MOST_COLUMNS).round().astype(int))]
-        rows = [("photo", [read_png(first / f"{photo_name(a.material, a.photo)}.png") for a in some])] if kind != KINDS[2] else []  # fmt: skip
-        rows.append(("truth", [read_png(first / f"{a.name}-truth.png") for a in some]))
-        for method, label in labels.items():
-            names = {a: folders[method] / f"{a.name}.png" for a in some if a.name in answered[method]}
-            rows.append((label, [read_png(names[a]) if a in names else None for a in some]))
-        whole = sheet(rows, [f"{a.material}\n{a.view}, light {a.light}" for a in some])
-        files[f"{kind}.png"] = (f"{caption}  {about}", png_bytes(whole))
+        rows = {} if kind == KINDS[2] else {"photo": [first / f"{photo_name(a.material, a.photo)}.png" for a in some]}
+        rows["truth"] = [first / f"{a.name}-truth.png" for a in some]
+        for label, folder in folders.items():
+            rows[label] = [folder / f"{a.name}.png" if a.name in answered[label] else None for a in some]
+        columns = ", ".join(f"{a.material} ({a.view}, light {a.light})" for a in some)
+        about = f"Rows: {', '.join(rows)}.  Columns: {columns}.  Seed {seeds[0]}; each column at its truth's exposure, nothing scaled."
+        pixels = sheet([[None if file is None else read_png(file) for file in row] for row in rows.values()])
+        files[f"{kind}.png"] = (f"{caption}  {about}", png_bytes(pixels))
     return files
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[Pixels | None]]], columns: Sequence[str]) -> Pixels:
-    """Rows of equally large pictures under the columns' names (two lines at most); None: nothing is there."""
-    across = next(len(cell) for _, cells in rows for cell in cells if cell is not None)
-    size = across * max(1, LEAST // across)
-    step = size + GAP
-    canvas = Image.new("RGB", (LEFT + step * len(columns), TOP + step * len(rows)), (255, 255, 255))
-    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(LETTERS)
-    for k, name in enumerate(columns):
-        draw.multiline_text((LEFT + k * step + size / 2, TOP - 4), name, INK, font, anchor="md", align="center")
-    for r, (label, cells) in enumerate(rows):
-        draw.text((LEFT - 10, TOP + r * step + size / 2), label, INK, font, anchor="rm")
-        for k, cell in enumerate(cells):
-            at = (LEFT + k * step, TOP + r * step)
-            if cell is None:
-                draw.text((at[0] + size / 2, at[1] + size / 2), "none", INK, font, anchor="mm")
-            else:
-                canvas.paste(Image.fromarray(np.asarray(cell)).resize((size, size), Image.Resampling.NEAREST), at)
-    return np.asarray(canvas)
+def sheet(rows: Sequence[Sequence[Pixels | None]]) -> Pixels:
+    """Rows of equally large pictures, small ones enlarged; grey where there is none."""
+    size = next(len(cell) for row in rows for cell in row if cell is not None)
+    larger, none = max(1, LEAST // size), np.full((size, size, 3), 128, np.uint8)
+    spaced = [
+        [np.pad(none if c is None else c, ((1, 1), (1, 1), (0, 0)), constant_values=255) for c in row] for row in rows
+    ]
+    whole = np.concatenate([np.concatenate(row, axis=1) for row in spaced])
+    return whole.repeat(larger, axis=0).repeat(larger, axis=1)

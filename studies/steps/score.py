@@ -203,9 +203,10 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
 
 
-def spheres_by_setting(settings: Sequence[Setting], seed: int, scores: Path) -> dict[str, tuple[str, bytes]]:
+def spheres_by_setting(settings: Sequence[Setting], seeds: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
     """PNG files by name, with captions: recovered spheres, a column for each setting, the truth first; as many files as it takes."""
-    files, rows = {}, ", ".join(settings[0].case(seed).material_names)
+    files, seed = {}, seeds[0]
+    rows = ", ".join(settings[0].case(seed).material_names)
     for number in range(0, len(settings), MOST):
         some = settings[number : number + MOST]
         pairs = [read_png(scores / f"balls-{case_name(s.name, seed)}.png") for s in some]
@@ -216,4 +217,14 @@ def spheres_by_setting(settings: Sequence[Setting], seed: int, scores: Path) -> 
         )
         caption += ", ".join(s.label for s in some) + "."
         files[f"spheres-{number // MOST + 1}.png"] = (caption, png_bytes(whole))
+    return files
+
+
+def matrices(settings: Sequence[Setting], seeds: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
+    """PNG files by name, with captions: each setting's materials (rows) in its lights (columns), true and recovered."""
+    files, seed = {}, seeds[0]
+    for s in settings:
+        caption = f"{s.label}, seed {seed}: {', '.join(s.case(seed).material_names)} (rows) in the set's lights (columns); left the truth, "
+        caption += "right recovered materials in recovered lights.  Frames: observed entries."
+        files[f"{s.name}.png"] = (caption, (scores / f"matrix-{case_name(s.name, seed)}.png").read_bytes())
     return files

@@ -92,16 +92,18 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), "it stands alone"
 
 
+def pictures_of(settings, seeds, scores):
+    return {f"{len(list(scores.glob('*.json')))}.png": ("caption", b"data")}
+
+
 def test_a_run_takes_the_pictures_of_the_last_away(tmp_path):
+    study = msgspec.structs.replace(
+        STUDIES[NAME], settings=lambda s: [s.setting("a", "a")], measures=(), pictures=f"{__name__}.pictures_of"
+    )
     (tmp_path / "scores.json").write_text('{"a-seed0": {"values": {}}}')
-    study = STUDIES[NAME]
-    for name in ("a.png", "b.png"):
-        of = {
-            "settings": lambda s: [s.setting("a", "a")],
-            "pictures": lambda *_, name=name: {name: ("caption", b"data")},
-        }
-        conclude(msgspec.structs.replace(study, claims=lambda s: [], measures=(), **of), QUICK, tmp_path, tmp_path)
-    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["b.png"]
+    for name in ("1.png", "2.png"):  # the second time table.json lies beside the scores
+        conclude(study, QUICK, tmp_path, tmp_path)
+        assert [path.name for path in (tmp_path / "pictures").iterdir()] == [name]
 
 
 def finished(project):

@@ -1,6 +1,6 @@
 """The user study: a simulated viewer drives the page in a browser, and its saved files are analysed.
 
-The viewer prefers the candidate of lower DSSIM with a stated probability, and says so in the page's address: the page marks all that it saves.
+The viewer prefers the candidate of lower DSSIM, and says so in the page's address: the page marks all that it saves.
 """
 
 import csv
@@ -21,41 +21,35 @@ from factorlib.runner.project import LIBRARY
 from studies.steps.compare import Asked, ScoredShot
 from studies.study import QUICK
 from studies.user_study.__main__ import digest, trials
-from studies.user_study.__main__ import html as page
+from studies.user_study.__main__ import html as html_of
 from studies.user_study.analysis import Answer, Answers, analysed, csv_text, figure, paragraph, read_answers
 
 MATERIALS = ("brick", "leaf", "gold")
+WORDS = "prefers the lower DSSIM"
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page"
 )
 
 
-def png(path, colour):
-    write_png(path, np.full((24, 24, 3), colour, np.uint8))
-
-
 @pytest.fixture(scope="module")
 def scores(tmp_path_factory):
-    """As the study's step `score` writes them: ours is better in all pictures but those of gold."""
-    folder = tmp_path_factory.mktemp("score")
+    """As the comparison's last step writes them: ours is better in all pictures but those of gold."""
+    folder = tmp_path_factory.mktemp("compare")
     for number, (method, error) in enumerate({"ours": 0.05, "intrinsic": 0.2}.items()):
-        home = folder / f"{method}-seed0"
-        home.mkdir()
-        shots = []
-        for k, material in enumerate(MATERIALS):
-            for kind in ("novel_view", "novel_light", "novel_material"):
-                asked = Asked(kind, material, k, "front", 0)
-                shots.append(ScoredShot(asked, 0.4 if material == "gold" and method == "ours" else error))
-                png(home / f"{asked.name}.png", 40 * k + 10 + 20 * number)
-                png(home / f"{asked.name}-truth.png", 40 * k + 5)
-        write_json(home / "shots.json", shots)
+        (home := folder / f"{method}-seed0").mkdir()
+        asked = [Asked(kind, m, k, "front", 0) for k, m in enumerate(MATERIALS) for kind in ("novel_view", "novel_light", "novel_material")]  # fmt: skip
+        for a in asked:
+            for suffix, colour in {"": 40 * a.light + 10 + 20 * number, "-truth": 40 * a.light + 5}.items():
+                write_png(home / f"{a.name}{suffix}.png", np.full((24, 24, 3), colour, np.uint8))
+        worse = {a: 0.4 if (a.material, method) == ("gold", "ours") else error for a in asked}
+        write_json(home / "shots.json", [ScoredShot(a, worse[a]) for a in asked])
     return folder
 
 
 @pytest.fixture(scope="module")
 def html(scores, tmp_path_factory):
     file = tmp_path_factory.mktemp("page") / "index.html"
-    file.write_text(page(trials(scores, QUICK, 40)))
+    file.write_text(html_of(trials(scores, QUICK, 40)))
     return file
 
 
@@ -63,9 +57,8 @@ def html(scores, tmp_path_factory):
 
 
 def test_questions_are_of_new_views_and_new_light_and_spread_evenly(scores):
-    every = trials(scores, QUICK, 40)
+    every, few = trials(scores, QUICK, 40), trials(scores, QUICK, 3)
     assert len(every) == 6 and not any("novel_material" in t.name for t in every)
-    few = trials(scores, QUICK, 3)
     assert [t.name.split("-")[1] for t in few] == list(MATERIALS) and digest(few) != digest(every)
 
 
@@ -74,31 +67,6 @@ def test_the_page_stands_alone_and_names_no_method_to_the_eye(html):
     assert "http" not in text and text.count("<script") == 2
     visible = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     assert not re.search("ours|intrinsic|solve", visible)
-
-
-def viewed(html, folder, probability, seed):
-    """Saved files of a simulated viewer who prefers the lower DSSIM with that probability."""
-    rng = np.random.default_rng(seed)
-    words = f"prefers the lower DSSIM with probability {probability:g}"
-    with opened(html) as (browser, complaints):
-        browser.goto(f"{html.as_uri()}#simulated={words.replace(' ', '%20')}")
-        browser.reload()
-        assert browser.inner_text("#simulated") == f"simulated: {words}"
-        browser.click("#begin")
-        pictures = {p["ours"]: p["dssim"][0] for p in browser.evaluate("data.pictures")}
-        pictures |= {p["other"]: p["dssim"][1] for p in browser.evaluate("data.pictures")}
-        for k in range(browser.evaluate("data.pictures.length")):
-            browser.wait_for_function(f"ready && results.answers.length === {k}")
-            left, right = (pictures[browser.get_attribute(f"#{side} img", "src")] for side in ("left", "right"))
-            side = "left" if (left < right) == (rng.random() < probability) else "right"
-            if k % 2:
-                browser.click(f"#{side}")
-            else:
-                browser.keyboard.press(f"Arrow{side.capitalize()}")
-        browser.wait_for_selector("#end:not([hidden])")
-        saved = [save(browser, f"#{kind}", folder) for kind in ("json", "csv")]
-        assert [c for c in complaints if not c.startswith("blob:")] == []
-    return saved
 
 
 def save(browser, button, folder):
@@ -111,60 +79,45 @@ def save(browser, button, folder):
 
 @needs_chromium
 def test_a_simulated_viewer_answers_and_is_marked_as_one(html, tmp_path):
-    file, table = viewed(html, tmp_path, 1.0, 0)
+    with opened(html) as (browser, complaints):
+        browser.goto(f"{html.as_uri()}#simulated={WORDS.replace(' ', '%20')}")
+        browser.reload()
+        assert browser.inner_text("#simulated") == f"simulated: {WORDS}"
+        browser.click("#begin")
+        pictures = {
+            p[side]: p["dssim"][k]
+            for p in browser.evaluate("data.pictures")
+            for k, side in enumerate(("ours", "other"))
+        }
+        for k in range(browser.evaluate("data.pictures.length")):
+            browser.wait_for_function(f"ready && results.answers.length === {k}")
+            left, right = (pictures[browser.get_attribute(f"#{side} img", "src")] for side in ("left", "right"))
+            side = "left" if left < right else "right"
+            browser.click(f"#{side}") if k % 2 else browser.keyboard.press(f"Arrow{side.capitalize()}")
+        browser.wait_for_selector("#end:not([hidden])")
+        file, table = (save(browser, f"#{kind}", tmp_path) for kind in ("json", "csv"))
+        assert [c for c in complaints if not c.startswith("blob:")] == []
     (answers,) = read_answers([file])
-    assert (
-        answers.simulated == "prefers the lower DSSIM with probability 1" and len(answers.answers) == answers.asked == 6
-    )
+    assert answers.simulated == WORDS and len(answers.answers) == answers.asked == 6
     assert all(a.for_ours == ("gold" not in a.picture) for a in answers.answers)
     rows = list(csv.DictReader(table.open()))
     assert [(r["picture"], r["ours"], r["chosen"]) for r in rows] == [
         (a.picture, a.ours, a.chosen) for a in answers.answers
     ]
-    assert {r["simulated"] for r in rows} == {answers.simulated} and {r["participant"] for r in rows} == {
-        answers.participant
-    }
+    assert {(r["simulated"], r["participant"]) for r in rows} == {(WORDS, answers.participant)}
 
 
 @needs_chromium
-def test_a_browser_that_a_program_drives_is_marked_even_where_it_says_nothing(html):
-    with opened(html) as (browser, _):
+def test_a_phone_needs_no_scrolling_and_a_program_is_marked_even_where_it_says_nothing(html):
+    with opened(html, viewport={"width": 360, "height": 740}) as (browser, complaints):
         assert browser.evaluate("results.simulated") == "a program drives the browser" and browser.is_visible(
             "#simulated"
         )
-
-
-@needs_chromium
-def test_a_phone_needs_no_scrolling_sideways(html):
-    with opened(html, viewport={"width": 360, "height": 740}) as (browser, complaints):
+        browser.keyboard.press("ArrowLeft")  # before the first question
         browser.click("#begin")
         browser.wait_for_function("ready")
         assert browser.evaluate("document.documentElement.scrollWidth") <= 360 and complaints == []
         assert all(browser.locator(f"#{side}").bounding_box()["x"] >= 0 for side in ("left", "right"))
-
-
-@needs_chromium
-def test_order_and_sides_are_the_seeds_and_sides_are_fair(html):
-    with opened(html) as (browser, _):
-        script = "(seed) => drawn(data.pictures, seed).map((q) => [q.picture.name, q.ours])"
-        first, again, others = (
-            browser.evaluate(script, 7),
-            browser.evaluate(script, 7),
-            [browser.evaluate(script, s) for s in range(300)],
-        )
-        assert first == again and sorted(name for name, _ in first) == sorted(
-            p["name"] for p in browser.evaluate("data.pictures")
-        )
-        left = np.mean([side == "left" for drawn in others for _, side in drawn])
-        assert left == pytest.approx(0.5, abs=0.05) and len({name for drawn in others for name, _ in drawn[:1]}) == 6
-
-
-@needs_chromium
-def test_keys_before_the_first_question_and_their_repeats_answer_nothing(html):
-    with opened(html) as (browser, _):
-        browser.keyboard.press("ArrowLeft")
-        browser.click("#begin")
-        browser.wait_for_function("ready")
         browser.keyboard.down("ArrowLeft")
         browser.wait_for_function("ready && results.answers.length === 1")
         browser.keyboard.down("ArrowLeft")  # without up: a repeat
@@ -172,79 +125,75 @@ def test_keys_before_the_first_question_and_their_repeats_answer_nothing(html):
         assert browser.evaluate("results.answers.length") == 1
 
 
+@needs_chromium
+def test_order_and_sides_are_the_seeds_and_sides_are_fair(html):
+    with opened(html) as (browser, _):
+        script = "(seed) => drawn(data.pictures, seed).map((q) => [q.picture.name, q.ours])"
+        first, again, *others = (browser.evaluate(script, seed) for seed in (7, 7, *range(300)))
+        names = sorted(p["name"] for p in browser.evaluate("data.pictures"))
+        assert first == again and sorted(name for name, _ in first) == names
+        left = np.mean([side == "left" for drawn in others for _, side in drawn])
+        assert left == pytest.approx(0.5, abs=0.05) and len({drawn[0][0] for drawn in others}) == 6
+
+
 # ── the analysis ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def participant(number, preferred, simulated="", **changes):
+def participant(number, preferred, **changes):
     """A person who chose ours in the pictures of `preferred`, of four."""
     given = [Answer(f"p{k}", "left", "left" if k in preferred else "right", 900.0) for k in range(4)]
     fields = {
         "page": "0" * 16,
         "participant": f"{number:016x}",
         "seed": number,
-        "simulated": simulated,
+        "simulated": "",
         "asked": 4,
         "answers": given,
     }
     return Answers(format=1, **fields | changes)
 
 
-def written(folder, *found):
-    files = [folder / f"{k}.json" for k in range(len(found))]
-    for file, answers in zip(files, found, strict=True):
+def written(folder, *people):
+    files = [folder / f"{k}.json" for k in range(len(people))]
+    for file, answers in zip(files, people, strict=True):
         write_json(file, answers)
     return files
 
 
 def test_shares_and_standard_errors():
     """Shares of three people: 1, 1/2, 3/4; s = 1/4."""
-    found = analysed([participant(0, {0, 1, 2, 3}), participant(1, {0, 1}), participant(2, {0, 1, 2})])
-    assert found.overall.share == pytest.approx(0.75) and found.overall.error == pytest.approx(0.25 / 3**0.5)
-    assert [s.share for s in found.pictures] == pytest.approx([1, 1, 2 / 3, 1 / 3])
-    assert found.pictures[2].error == pytest.approx((2 / 9 / 3) ** 0.5) and found.overall.for_ours == 9
+    of = analysed([participant(0, {0, 1, 2, 3}), participant(1, {0, 1}), participant(2, {0, 1, 2})])
+    assert of.overall.share == pytest.approx(0.75) and of.overall.error == pytest.approx(0.25 / 3**0.5)
+    assert [s.share for s in of.pictures] == pytest.approx([1, 1, 2 / 3, 1 / 3])
+    assert of.pictures[2].error == pytest.approx((2 / 9 / 3) ** 0.5) and of.overall.for_ours == 9
+    alone = analysed([participant(0, {0})])
+    assert alone.overall.error is None and "no conclusion" in paragraph(alone)
 
 
 def test_the_papers_own_numbers_come_out():
     """One answer each of 250 people, 86.5 % for ours: a standard error of 2.1 or 2.2 %."""
-    people = [
-        participant(
-            k, {0} if k < 216 else set(), answers=[Answer("p0", "left", "left" if k < 216 else "right", 1.0)], asked=1
-        )
-        for k in range(250)
-    ]
-    found = analysed(people)
-    assert 100 * found.overall.share == pytest.approx(86.4) and 2.1 < 100 * found.overall.error < 2.2
-    assert "No difference is shown" in paragraph(found) and "250 participants" in paragraph(found)
-
-
-def test_one_person_has_no_standard_error():
-    found = analysed([participant(0, {0})])
-    assert found.overall.error is None and "no conclusion" in paragraph(found)
+    sides = ["left"] * 216 + ["right"] * 34
+    of = analysed([participant(k, (), answers=[Answer("p0", "left", s, 1.0)], asked=1) for k, s in enumerate(sides)])
+    assert 100 * of.overall.share == pytest.approx(86.4) and 2.1 < 100 * of.overall.error < 2.2
+    assert "No difference is shown" in paragraph(of) and "250 participants" in paragraph(of)
 
 
 def test_simulated_answers_stay_marked_in_all_that_is_made_of_them():
-    found = analysed([participant(k, {0, 1}, simulated="a coin") for k in range(3)])
-    assert all(row["simulated"] == "a coin" for row in csv.DictReader(io.StringIO(csv_text(found))))
-    assert (
-        "simulated: a coin" in figure(found)
-        and paragraph(found).startswith("**simulated: a coin**")
-        and "250" not in paragraph(found)
-    )
+    of = analysed([participant(k, {0, 1}, simulated="a coin") for k in range(3)])
+    assert all(row["simulated"] == "a coin" for row in csv.DictReader(io.StringIO(csv_text(of))))
+    assert "simulated: a coin" in figure(of) and "250" not in paragraph(of)
+    assert paragraph(of).startswith("**simulated: a coin**")
 
 
-MALFORMED = {
-    "no JSON": ("{", "not a file of answers"),
-    "another file": ('{"a": 1}', "not a file of answers"),
-    "a list": ("[]", "not a file of answers"),
-}
-
-
-@pytest.mark.parametrize("content, said", MALFORMED.values(), ids=list(MALFORMED))
-def test_what_is_no_file_of_answers_is_said(tmp_path, content, said):
+@pytest.mark.parametrize("content", ["{", '{"a": 1}', "[]"])
+def test_what_is_no_file_of_answers_is_said(tmp_path, content):
     (file := tmp_path / "a.json").write_text(content)
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match="not a file of answers") as caught:
         read_answers([file])
     assert caught.value.file == file and caught.value.cure
+
+
+ANSWER = {"picture": "p0", "ours": "left", "chosen": "left", "milliseconds": 1}
 
 
 @pytest.mark.parametrize(
@@ -252,12 +201,12 @@ def test_what_is_no_file_of_answers_is_said(tmp_path, content, said):
     [
         ({"format": 2}, "format 2"),
         ({"answers": []}, "0 answers to 4 questions"),
-        ({"answers": [{"picture": "p0", "ours": "left", "chosen": "up", "milliseconds": 1}]}, "Invalid enum value 'up'"),
-        ({"answers": [{"picture": "p0", "ours": "left", "chosen": "left", "milliseconds": 1}] * 4}, "two answers to 'p0'"),
+        ({"answers": [ANSWER | {"chosen": "up"}]}, "Invalid enum value 'up'"),
+        ({"answers": [ANSWER] * 4}, "two answers to 'p0'"),
         ({"participant": "me"}, "participant"),
         ({"extra": 1}, "unknown field `extra`"),
     ],
-)  # fmt: skip
+)
 def test_a_changed_file_is_said(tmp_path, changes, said):
     (file,) = written(tmp_path, participant(0, {0}))
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
@@ -279,9 +228,8 @@ def test_files_that_do_not_belong_together_are_said(tmp_path, second, said):
 
 
 def command(*words):
-    return subprocess.run(
-        [sys.executable, "-m", "studies.user_study", *words], cwd=LIBRARY, capture_output=True, text=True, check=False
-    )
+    line = [sys.executable, "-m", "studies.user_study", *words]
+    return subprocess.run(line, cwd=LIBRARY, capture_output=True, text=True, check=False)
 
 
 def test_the_analysis_is_a_command(tmp_path):
