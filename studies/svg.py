@@ -52,13 +52,14 @@ class LogAxis(NamedTuple):
     high: float
     start: float
     end: float
+    log = staticmethod(math.log10)
 
     def __call__(self, value: float) -> float:
         """The pixel of a value."""
-        share = math.log10(max(value, 1e-300) / self.low) / math.log10(self.high / self.low)
+        share = (self.log(max(value, 1e-300)) - self.log(self.low)) / (self.log(self.high) - self.log(self.low))
         return self.start + share * (self.end - self.start)
 
     def decades(self) -> list[float]:
         """The powers of ten between both ends."""
-        first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
+        first, last = math.ceil(self.log(self.low) - 1e-9), math.floor(self.log(self.high) + 1e-9)
         return [10.0**k for k in range(first, last + 1)]
