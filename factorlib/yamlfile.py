@@ -212,8 +212,8 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
     else:
         choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
         described = [meta.description for each in types for meta in getattr(each, "__metadata__", ())]
-        cure = next(filter(None, described), "write a value of that kind")
-        cure = f"one of {', '.join(choices)}" if choices else cure
+        one_of = f"one of {', '.join(choices)}" if choices else "write a value of that kind"
+        cure = next(filter(None, described), one_of)
         if isinstance(value, int | float) and "xpected `str" in words:
             cure = f'put it in quotes: "{one_line(str(value))}"'
         words = f"{words[:1].lower()}{words[1:]}"

@@ -1,5 +1,6 @@
 """Reading photos: the same scene is the same radiance whatever file it came in."""
 
+import os
 import tracemalloc
 
 import numpy as np
@@ -7,10 +8,13 @@ import OpenImageIO as oiio
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.images import light_map
 from factorlib.images import photo as photo_module
 from factorlib.images.boxes import box_mean
+from factorlib.images.exr import read_exr
 from factorlib.images.focal import FILM_DIAGONAL, focal_px_of_exif
-from factorlib.images.photo import decoded, open_photo, read_photo
+from factorlib.images.light_map import read_light_map
+from factorlib.images.photo import check_bright, decoded, open_photo, read_photo
 from factorlib.images.transfer import gamma_encode, srgb_encode
 
 RNG = np.random.default_rng(3)
@@ -39,19 +43,12 @@ def codes(encoded, kind=np.uint8):
     return np.rint(encoded * np.iinfo(kind).max).astype(kind)
 
 
-@pytest.mark.parametrize(
-    "file, pixels, tolerance",
-    [
-        ("a.png", codes(srgb_encode(RADIANCE)), 5e-3),
-        ("b.png", codes(srgb_encode(RADIANCE), np.uint16), 2e-5),
-        ("a.tif", codes(srgb_encode(RADIANCE)), 5e-3),
-        ("b.tif", codes(srgb_encode(RADIANCE), np.uint16), 2e-5),
-        ("c.tif", RADIANCE, 0),
-        ("a.exr", RADIANCE, 0),
-        ("b.exr", RADIANCE.astype(np.float16), 5e-4),
-        ("a.hdr", RADIANCE, 5e-3),
-    ],
-)
+@pytest.mark.parametrize("file, pixels, tolerance", [
+    *((f"a.{suffix}", codes(srgb_encode(RADIANCE)), 5e-3) for suffix in ("png", "tif")),
+    *((f"b.{suffix}", codes(srgb_encode(RADIANCE), np.uint16), 2e-5) for suffix in ("png", "tif")),
+    *((f"c.{suffix}", RADIANCE, tolerance) for suffix, tolerance in (("tif", 0), ("exr", 0), ("hdr", 5e-3))),
+    ("d.exr", RADIANCE.astype(np.float16), 5e-4),
+])  # fmt: skip
 def test_every_kind_of_file_gives_the_same_radiance(tmp_path, file, pixels, tolerance):
     photo = read_photo(save(tmp_path / file, pixels))
     assert photo.radiance.dtype == np.float32
@@ -163,21 +160,13 @@ def test_a_focal_length_is_in_pixels_of_the_averaged_photo(tmp_path):
     assert decoded(open_photo(path), None, 4, path).focal_px == pytest.approx(read_photo(path).focal_px / 4)
 
 
-@pytest.mark.parametrize(
-    "tags, expected",
-    [
-        ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 125}, 125 / 60 / 1.8**2),
-        ({"ExposureTime": 1 / 60, "FNumber": 1.8}, None),
-        (
-            {"ExposureTime": 1 / 60, "FNumber": 0.0, "Exif__PhotographicSensitivity": 125},
-            None,
-        ),  # a lens that says nothing
-        ({"ExposureTime": 1 / 60, "FNumber": 1.8, "Exif__PhotographicSensitivity": 65535}, None),  # "more than fits"
-    ],
-)
-def test_the_exposure_is_what_the_camera_wrote(tmp_path, tags, expected):
-    found = read_photo(save(tmp_path / "a.jpg", np.zeros((40, 60, 3), dtype=np.uint8), **tags)).exposure
-    assert found == (None if expected is None else pytest.approx(expected, rel=1e-3))
+@pytest.mark.parametrize("aperture, iso, expected", [
+    (1.8, 125, 125 / 60 / 1.8**2), (1.8, None, None), (0.0, 125, None), (1.8, 65535, None),  # a lens that says nothing; "more than fits"
+])  # fmt: skip
+def test_the_exposure_is_what_the_camera_wrote(tmp_path, aperture, iso, expected):
+    tags = {"ExposureTime": 1 / 60, "FNumber": aperture} | ({"Exif__PhotographicSensitivity": iso} if iso else {})
+    exposure = read_photo(save(tmp_path / "a.jpg", np.zeros((40, 60, 3), dtype=np.uint8), **tags)).exposure
+    assert exposure == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
 @pytest.mark.parametrize("channels, names", [(1, ["Y"]), (2, ["Y", "A"]), (4, ["R", "G", "B", "A"])])
@@ -220,6 +209,64 @@ def test_what_is_not_finite_is_no_pixel_and_bright_floats_are_not_clipped(tmp_pa
     assert not photo.clipped.any() and np.isfinite(photo.radiance).all() and photo.radiance[0, 1, 0] == 50
 
 
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_a_photo_that_is_black_or_negative_wherever_it_is_used_is_refused_by_name(tmp_path, value):
+    pixels, inside = np.full((4, 6, 3), value, np.float32), np.zeros((4, 6), bool)
+    pixels[0], inside[1:] = 1.0, True
+    photo = read_photo(save(tmp_path / "kitchen.exr", pixels))
+    check_bright(photo, np.ones((4, 6), bool), "kitchen.exr")
+    with pytest.raises(InputError, match="black, or less than 0") as caught:
+        check_bright(photo, inside, "kitchen.exr", "photos[kitchen].image")
+    assert "kitchen.exr: photos[kitchen].image" in str(caught.value) and "drop the photo" in caught.value.cure
+
+
+# ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("suffix", ["exr", "hdr"])
+def test_a_large_light_is_averaged_down_while_it_is_read(tmp_path, monkeypatch, suffix):
+    """A file of kilobytes that stands for many pixels; what is held is some rows of it and the smaller map."""
+    monkeypatch.setattr(light_map, "MOST_TEXELS", 256 * 128)
+    monkeypatch.setattr(photo_module, "READ_AT_ONCE", 1 << 16)
+    pixels = np.broadcast_to(np.linspace(1, 2, 1250, dtype=np.float32)[:, None, None], (1250, 2500, 3))
+    path = save(tmp_path / f"a.{suffix}", pixels)
+    tracemalloc.start()
+    light = read_light_map(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert light.shape == (125, 250, 3) and peak < pixels.size * 4 / 3
+    assert light[:, 0, 0] == pytest.approx(pixels[:, 0, 0].reshape(125, 10).mean(axis=1), rel=5e-3)
+
+
+def test_a_light_of_the_usual_size_is_read_as_it_is(tmp_path):
+    pixels = RNG.uniform(0, 5, (16, 32, 3)).astype(np.float32)
+    pixels[3, 4, 1] = -1e-4  # as resampling leaves it
+    assert np.array_equal(read_light_map(save(tmp_path / "a.exr", pixels)), pixels)
+
+
+@pytest.mark.parametrize("value, words", [(-7.0, "a radiance of -7 is less than 0"), (np.inf, "no numbers, or infinite"),
+                                          (3e38, "no numbers, or infinite"), (np.nan, "no numbers")])  # fmt: skip
+@pytest.mark.parametrize("most", [1 << 23, 8])
+def test_a_light_with_radiance_that_is_none_is_refused(tmp_path, monkeypatch, value, words, most):
+    """One texel is enough, in a map that is averaged down, too."""
+    monkeypatch.setattr(light_map, "MOST_TEXELS", most)
+    pixels = np.ones((4, 8, 3), np.float32)
+    pixels[1, 2, 0] = value
+    with pytest.raises(InputError, match=words) as caught:
+        read_light_map(save(tmp_path / "a.exr", pixels), "illumination.hall")
+    assert "a.exr: illumination.hall" in str(caught.value) and caught.value.cure
+
+
+def test_a_pipe_in_place_of_an_image_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.exr")
+    for read in (read_exr, read_light_map):
+        with pytest.raises(InputError, match="is a pipe"):
+            read(tmp_path / "a.exr")
+
+
+# ── damaged ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
 @pytest.mark.parametrize("file", ["a.jpg", "a.png", "a.tif", "a.exr", "a.hdr"])
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.97])
 def test_truncated_files_are_refused(tmp_path, file, part):
@@ -240,13 +287,8 @@ def test_what_is_no_image_is_refused(tmp_path):
 
 def test_focal_of_35mm_film_is_the_same_for_any_size_and_orientation(tmp_path):
     for size, orientation in (((40, 60), 1), ((80, 120), 6)):
-        path = save(
-            tmp_path / "a.jpg",
-            np.zeros((*size, 3), dtype=np.uint8),
-            Orientation=orientation,
-            Exif__FocalLengthIn35mmFilm=50,
-        )
-        photo = read_photo(path)
+        tags = {"Orientation": orientation, "Exif__FocalLengthIn35mmFilm": 50}
+        photo = read_photo(save(tmp_path / "a.jpg", np.zeros((*size, 3), dtype=np.uint8), **tags))
         half = np.hypot(photo.width, photo.height) / 2
         assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
 
@@ -260,15 +302,16 @@ def test_focal_of_the_focal_plane_follows_a_resize():
     assert focal_px_of_exif(exif | {"Exif:FocalPlaneResolutionUnit": 3}, 5472, 3648) == pytest.approx(18 * 10000 / 10)
 
 
-@pytest.mark.parametrize(
-    "exif, size",
-    [
-        ({}, (600, 400)),
-        ({"Exif:FocalLength": 18.0}, (600, 400)),  # of a sensor of unknown size
-        ({"Exif:FocalLengthIn35mmFilm": 0}, (600, 400)),  # "unknown" by the standard
-        ({"Exif:FocalLengthIn35mmFilm": 50}, (500, 500)),  # cropped: no camera's proportions
-        ({"Exif:FocalLengthIn35mmFilm": 50, "Exif:PixelXDimension": 6000, "Exif:PixelYDimension": 4000}, (400, 300)),
-    ],
-)
+FILM = {"Exif:FocalLengthIn35mmFilm": 50}
+TAKEN = {"Exif:PixelXDimension": 6000, "Exif:PixelYDimension": 4000}
+
+
+@pytest.mark.parametrize("exif, size", [
+    ({}, (600, 400)),
+    ({"Exif:FocalLength": 18.0}, (600, 400)),  # of a sensor of unknown size
+    ({"Exif:FocalLengthIn35mmFilm": 0}, (600, 400)),  # "unknown" by the standard
+    (FILM, (500, 500)),  # cropped: no camera's proportions
+    (FILM | TAKEN, (400, 300)),
+])  # fmt: skip
 def test_no_focal_where_exif_cannot_tell(exif, size):
     assert focal_px_of_exif(exif, *size) is None

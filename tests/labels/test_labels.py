@@ -51,16 +51,20 @@ def palette(path, values):
 
 
 def coco(folder, annotations, images=None, categories=MATERIALS):
+    """annotations: (category_id, segmentation); categories are numbered from 10."""
     content = {
         "info": {"year": 2020},
         "images": images or [{"id": 7, "file_name": "kitchen.jpg", "width": W, "height": H, "license": 1}],
         "categories": [{"id": 10 + k, "name": name, "supercategory": "material"} for k, name in enumerate(categories)],
-        "annotations": [
-            {"id": k, "image_id": 7, "iscrowd": 0, **annotation} for k, annotation in enumerate(annotations)
-        ],
-    }
+        "annotations": [{"id": k, "image_id": 7, "iscrowd": 0, "category_id": category, "segmentation": segmentation}
+                        for k, (category, segmentation) in enumerate(annotations)],
+    }  # fmt: skip
     (folder / "coco.json").write_text(json.dumps(content))
     return "coco.json"
+
+
+def rle(counts, size=(H, W)):
+    return {"size": list(size), "counts": counts}
 
 
 def counts_of(inside):
@@ -77,44 +81,24 @@ def box(x0, y0, x1, y1):
     return [x0, y0, x1, y0, x1, y1, x0, y1]
 
 
-def forms(folder):
-    red, wood = LABEL == 1, LABEL == 3
-    as_is = LABEL.copy()
-    return {
-        "grey": lambda: save(folder / "grey.png", as_is),
-        "palette": lambda: palette(folder / "palette.png", as_is),
-        "rgb": lambda: save(folder / "rgb.png", np.dstack([as_is] * 3)),
-        "rgba": lambda: save(folder / "rgba.png", np.dstack([as_is] * 3 + [np.full_like(as_is, 255)])),
-        "16 bit": lambda: save(folder / "deep.png", as_is.astype(np.uint16)),
-        "one each, 255": lambda: {
-            "wood": save(folder / "w.png", wood.astype(np.uint8) * 255),
-            "red": save(folder / "r.png", red.astype(np.uint8) * 255),
-        },
-        "one each, 1": lambda: {
-            "red": save(folder / "r.png", red.astype(np.uint8)),
-            "wood": save(folder / "w.png", wood.astype(np.uint8)),
-        },
-        "one each, 1 bit": lambda: {"red": save(folder / "r.png", red), "wood": save(folder / "w.png", wood)},
-        "polygons": lambda: coco(
-            folder,
-            [
-                {"category_id": 12, "segmentation": [box(5, 10, 15, 18), box(15, 10, 25, 18)]},
-                {"category_id": 10, "segmentation": [box(3, 2, 12, 9)]},
-            ],
-        ),
-        "RLE": lambda: coco(
-            folder,
-            [
-                {"category_id": 10, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": counts_of(red)}},
-                {"category_id": 12, "iscrowd": 1, "segmentation": {"size": [H, W], "counts": compressed(wood)}},
-            ],
-        ),
-    }
+RED, WOOD = LABEL == 1, LABEL == 3
+FORMS = {
+    "grey": lambda at: save(at / "a.png", LABEL),
+    "palette": lambda at: palette(at / "a.png", LABEL),
+    "rgb": lambda at: save(at / "a.png", np.dstack([LABEL] * 3)),
+    "rgba": lambda at: save(at / "a.png", np.dstack([LABEL] * 3 + [np.full_like(LABEL, 255)])),
+    "16 bit": lambda at: save(at / "a.png", LABEL.astype(np.uint16)),
+    "one each, 255": lambda at: {"wood": save(at / "w.png", WOOD * np.uint8(255)), "red": save(at / "r.png", RED * np.uint8(255))},
+    "one each, 1": lambda at: {"red": save(at / "r.png", RED * np.uint8(1)), "wood": save(at / "w.png", WOOD * np.uint8(1))},
+    "one each, 1 bit": lambda at: {"red": save(at / "r.png", RED), "wood": save(at / "w.png", WOOD)},
+    "polygons": lambda at: coco(at, [(12, [box(5, 10, 15, 18), box(15, 10, 25, 18)]), (10, [box(3, 2, 12, 9)])]),
+    "RLE": lambda at: coco(at, [(10, rle(counts_of(RED))), (12, rle(compressed(WOOD)))]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("form", list(forms(None)))
+@pytest.mark.parametrize("form", FORMS)
 def test_every_form_is_the_same_labels(tmp_path, form):
-    found = labels(tmp_path, forms(tmp_path)[form]())
+    found = labels(tmp_path, FORMS[form](tmp_path))
     np.testing.assert_array_equal(found.label, LABEL)
     assert not found.left_out.any()
 
@@ -168,70 +152,51 @@ def test_another_size(tmp_path, form, size, hint):
     assert KEY in message and ("coco.json" if form == "coco" else "a.png") in message
 
 
-def test_unknown_label(tmp_path):
-    values = LABEL.copy()
-    values[0, :5] = 4
+@pytest.mark.parametrize("values, words", [
+    (np.vstack([np.full((1, W), 4, np.uint8), LABEL[1:]]), ["unknown label 4 (30 pixels)", "3 wood"]),
+    (np.zeros((H, W), np.uint8), ["the mask is empty"]),
+    (np.uint8(255) * (LABEL > 0), ["only 0 and 255", "masks: {red:"]),
+    (np.dstack([LABEL * 60, LABEL, LABEL]), ["colour picture", "one channel"]),
+    (np.dstack([LABEL] * 3 + [LABEL * 50]), ["transparent"]),
+])  # fmt: skip
+def test_a_mask_whose_values_are_no_labels(tmp_path, values, words):
     message = refusal(tmp_path, save(tmp_path / "a.png", values))
-    assert "a.png" in message and "unknown label 4 (5 pixels)" in message and "3 wood" in message
+    assert all(word in message for word in [*words, "a.png", KEY]), message
 
 
-@pytest.mark.parametrize("masks", ["label", "per material", "coco"])
+@pytest.mark.parametrize("masks", ["per material", "coco"])
 def test_empty(tmp_path, masks):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
-    message = refusal(
-        tmp_path, {"label": name, "per material": {"red": name, "wood": name}, "coco": coco(tmp_path, [])}[masks]
-    )
+    message = refusal(tmp_path, {"red": name, "wood": name} if masks == "per material" else coco(tmp_path, []))
     assert "the mask is empty" in message and KEY in message
 
 
-def test_only_0_and_255_says_how_a_binary_mask_is_given(tmp_path):
-    message = refusal(tmp_path, save(tmp_path / "a.png", np.uint8(255) * (LABEL > 0)), materials=["gold"])
-    assert "only 0 and 255" in message and "masks: {gold:" in message
-
-
-def test_colours(tmp_path):
-    picture = np.dstack([LABEL * 60, LABEL, LABEL])
-    message = refusal(tmp_path, save(tmp_path / "a.png", picture))
-    assert "colour picture" in message and "one channel" in message
-
-
-def test_transparency(tmp_path):
-    assert "transparent" in refusal(tmp_path, save(tmp_path / "a.png", np.dstack([LABEL] * 3 + [LABEL * 50])))
-
-
 def test_materials_that_overlap(tmp_path):
-    red, wood = LABEL == 1, LABEL > 0
-    masks = {
-        "wood": save(tmp_path / "w.png", np.uint8(255) * wood),
-        "red": save(tmp_path / "r.png", np.uint8(255) * red),
-    }
+    masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(tmp_path / "r.png", RED)}
     message = refusal(tmp_path, masks)
-    assert f"'red' and 'wood' share {red.sum()} pixels" in message and "w.png" in message and "r.png" in message
+    assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
 
 def test_outlines_that_share_an_edge_lose_it_and_ones_that_share_more_are_refused(tmp_path):
-    side = [{"category_id": 10, "segmentation": [box(0, 0, 20, 20)]}]
-    found = labels(tmp_path, coco(tmp_path, [*side, {"category_id": 11, "segmentation": [box(19, 0, 30, 20)]}]))
-    both = found.left_out
-    assert 0 < both.sum() <= H and (found.label[both] == 0).all() and {1, 2} <= set(found.label.ravel().tolist())
-    message = refusal(tmp_path, coco(tmp_path, [*side, {"category_id": 11, "segmentation": [box(10, 0, 30, 20)]}]))
+    side = (10, [box(0, 0, 20, 20)])
+    edge = labels(tmp_path, coco(tmp_path, [side, (11, [box(19, 0, 30, 20)])]))
+    both = edge.left_out
+    assert 0 < both.sum() <= H and (edge.label[both] == 0).all() and {1, 2} <= set(edge.label.ravel().tolist())
+    message = refusal(tmp_path, coco(tmp_path, [side, (11, [box(10, 0, 30, 20)])]))
     assert "'red' and 'white' share 200 pixels" in message
 
 
-@pytest.mark.parametrize(
-    "annotation, said",
-    [
-        ({"category_id": 13, "segmentation": [box(3, 2, 12, 9)]}, ["'whit'", "did you mean 'white'"]),
-        ({"category_id": 99, "segmentation": [box(3, 2, 12, 9)]}, ["99", "not in categories"]),
-        ({"category_id": 10, "segmentation": []}, ["only a box", "annotations[0].segmentation"]),
-        ({"category_id": 10, "segmentation": [[1, 2, 3, 4]]}, ["no polygon", "segmentation[0]"]),
-        ({"category_id": 10, "segmentation": [box(3, 2, 60, 9)]}, ["leaves the image", "30 × 20"]),
-        ({"category_id": 10, "segmentation": {"size": [W, H], "counts": [H * W]}}, ["20 × 30", "30 × 20"]),
-    ],
-)
-def test_bad_annotations(tmp_path, annotation, said):
-    message = refusal(tmp_path, coco(tmp_path, [annotation], categories=[*MATERIALS, "whit"]))
-    assert all(word in message for word in ["coco.json", *said]), message
+@pytest.mark.parametrize("category, segmentation, words", [
+    (13, [box(3, 2, 12, 9)], ["'whit'", "did you mean 'white'"]),
+    (99, [box(3, 2, 12, 9)], ["99", "not in categories"]),
+    (10, [], ["only a box", "annotations[0].segmentation"]),
+    (10, [[1, 2, 3, 4]], ["no polygon", "segmentation[0]"]),
+    (10, [box(3, 2, 60, 9)], ["leaves the image", "30 × 20"]),
+    (10, rle([H * W], (W, H)), ["20 × 30", "30 × 20"]),
+])  # fmt: skip
+def test_bad_annotations(tmp_path, category, segmentation, words):
+    message = refusal(tmp_path, coco(tmp_path, [(category, segmentation)], categories=[*MATERIALS, "whit"]))
+    assert all(word in message for word in ["coco.json", *words]), message
 
 
 def test_coco_without_the_photo(tmp_path):
@@ -241,7 +206,7 @@ def test_coco_without_the_photo(tmp_path):
 
 def test_coco_goes_by_the_whole_path_first(tmp_path):
     images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "other"), (7, "photos"))]
-    name = coco(tmp_path, [{"category_id": 10, "segmentation": [box(3, 2, 12, 9)]}], images=images)
+    name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images)
     assert labels(tmp_path, name).label.any()
     images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "a"), (7, "b"))]
     assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images))
@@ -268,9 +233,6 @@ def test_bad_object_masks(tmp_path, second, said):
     with pytest.raises(InputError, match=said) as caught:
         objects(tmp_path, masks)
     assert "b.png" in str(caught.value) and "photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
-
-
-# ---- limits ----------------------------------------------------------------------------------------------------
 
 
 def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):

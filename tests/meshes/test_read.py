@@ -16,15 +16,9 @@ from factorlib.meshes.ply import submesh
 from tests.faults.good import VERTICES, glb, gltf_header
 
 MATERIALS = ["red", "oak"]
-QUADS = """
-v 0 0 0
-v 1 0 0
-v 1 1 0
-v 0 1 0
-v 0 0 1
-v 1 0 1
-v 1 1 1
-v 0 1 1
+PARTS = {"shell": "red", "legs": "oak"}
+QUADS = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+QUADS += """
 g shell
 usemtl plastic
 f 4 3 2 1
@@ -63,37 +57,25 @@ def test_object_name_is_a_part_too(tmp_path):
 
 
 def test_an_objects_own_materials_go_before_the_meshs(tmp_path):
-    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"}, overrides={"shell": "oak"})
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, PARTS, overrides={"shell": "oak"})
     assert mesh.labels == (2,)
 
 
-def test_part_without_material_is_named(tmp_path):
-    with pytest.raises(InputError, match="legs.*no material") as caught:
-        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red"})
-    assert "mesh.obj" in str(caught.value) and caught.value.cure
-
-
-def test_part_that_the_mesh_lacks_is_named_with_the_nearest(tmp_path):
-    with pytest.raises(InputError, match="no part 'shel'") as caught:
-        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shel": "red", "legs": "oak"})
-    assert caught.value.cure == "did you mean 'shell'?"
-
-
-def test_part_with_two_materials_is_refused(tmp_path):
-    with pytest.raises(InputError, match="several materials"):
-        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "plastic": "oak", "legs": "oak"})
-
-
-def test_unknown_material_is_named(tmp_path):
-    with pytest.raises(InputError, match="unknown material 'ok'"):
-        read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "ok"})
+@pytest.mark.parametrize("parts, words, cure", [
+    ({"shell": "red"}, "legs.*no material", "legs: red|wood: red"),
+    ({"shel": "red", "legs": "oak"}, "no part 'shel'", "did you mean 'shell'?"),
+    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "name it once"),
+    ({"shell": "red", "legs": "ok"}, "unknown material 'ok'", "did you mean 'oak'?"),
+])  # fmt: skip
+def test_parts_and_materials_that_do_not_fit_are_named(tmp_path, parts, words, cure):
+    with pytest.raises(InputError, match=words) as caught:
+        read_mesh(obj(tmp_path, QUADS), MATERIALS, parts)
+    assert "mesh.obj" in str(caught.value) and any(each in caught.value.cure for each in cure.split("|"))
 
 
 def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "factorlib.meshes"):
-        mesh = read_mesh(
-            obj(tmp_path, QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, {"shell": "red", "legs": "oak"}
-        )
+        mesh = read_mesh(obj(tmp_path, QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, PARTS)
     assert len(mesh.faces) == 12  # 4 3 2 is half of the first quad, in either winding
     assert "1 zero-area" in caplog.text and "2 duplicate" in caplog.text
 
@@ -119,34 +101,24 @@ def test_plain_formats_hold_one_part(tmp_path, suffix):
     assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.999  # STL has no shared vertices: welded
 
 
-def test_written_ply_is_read_again_and_is_the_same_bytes(tmp_path):
-    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"})
+def test_written_ply_is_read_again_and_is_the_same_bytes_and_a_submesh_holds_one_material(tmp_path):
+    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, PARTS)
     for name in ("a.ply", "b.ply"):
         write_ply(tmp_path / name, mesh)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     again = read_mesh(tmp_path / "a.ply", MATERIALS, "red")
-    assert len(again.faces) == 12
     corners = [sorted(map(tuple, np.round(m.vertices[m.faces].reshape(-1, 9), 6))) for m in (mesh, again)]
     assert corners[0] == corners[1]
-
-
-def test_submesh_holds_one_material(tmp_path):
-    mesh = read_mesh(obj(tmp_path, QUADS), MATERIALS, {"shell": "red", "legs": "oak"})
     parts = [submesh(mesh, label) for label in mesh.labels]
     assert sum(len(p.faces) for p in parts) == 12 and all(p.faces.max() == len(p.vertices) - 1 for p in parts)
 
 
 def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
-    turn, quaternion = (
-        Rotation.from_euler("xyz", [0.3, -0.8, 1.1]),
-        Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_quat().tolist(),
-    )
-    header = gltf_header()
-    outer = np.eye(4)
+    turn, header, outer = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]), gltf_header(), np.eye(4)
     outer[:3, 3] = (5, 6, 7)
     header["nodes"] = [
         {"matrix": outer.T.ravel().tolist(), "children": [1]},
-        {"mesh": 0, "scale": [1, 2, 3], "rotation": quaternion, "translation": [1, 0, 0]},
+        {"mesh": 0, "scale": [1, 2, 3], "rotation": turn.as_quat().tolist(), "translation": [1, 0, 0]},
     ]
     (tmp_path / "a.glb").write_bytes(glb(header))
     expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
@@ -160,9 +132,8 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
     tilted = ball.vertex_normals + 0.2 * np.roll(ball.vertex_normals, 1, axis=1)
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
-    (tmp_path / f"ball.{suffix}").write_bytes(
-        made.export(file_type=suffix, **({"vertex_normal": True} if suffix == "ply" else {}))
-    )
+    options = {"vertex_normal": True} if suffix == "ply" else {}
+    (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **options))
     mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "red")
     nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
     assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
@@ -170,14 +141,9 @@ def test_normals_of_the_file_are_used(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "glb", "obj"])
 def test_what_trimesh_writes_and_reads_is_read_the_same(tmp_path, suffix):
-    made = trimesh.util.concatenate(
-        [trimesh.creation.torus(2, 0.5), trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))]
-    )
-    made.export(tmp_path / f"a.{suffix}")
-    theirs = trimesh.load_mesh(tmp_path / f"a.{suffix}")
-    ours = read_mesh(tmp_path / f"a.{suffix}", MATERIALS, "red")
-    triangles = [
-        np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0)
-        for t in (theirs.triangles, ours.vertices[ours.faces])
-    ]
+    box = trimesh.creation.box((1, 2, 3)).apply_translation((9, 0, 0))
+    trimesh.util.concatenate([trimesh.creation.torus(2, 0.5), box]).export(tmp_path / f"a.{suffix}")
+    theirs, ours = trimesh.load_mesh(tmp_path / f"a.{suffix}"), read_mesh(tmp_path / f"a.{suffix}", MATERIALS, "red")
+    both = theirs.triangles, ours.vertices[ours.faces]
+    triangles = [np.unique(np.sort(t.round(3), axis=1).reshape(-1, 9), axis=0) for t in both]
     assert triangles[0].shape == triangles[1].shape and np.allclose(*triangles, atol=2e-3)
