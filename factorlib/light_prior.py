@@ -59,11 +59,9 @@ def prior_of(
     cells, bar = fibonacci_sphere(count or CELLS), bar or Progress(disable=True)
     means = np.stack([means_of(path, cells) for path in bar.track(paths, description="reading")])
     logs, task = log_cells(means), bar.add_task("leaving one out", total=len(paths))
-    scores = (
-        leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done))
-        if scored and len(paths) > 1
-        else None
-    )
+    scores = None
+    if scored and len(paths) > 1:
+        scores = leave_one_out(logs, cells, lambda done, total: bar.update(task, completed=done))
     sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
 

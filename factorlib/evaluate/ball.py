@@ -208,9 +208,8 @@ def _visible_normals(cos_o: Float[np.ndarray, "n 1"], alpha: float) -> Float[np.
     along = (1 - lift) * np.sqrt(1 - across**2) + lift * along
     up = np.sqrt(np.maximum(1 - across**2 - along**2, 0))
     # basis of the stretched view v = (sin, 0, cos): t1 = (0, 1, 0), t2 = v × t1 = (−cos, 0, sin)
-    half = np.stack(
-        [alpha * (-cos * along + sin * up), alpha * across, np.maximum(sin * along + cos * up, 1e-9)], axis=-1
-    )
+    toward, upward = alpha * (-cos * along + sin * up), np.maximum(sin * along + cos * up, 1e-9)
+    half = np.stack([toward, alpha * across, upward], axis=-1)
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 

@@ -59,8 +59,7 @@ def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
     names = sorted({name for together in pairs.values() for name in together})
     linked = [(names.index(together[0]), names.index(name)) for together in pairs.values() for name in together]
     first, second = np.array(linked, dtype=int).reshape(-1, 2).T
-    _, label = components_of_graph(
-        coo_array((np.ones(len(linked)), (first, second)), shape=(len(names), len(names))), directed=False
-    )
+    graph = coo_array((np.ones(len(linked)), (first, second)), shape=(len(names), len(names)))
+    _, label = components_of_graph(graph, directed=False)
     order = list(dict.fromkeys(label.tolist()))
     return {name: order.index(number) for name, number in zip(names, label.tolist(), strict=True)}

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
@@ -141,13 +142,11 @@ def _scored_view(
     constant = [render(constant_light(truths[n].mean))[kept[n]] for n in names]
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
     factors = [gauge_factors(pictures, true, whites) for pictures in (found, constant)]
-    return {
-        n: {
-            g: ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors)))
-            for g in GAUGES
-        }
-        for i, n in enumerate(names)
-    }
+
+    def scored(i: int, g: str) -> ScoredLight:
+        return ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors)))
+
+    return {n: {g: scored(i, g) for g in GAUGES} for i, n in enumerate(names)}
 
 
 def _part(view: str, seen: Bool[np.ndarray, " t"] | None) -> slice | np.ndarray | None:
@@ -161,14 +160,13 @@ def _part(view: str, seen: Bool[np.ndarray, " t"] | None) -> slice | np.ndarray 
 
 
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
-    views = [v for v in _views() if any(v in s for s in scored)]
+    by_view = {v: [s[v] for s in scored if v in s] for v in _views()}
+    parts = ("estimate", "null")
     return {
-        v: ScoredLight(*(_mean_error([getattr(s[v], k) for s in scored if v in s]) for k in ("estimate", "null")))
-        for v in views
+        v: ScoredLight(*(_mean_error([getattr(s, k) for s in of]) for k in parts)) for v, of in by_view.items() if of
     }
 
 
 def _mean_error(errors: list[LightError]) -> LightError:
-    return LightError(
-        *(round(float(np.mean([getattr(e, f) for e in errors])), 9) for f in LightError.__struct_fields__)
-    )
+    values = np.array([msgspec.structs.astuple(e) for e in errors])
+    return LightError(*(round(float(np.mean(column)), 9) for column in values.T))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import correlate1d
@@ -83,7 +84,13 @@ def picture_errors(
     estimate, truth, union = estimate[box], truth[box], union[box]
     shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
     ssim = ssim_map(*shown, union)
-    return {name: _error_in(region[box], estimate, truth, shown, ssim, white) for name, region in regions.items()}
+
+    def error(region: Mask) -> PictureError:
+        psnr_linear = psnr(estimate[region], truth[region], white)
+        dssim = round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9)
+        return PictureError(psnr_linear, psnr(shown[0][region], shown[1][region], 1.0), dssim)
+
+    return {name: error(region[box]) for name, region in regions.items()}
 
 
 def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError | None:
@@ -95,24 +102,8 @@ def mean_error(errors: list[PictureError]) -> PictureError | None:
     """The mean of each number (of dB, for PSNR); None of none."""
     if not errors:
         return None
-    return PictureError(
-        *(round(float(np.mean([getattr(e, f) for e in errors])), 6) for f in PictureError.__struct_fields__)
-    )
-
-
-def _error_in(
-    region: Mask,
-    estimate: np.ndarray,
-    truth: np.ndarray,
-    shown: tuple[np.ndarray, np.ndarray],
-    ssim: np.ndarray,
-    white: float,
-) -> PictureError:
-    return PictureError(
-        psnr_linear_db=psnr(estimate[region], truth[region], white),
-        psnr_tonemapped_db=psnr(shown[0][region], shown[1][region], 1.0),
-        dssim=round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9),
-    )
+    values = np.array([msgspec.structs.astuple(e) for e in errors])
+    return PictureError(*(round(float(np.mean(column)), 6) for column in values.T))
 
 
 def _blurred(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:

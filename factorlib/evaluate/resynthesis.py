@@ -71,10 +71,8 @@ def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[s
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return Resynthesis(photos, None, None, None)
-    mean = {
-        g: ScoredPicture(*(mean_error([getattr(s[g], k) for s in scored]) for k in ("estimate", "null")))
-        for g in GAUGES
-    }
+    parts = ("estimate", "null")
+    mean = {g: ScoredPicture(*(mean_error([getattr(s[g], k) for s in scored]) for k in parts)) for g in GAUGES}
     worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
     return Resynthesis(photos, mean, *worst)
 
@@ -116,6 +114,5 @@ def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.n
 
 
 def _scored(estimate: Picture, shot: Shot, regions: dict) -> dict[str, PictureError]:
-    return picture_errors(
-        np.nan_to_num(estimate, posinf=0.0, neginf=0.0), shot.photo, {"": shot.pixels, **regions}, shot.white
-    )
+    estimate = np.nan_to_num(estimate, posinf=0.0, neginf=0.0)
+    return picture_errors(estimate, shot.photo, {"": shot.pixels, **regions}, shot.white)

@@ -12,6 +12,7 @@ show the default F0 of 0.04.  baseColor stays within one because max k_d + max k
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,8 @@ def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Map
         visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-    data = scene.export(
-        file_type="glb", include_normals=True, tree_postprocessor=lambda tree: _set_materials(tree, materials)
-    )
-    write_bytes(path, data)
+    exact = partial(_set_materials, materials=materials)
+    write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
 def _set_materials(tree: dict[str, Any], materials: Mapping[str, Reflectance]) -> None:
@@ -55,11 +54,6 @@ def gltf_material(material: Reflectance) -> dict[str, Any]:
     brightest = max(material.specular)
     base = np.array(material.diffuse) / (1 - brightest)
     colour = np.array(material.specular) / (DIELECTRIC * brightest) if brightest > 0 else np.ones(3)
-    return {
-        "pbrMetallicRoughness": {
-            "baseColorFactor": [*base.tolist(), 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": material.roughness,
-        },
-        "extensions": {EXTENSION: {"specularFactor": brightest, "specularColorFactor": colour.tolist()}},
-    }
+    plain = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
+    specular = {"specularFactor": brightest, "specularColorFactor": colour.tolist()}
+    return {"pbrMetallicRoughness": plain, "extensions": {EXTENSION: specular}}

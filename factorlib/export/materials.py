@@ -32,9 +32,8 @@ def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
 def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
     """The table with reflectances and their standard errors times `factor`, which `gauge` then tells."""
     gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
-    return msgspec.structs.replace(
-        table, materials={name: _scaled(one, factor) for name, one in table.materials.items()}, gauge=gauge
-    )
+    materials = {name: _scaled(one, factor) for name, one in table.materials.items()}
+    return msgspec.structs.replace(table, materials=materials, gauge=gauge)
 
 
 def _scaled(material: Solved, factor: float) -> Solved:

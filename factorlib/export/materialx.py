@@ -52,9 +52,8 @@ def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:
 def _add_material(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
     weight, diffuse, specular = mixture(material)
     _add(document, "oren_nayar_diffuse_bsdf", f"{prefix}_diffuse", "BSDF", color=diffuse, roughness=0.0)
-    schlick = _add(
-        document, "generalized_schlick_bsdf", f"{prefix}_specular", "BSDF", color0=specular, color90=specular
-    )
+    colours = {"color0": specular, "color90": specular}
+    schlick = _add(document, "generalized_schlick_bsdf", f"{prefix}_specular", "BSDF", **colours)
     _input(schlick, "roughness", "vector2", value=f"{material.alpha!r}, {material.alpha!r}")
     _input(schlick, "scatter_mode", "string", value="R")
     mix = _add(document, "mix", f"{prefix}_bsdf", "BSDF", mix=weight)
@@ -68,16 +67,8 @@ def _add_standard_surface(document: ET.Element, prefix: str, name: str, material
     brightest = max(material.specular)
     base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
-    _add(
-        document,
-        "standard_surface",
-        f"{prefix}_surface",
-        "surfaceshader",
-        base=1.0,
-        base_color=base,
-        specular_color=tint,
-        **numbers,
-    )
+    inputs = {"base": 1.0, "base_color": base, "specular_color": tint, **numbers}
+    _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", **inputs)
     _add_surface_material(document, prefix, name)
 
 

@@ -95,9 +95,8 @@ def _add_sensor(scene: ET.Element, view: View, shapes: Sequence[Shape]) -> None:
     near, far = clip_distances(shapes)
     field = float(np.degrees(2 * np.arctan(w / (2 * view.focal_px))))
     _values(sensor, float={"fov": field, **offset, "near_clip": near, "far_clip": far}, string={"fov_axis": "x"})
-    ET.SubElement(
-        ET.SubElement(sensor, "transform", name="to_world"), "lookat", origin="0, 0, 0", target="0, 0, -1", up="0, 1, 0"
-    )
+    to_world = ET.SubElement(sensor, "transform", name="to_world")
+    ET.SubElement(to_world, "lookat", origin="0, 0, 0", target="0, 0, -1", up="0, 1, 0")
     film = ET.SubElement(sensor, "film", type="hdrfilm")
     _values(film, integer={"width": w, "height": h}, string={"pixel_format": "rgb", "component_format": "float32"})
     ET.SubElement(film, "rfilter", type="box")

@@ -48,9 +48,8 @@ def scene_text(view: View, shapes: Sequence[Shape], materials: Mapping[str, Refl
     scene = [*_camera(view, shapes), *_light(light), *_materials(materials, named), *_objects(shapes, named)]
     film = ["rel camera = </scene/camera>", f"uniform int2 resolution = ({view.width}, {view.height})"]
     about = ['defaultPrim = "scene"', UP_AXIS[0], 'renderSettingsPrimPath = "/Render/photo"', UP_AXIS[1]]
-    return _layer(
-        about, [*_prim('Xform "scene"', scene), *_prim('Scope "Render"', _prim('RenderSettings "photo"', film))]
-    )
+    render = _prim('Scope "Render"', _prim('RenderSettings "photo"', film))
+    return _layer(about, [*_prim('Xform "scene"', scene), *render])
 
 
 def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -150,18 +149,12 @@ def _materials(materials: Mapping[str, Reflectance], named: Mapping[str, str]) -
 def _material(name: str, identifier: str, material: Reflectance) -> list[str]:
     shader = ['uniform token info:id = "UsdPreviewSurface"']
     for key, value in shader_inputs(material).items():
-        if np.ndim(value):
-            shader.append(f"color3f inputs:{key} = {_tuple(value)}")
-        else:
-            shader.append(
-                f"int inputs:{key} = {value}" if isinstance(value, int) else f"float inputs:{key} = {_number(value)}"
-            )
+        kind = "color3f" if np.ndim(value) else "int" if isinstance(value, int) else "float"
+        words = {"color3f": _tuple, "int": str, "float": _number}[kind](value)
+        shader.append(f"{kind} inputs:{key} = {words}")
     surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
-    return _prim(
-        f'Material "{identifier}"',
-        [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])],
-        _shown(name),
-    )
+    lines = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
+    return _prim(f'Material "{identifier}"', lines, _shown(name))
 
 
 def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
@@ -174,19 +167,15 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
         place = np.eye(4)
         place[:3, :3] = YUP_FROM_CAMERA
         parts = [line for shape in objects[name] for line in _part(shape, materials[shape.material])]
-        lines += _prim(
-            f'Xform "{identifier}"', [*_transform(place @ objects[name][0].cam_from_object), *parts], _shown(name)
-        )
+        about = [*_transform(place @ objects[name][0].cam_from_object), *parts]
+        lines += _prim(f'Xform "{identifier}"', about, _shown(name))
     return _prim('Scope "objects"', lines)
 
 
 def _part(shape: Shape, material: str) -> list[str]:
     file = f"./{PurePosixPath(shape.file).with_suffix(SUFFIX)}"
-    about = [
-        'prepend apiSchemas = ["MaterialBindingAPI"]',
-        *_shown(shape.material),
-        f"prepend references = {_asset(file)}",
-    ]
+    binding, references = 'prepend apiSchemas = ["MaterialBindingAPI"]', f"prepend references = {_asset(file)}"
+    about = [binding, *_shown(shape.material), references]
     return _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], about)
 
 
@@ -217,11 +206,8 @@ def _shown(name: str) -> list[str]:
 
 
 def _string(text: str) -> str:
-    return (
-        '"'
-        + "".join(ESCAPES.get(c, c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else c) for c in text)
-        + '"'
-    )
+    plain = {c: c if c.isprintable() or ord(c) >= 128 else f"\\x{ord(c):02x}" for c in text} | ESCAPES
+    return '"' + "".join(plain[c] for c in text) + '"'
 
 
 def _asset(path: str) -> str:

@@ -90,9 +90,8 @@ def mtlx(material: Reflectance, angles: Angles) -> Parts:
 def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
     """The standard surface of `factorlib.export.materialx`, whose F is 1: there E · (1 + (1 − E)/E) = 1."""
     brighter = 1 / albedo(material.alpha, angles.no)
-    return _parts(
-        angles, material.diffuse, np.multiply.outer(brighter, material.specular), correlated(material.alpha, angles)
-    )
+    specular = np.multiply.outer(brighter, material.specular)
+    return _parts(angles, material.diffuse, specular, correlated(material.alpha, angles))
 
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
@@ -106,9 +105,8 @@ def usd(material: Reflectance, angles: Angles) -> Parts:
     return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
 
 
-MODELS: dict[str, Model] = {
-    model.__name__: model for model in (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface, usd)
-}
+_ALL = (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface, usd)
+MODELS: dict[str, Model] = {model.__name__: model for model in _ALL}
 
 
 def filed(name: str, material: Reflectance) -> Reflectance:
@@ -169,9 +167,8 @@ def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "
     """From the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
-    specular = (
-        entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
-    )
+    plain = {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
+    specular = entry["extensions"][EXTENSION] if extension else plain
     f90 = specular["specularFactor"]
     f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)

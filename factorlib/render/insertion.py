@@ -113,9 +113,8 @@ def spot_at(
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
-        raise InputError(
-            f"pixel {pixel} shows no ground: it lies above the horizon", key="at", cure="name a pixel further down"
-        )
+        found = f"pixel {pixel} shows no ground: it lies above the horizon"
+        raise InputError(found, key="at", cure="name a pixel further down")
     return Spot(plane, point, relative_height * height_over(plane, neighbour))
 
 
@@ -158,10 +157,8 @@ def inserted(
     """
     scene, photo = backdrop.scene, backdrop.photo
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    there, more = (
-        {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)},
-        shapes([new], scene.materials),
-    )
+    there = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
+    more = shapes([new], scene.materials)
 
     def traced(entries: dict[str, Any], samples: int = samples) -> Picture:
         """With the same random numbers each time."""
@@ -174,9 +171,10 @@ def inserted(
         found = "the new object is not seen: it stands outside the picture, or something hides it"
         raise InputError(found, key="at", cure="say where it stands, `at: [x, y]`, or make it smaller")
     report(1)
-    diffuse = ground.diffuse or _ground_colour(
-        traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES), photo, shows_ground
-    )
+    diffuse = ground.diffuse
+    if diffuse is None:
+        grey = traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES)
+        diffuse = _ground_colour(grey, photo, shows_ground)
     report(2)
     disc = _disc(spot, _lambertian(diffuse))
     without = traced(disc)
@@ -218,11 +216,8 @@ def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
 
 def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
     """The new object shines with radiance 1, all else is black: what is seen is its share of each pixel."""
-    glowing = {
-        f"{new.name}_{label}_{side}": _emitter(new, label, side)
-        for label in new.mesh.labels
-        for side in range(1 + new.mesh.open)
-    }
+    sides = [(label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)]
+    glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label, side in sides}
     black = shapes(scene.objects, scene.materials, black=[each.name for each in scene.objects])
     picture = rendered({**black, **glowing}, camera, samples, 1, 1)
     return np.clip(picture[..., 0], 0, 1)
@@ -234,12 +229,8 @@ def _emitter(new: Placed, label: int, side: int) -> Any:
     if side:
         behind = part.vertices - HAIR * new.mesh.radius * part.normals
         part = Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True)
-    return shape(
-        part,
-        {"type": "diffuse", "reflectance": rgb(0.0)},
-        new.world_from_object,
-        {"type": "area", "radiance": rgb(1.0)},
-    )
+    black, emitter = {"type": "diffuse", "reflectance": rgb(0.0)}, {"type": "area", "radiance": rgb(1.0)}
+    return shape(part, black, new.world_from_object, emitter)
 
 
 def _shadow(
