@@ -9,11 +9,11 @@ from tests.export import made_export
 collect_ignore = ["in_materialx.py"]  # runs in a process of its own, where MaterialX is installed
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def exported(tmp_path_factory):
-    """Inputs of `export`, and the folder of what it wrote."""
+    """Inputs of `export`, and the folder of what it wrote; nobody changes them."""
     folder = tmp_path_factory.mktemp("export")
     inputs = made_export.make(folder)
     (folder / "export").mkdir()
-    export.main(export.Params(), inputs, folder / "export", silent)
+    export.main(export.Params(height=256), inputs, folder / "export", silent)
     return inputs, folder / "export"

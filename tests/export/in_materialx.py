@@ -1,8 +1,8 @@
-"""MaterialX' own GLSL renderer, in a process of its own: a ball under one lamp, as the shaders that MaterialX generates show it.
+"""MaterialX' own GLSL renderer, in a process of its own: a ball under one lamp, by the shaders that it generates.
 
     python in_materialx.py <folder> <size> <x,y,z: towards the lamp> <surface> …
 
-reads m.mtlx and ball.obj in the folder and writes <surface>.npy: [size, size, 3], rows from the bottom; the ball of radius 1 fills it.
+reads m.mtlx and ball.obj in the folder and writes <surface>.npy: [size, size, 3], rows from the bottom; the ball fills it.
 """
 
 from __future__ import annotations

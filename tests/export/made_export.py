@@ -1,4 +1,4 @@
-"""Small inputs of `export`, `render` and `recipes`, and a whole small result, made by hand: two objects in two photos, a light of coloured lobes, and solved numbers.
+"""Small inputs of `export`, `render` and `recipes`, and a whole small result, made by hand.
 
 The first photo shows a ball, principal point off centre; the second an ellipsoid of two materials far off the
 axis, turned, in a light fixed to the world.  The meshes are fine enough that their facets do not show.

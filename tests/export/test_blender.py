@@ -1,4 +1,4 @@
-"""Exported scenes, opened and rendered in Blender: frames, exposure, light and materials against closed forms and Mitsuba's picture."""
+"""Exported scenes rendered in Blender: frames, light and materials against closed forms and Mitsuba's picture."""
 
 from pathlib import Path
 
@@ -106,7 +106,7 @@ def test_light_of_one_texel_gives_the_radiance_it_should(balls, name):
 
 @pytest.mark.long
 def test_what_differs_from_the_solved_model_is_the_shadowing(balls):
-    """Light that grazes a rough metal: Cycles shows what the height-correlated Smith term says, not the separable one."""
+    """Light that grazes a rough metal: Cycles shows the height-correlated Smith term, not the separable one."""
     found, alpha = balls["grazing"][..., :3], balls["grazing"][..., 3]
     (separable, ni), (correlated, _) = (closed_form("grazing", model) for model in (viewers.solved, viewers.blender))
     lit = (ni > 0.3) & (alpha == 1)

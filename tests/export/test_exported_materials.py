@@ -19,7 +19,8 @@ def bright(scale: float) -> Reflectance:
     return Reflectance(*(tuple(scale * v for v in colour) for colour in ((0.9, 0.3, 0.2), (0.1, 0.2, 0.3))), 0.5)
 
 
-CASES = {"bright": bright(0.8), "lambertian": Reflectance((0.2, 0.3, 0.4), (0, 0, 0), 0.9), "metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
+CASES = {"bright": bright(0.8), "lambertian": Reflectance((0.2, 0.3, 0.4), (0, 0, 0), 0.9),
+"metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
          "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
 
 

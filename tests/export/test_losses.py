@@ -20,7 +20,7 @@ WITHOUT_FRESNEL = [name for name in MODELS if name not in ("glb_plain", "usd")]
 
 
 def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
-    """Angles of directions spread evenly over half the hemisphere (the other half mirrors it), and their solid angle, doubled."""
+    """Angles of directions spread evenly over half the hemisphere, and their solid angle, doubled."""
     ni, phi = (a.reshape(-1) for a in np.meshgrid(*2 * [(np.arange(count) + 0.5) / count]))
     io = ni * no + np.sqrt((1 - ni**2) * (1 - no**2)) * np.cos(np.pi * phi)
     oh = np.sqrt((1 + io) / 2)

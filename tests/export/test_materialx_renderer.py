@@ -36,13 +36,9 @@ def pictures(tmp_path_factory):
     _write_ball(folder)
     names = [f"m_{material}_{surface}" for material in MATERIALS for surface in SURFACES]
     script = [
-        sys.executable,
-        str(Path(__file__).with_name("in_materialx.py")),
-        str(folder),
-        str(SIZE),
-        ",".join(map(str, LAMP)),
-        *names,
-    ]
+        sys.executable, str(Path(__file__).with_name("in_materialx.py")), str(folder), str(SIZE),
+        ",".join(map(str, LAMP)), *names,
+    ]  # fmt: skip
     done = subprocess.run([*screen, *script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return {name: np.load(folder / f"{name}.npy") for name in names}

@@ -1,4 +1,4 @@
-"""Exported scenes, rendered by Mitsuba, are the pipeline's own pictures: camera, poses, materials, light and every frame."""
+"""Exported scenes, rendered by Mitsuba, are the pipeline's own pictures: camera, poses, materials and light."""
 
 from functools import cache
 

@@ -16,8 +16,6 @@ from factorlib.meshes.ply import submesh
 from factorlib.meshes.read import read_mesh
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.stage import silent
-from stages import export
 from tests.export import made_export
 
 ROWS = 256
@@ -109,15 +107,6 @@ def pxr():
     return pytest.importorskip("pxr", reason=MISSING)
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("usd")
-    inputs = made_export.make(folder)
-    (folder / "export").mkdir()
-    export.main(export.Params(height=ROWS, mitsuba_height=8), inputs, folder / "export", silent)
-    return inputs, folder / "export"
-
-
 def opened(exported, photo):
     from pxr import Usd
 
@@ -195,7 +184,7 @@ def test_meshes_are_bound_to_the_exported_materials(pxr, exported, photo):
 
 @pytest.mark.parametrize("photo", PHOTOS)
 def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
-    """By the layout that OpenUSD's DomeLight documents: OpenEXR's, latitude up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
+    """By the layout that OpenUSD's DomeLight documents: OpenEXR's, up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
     from pxr import UsdLux
 
     stage = opened(exported, photo)

@@ -1,4 +1,4 @@
-"""USD scenes read by Blender's own importer: camera, places, materials, and a ball that its dome light lights from the right side."""
+"""USD scenes read by Blender's own importer: camera, places, materials, and a ball lit from the right side."""
 
 import json
 

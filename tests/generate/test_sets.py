@@ -79,7 +79,7 @@ def test_only_the_jpeg_clips(small):
 
 
 def test_a_matte_pixel_is_its_irradiance(small):
-    """Photo, mask, normals, light and exposure belong together: Lambert's law from the truth alone gives the red ball."""
+    """Photo, mask, normals, light and exposure belong together: Lambert's law from the truth gives the red ball."""
     radiance, labels = read_photo(small / "photos/garden.exr").radiance, read_png(small / "masks/garden.png")[..., 0]
     maps, light = read_exr(small / "truth/garden_normal.exr"), read_rgb_exr(small / "truth/garden_light.exr")
     normal = np.stack([maps[f"normal.{axis}"] for axis in "xyz"], axis=-1)[labels == 1] @ YUP_FROM_CAMERA

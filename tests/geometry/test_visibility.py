@@ -41,15 +41,10 @@ def open_share(seen, normal):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize(
-    "part",
-    [
-        ball(subdivisions=1),
-        ball(subdivisions=3),
-        trimesh.creation.box(extents=(1.5, 1, 0.7)),
-        trimesh.creation.cylinder(0.4, 1.5, sections=12),
-    ],
-)
+@pytest.mark.parametrize("part", [
+    ball(subdivisions=1), ball(subdivisions=3), trimesh.creation.box(extents=(1.5, 1, 0.7)),
+    trimesh.creation.cylinder(0.4, 1.5, sections=12),
+])  # fmt: skip
 def test_no_convex_mesh_hides_anything_from_itself_however_coarse(part, scale):
     """Smooth normals lean up to 30° away from the faces here."""
     mesh = mesh_of([part.copy().apply_scale(scale)], crease_deg=60.0)

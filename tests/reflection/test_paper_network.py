@@ -1,4 +1,4 @@
-"""The paper's operator: laws that hold whatever its weights, what the shipped ones reach, and what they learned from."""
+"""The paper's operator: laws that hold whatever its weights, what the shipped ones reach and learned from."""
 
 import math
 import subprocess
@@ -58,23 +58,19 @@ def material(**changes):
     return SimpleNamespace(**(MATERIAL | changes))
 
 
-def test_radiance_is_not_negative_and_linear_in_weight_and_reflectance():
+def test_radiance_is_not_negative_and_linear_and_channels_know_nothing_of_each_other():
     light, normals, views = points()
-    radiance = EXACT(light, material(), normals, views)
+    radiance, turned = EXACT(light, material(), normals, views), [2, 0, 1]
     assert (radiance >= 0).all() and radiance.max() > 0
-    brighter = SimpleNamespace(**(vars(light) | {"weight": 3 * light.weight}))
-    torch.testing.assert_close(EXACT(brighter, material(), normals, views), 3 * radiance)
-    doubled = material(diffuse=2 * MATERIAL["diffuse"], specular=2 * MATERIAL["specular"])
-    torch.testing.assert_close(EXACT(light, doubled, normals, views), 2 * radiance)
 
+    def of(weight, **reflectance):
+        return EXACT(SimpleNamespace(**(vars(light) | {"weight": weight})), material(**reflectance), normals, views)
 
-def test_channels_know_nothing_of_each_other():
-    light, normals, views = points()
-    order = [2, 0, 1]
-    turned = SimpleNamespace(**(vars(light) | {"weight": light.weight[:, order]}))
-    swapped = material(diffuse=MATERIAL["diffuse"][order], specular=MATERIAL["specular"][order])
+    torch.testing.assert_close(of(3 * light.weight), 3 * radiance)
+    both = {name: MATERIAL[name] for name in ("diffuse", "specular")}
+    torch.testing.assert_close(of(light.weight, **{k: 2 * v for k, v in both.items()}), 2 * radiance)
     torch.testing.assert_close(
-        EXACT(turned, swapped, normals, views), EXACT(light, material(), normals, views)[:, order]
+        of(light.weight[:, turned], **{k: v[turned] for k, v in both.items()}), radiance[:, turned]
     )
 
 
@@ -93,7 +89,7 @@ def test_the_frame_of_the_cosines_has_the_cosines_and_the_half_vector_of_the_con
 @pytest.mark.parametrize("operator", [OPERATOR, EXACT], ids=["float32", "float64"])
 @pytest.mark.parametrize("roughness", [0.0, 0.08, 0.5, 1.0])
 def test_values_and_gradients_are_finite_and_values_not_negative_everywhere(operator, roughness):
-    """Every combination of special and ordinary angles, views from behind included, far beyond the sharpness in training."""
+    """Every combination of special and ordinary angles, views from behind too, far beyond the sharpness in training."""
     no = torch.tensor([-1, -0.3, 0, 1e-4, 0.02, 0.5, 0.999999, 1]).double()
     tilt = torch.tensor([0, 1e-7, 1e-3, 0.3, math.pi / 2, 2.5, math.pi - 1e-4, math.pi]).double()
     turn = torch.tensor([0, 1e-3, 1, math.pi / 2, math.pi]).double()
@@ -166,7 +162,7 @@ def test_training_lessens_the_error_and_gives_the_same_bytes_again():
 
 
 def test_rendered_spheres_are_what_the_reference_says(monkeypatch):
-    """Nothing is assumed of frames, the lobe's map or Mitsuba's materials: mean errors within Monte Carlo noise of zero."""
+    """Nothing is assumed of frames, the map or Mitsuba's materials: mean errors within Monte Carlo noise of zero."""
     pytest.importorskip("mitsuba", reason="Mitsuba cannot run here, so that the training set is not checked")
     monkeypatch.setenv("FACTORLIB_MITSUBA", "scalar_rgb")  # the variant that runs everywhere
     from factorlib.generate.lobe_spheres import Spheres, rendered

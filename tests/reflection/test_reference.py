@@ -18,16 +18,10 @@ def scalars(*values):
     return tuple(torch.tensor([v], dtype=torch.float64) for v in values)
 
 
-@pytest.mark.parametrize(
-    ("roughness", "sharpness", "no", "nz", "oz"),
-    [
-        (1.0, 0.1, 0.7, 0.5, 0.4),
-        (0.6, 3.0, 0.3, 0.2, -0.6),
-        (0.4, 40.0, 0.9, -0.1, -0.2),
-        (0.5, 200.0, 0.15, 0.1, -0.9),
-        (0.4, 20.0, 0.95, 0.9, 0.8),
-    ],
-)
+@pytest.mark.parametrize(("roughness", "sharpness", "no", "nz", "oz"), [
+    (1.0, 0.1, 0.7, 0.5, 0.4), (0.6, 3.0, 0.3, 0.2, -0.6), (0.4, 40.0, 0.9, -0.1, -0.2), (0.5, 200.0, 0.15, 0.1, -0.9),
+    (0.4, 20.0, 0.95, 0.9, 0.8),
+])  # fmt: skip
 def test_equals_an_independent_integrator(roughness, sharpness, no, nz, oz):
     diffuse, glossy = brute_force(roughness, sharpness, no, nz, oz)
     r, lam, no, nz, oz = scalars(roughness, sharpness, no, nz, oz)

@@ -20,7 +20,8 @@ COMPILED, TORCH = (
 )
 FAST = {
     "closed_form": reflection_operator("closed_form"), "network": COMPILED, "network in torch": TORCH,
-    "closed_form float64": reflection_operator("closed_form", dtype="float64"), "network float64": reflection_operator("network", dtype="float64"),
+    "closed_form float64": reflection_operator("closed_form", dtype="float64"),
+    "network float64": reflection_operator("network", dtype="float64"),
 }  # fmt: skip
 fast = pytest.mark.parametrize("name", FAST)
 single = pytest.mark.parametrize("name", ["closed_form", "network", "network in torch"])
@@ -106,7 +107,8 @@ def gradients(operator, leaves) -> dict[str, torch.Tensor]:
 @fast
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(
-    normal=vector, view=vector, axis=vector, place=st.sampled_from(PLACES), roughness=st.floats(0.03, 1), weight=st.sampled_from([0.0, 1.0, 1e6]),
+    normal=vector, view=vector, axis=vector, place=st.sampled_from(PLACES), roughness=st.floats(0.03, 1),
+    weight=st.sampled_from([0.0, 1.0, 1e6]),
     log_sharpness=st.floats(math.log(1e-4), math.log(1e6)), cosine=st.sampled_from([None, 1e-4, 1.0]),
 )  # fmt: skip
 def test_radiance_and_every_gradient_are_finite(
@@ -149,7 +151,8 @@ def test_gradients_obey_the_laws_of_the_radiance(name, sharpness):
 # what is not a number -------------------------------------------------------------------------------------------------
 
 INPUTS = ("roughness", "sharpness", "no", "nz", "oz")
-TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no": ("specular",), "nz": ("diffuse", "specular"), "oz": ("specular",)}  # fmt: skip
+TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no": ("specular",),
+"nz": ("diffuse", "specular"), "oz": ("specular",)}  # fmt: skip
 
 
 @fast

@@ -1,7 +1,8 @@
-"""The whole pipeline on data/synthetic, by the runner as a user runs it, against the numbers stored of the last run and what seeds
-change of them (`benchmarks.reference`), and against the bounds of `evaluate.table`, which are how good it must be at worst.
+"""The whole pipeline on data/synthetic, by the runner as a user runs it.
 
-The run uses the project's own build/, so that what is current there is not made again: keys are by content.
+Its numbers are compared with those stored of the last run and what seeds change of them (`benchmarks.reference`), and with the
+bounds of `evaluate.table`, which are how good it must be at worst.  The run uses the project's own build/, so that what is
+current there is not made again: keys are by content.
 """
 
 from __future__ import annotations
@@ -9,37 +10,22 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from benchmarks.reference import complaint, differences, read_stored
-from factorlib.evaluate.table import SYNTHETIC, Row, rows_of, table_text
+from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
 from factorlib.jsonfile import read_json
+from factorlib.runner.project import LIBRARY
 
-ROOT = Path(__file__).resolve().parents[2]
 
-
-@pytest.fixture(scope="module")
-def rows() -> list[Row]:
+def test_every_number_is_as_stored_and_every_bound_holds():
     command = [sys.executable, "-m", "factorlib", "all", "--dataset", "synthetic"]
     environment = {k: v for k, v in os.environ.items() if k not in ("DATASET", "FACTORLIB_ROOT")}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
-    return rows_of(read_json(ROOT / "build" / "synthetic" / "evaluate" / "metrics.json"), SYNTHETIC)
-
-
-def test_every_number_is_as_stored(rows):
-    found = differences(read_json(ROOT / "build" / "synthetic" / "evaluate" / "metrics.json"), read_stored())
-    assert not found, complaint(found)
-
-
-def test_every_bound_holds(rows):
-    text = table_text(rows)
-    print(text)
+    metrics = read_json(LIBRARY / "build" / "synthetic" / "evaluate" / "metrics.json")
+    moved, rows = differences(metrics, read_stored()), rows_of(metrics, SYNTHETIC)
+    assert not moved, complaint(moved)
+    print(text := table_text(rows))
     assert all(row.ok for row in rows), f"data/synthetic misses its bounds:\n{text}"
-
-
-def test_the_report_is_there(rows):
-    page = (ROOT / "build" / "synthetic" / "report" / "index.html").read_text(encoding="utf-8")
+    page = (LIBRARY / "build" / "synthetic" / "report" / "index.html").read_text(encoding="utf-8")
     assert "Re-synthesis" in page and "Materials against the truth" in page

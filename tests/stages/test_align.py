@@ -4,49 +4,38 @@ from __future__ import annotations
 
 import json
 import logging
+import warnings
 
 import msgspec
 import numpy as np
 import pytest
 
+from factorlib.align.given import check_before_camera, warn_of_camera
 from factorlib.align.search import Search
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
-from factorlib.images.exr import read_exr, write_exr
-from factorlib.jsonfile import write_json
+from factorlib.images.exr import read_exr
+from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.stage import Inputs, silent
 from stages import align
 from tests.align.scenes import blob, chair, photo_of
+from tests.stages.made import chair_facts, entry_of, write_masks
 
-FACTS = {"width": 200, "height": 150, "factor": 1, "original_size": [200, 150]}
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
+KNOWN = {"pose_given": True, "focal": 300.0, "source": "dataset"}
 
 
-def step(
-    tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, source=None, seed=8, edit=lambda label: label
-):
+def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, source=None, edit=lambda label: label):
     """Inputs of one photo of `mesh_in_photo` that is said to show `mesh_given`; and the truth."""
-    caster, camera, pose = photo_of(mesh_in_photo, seed, width=200, height=150)
-    label = edit(rasterise(caster, camera, pose).label.astype(float))
+    caster, camera, pose = photo_of(mesh_in_photo, 8, width=200, height=150)
     masks = tmp_path / "masks"
     masks.mkdir()
-    zero = np.zeros(label.shape)
-    write_exr(masks / "a.exr", {"R": label, "G": label, "B": label, "label": label, "left_out": zero, "object": zero})
-    write_json(masks / "a.json", {**FACTS, "focal_px": focal, "focal_source": source})
+    write_masks(masks, "a", edit(rasterise(caster, camera, pose).label.astype(float)), focal, source)
     write_ply(tmp_path / "chair.ply", mesh_given)
-    obj = {"name": "chair", "mesh": "chair"}
-    if pose_given:
-        obj["pose"] = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-    facts = {
-        "dataset.materials": ["white"],
-        "dataset.objects": {
-            "camera": {},
-            "objects": [obj],
-            "meshes": {"chair": {"file": "chair.ply", "material": "white"}},
-        },
-    }
+    objects = chair_facts(**({"pose": entry_of(pose)} if pose_given else {}))
+    facts = {"dataset.materials": ["white"], "dataset.objects": objects}
     return Inputs({"masks": masks}, facts, {"chair.ply": tmp_path / "chair.ply"}, "a"), caster, camera, pose
 
 
@@ -57,13 +46,18 @@ def run(tmp_path, inputs, name="out", **params):
     return out, json.loads((out / "a.json").read_text())
 
 
+def is_at(obj, pose):
+    return obj["rotation"] == pose.rotation.tolist() and obj["translation"] == pose.translation.tolist()
+
+
 def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
-    inputs, caster, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
+    inputs, caster, camera, pose = step(tmp_path, chair(), chair(), **KNOWN)
     out, entry = run(tmp_path, inputs)
     obj = entry["objects"]["chair"]
-    assert obj["rotation"] == pose.rotation.tolist() and obj["translation"] == pose.translation.tolist()
+    assert (
+        is_at(obj, pose) and obj["source"] == "given" and obj["silhouette_iou"] > 0.99 and obj["label_agreement"] == 1
+    )
     assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["principal_point"] == [100.0, 75.0]
-    assert obj["source"] == "given" and obj["silhouette_iou"] > 0.99 and obj["label_agreement"] == 1
     maps, truth = read_exr(out / "a.exr"), rasterise(caster, camera, pose)
     both = (maps["label"] > 0) & (truth.label > 0)
     for k, axis in enumerate("xyz"):
@@ -74,17 +68,13 @@ def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
 
 def test_focal_length_of_a_given_pose_is_found(tmp_path):
     inputs, _, camera, _ = step(tmp_path, chair(), chair(), pose_given=True)
-    entry = run(tmp_path, inputs)[1]
-    assert (
-        entry["camera"]["focal_px"] == pytest.approx(camera.focal, rel=0.01)
-        and entry["camera"]["focal_source"] == "estimated"
-    )
+    entry = run(tmp_path, inputs)[1]["camera"]
+    assert entry["focal_px"] == pytest.approx(camera.focal, rel=0.01) and entry["focal_source"] == "estimated"
 
 
-def test_found_from_nothing_and_the_same_bytes_twice(tmp_path):
+def test_a_pose_is_found_from_nothing_and_the_same_bytes_twice(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair())
-    first, entry = run(tmp_path, inputs, "first")
-    second, _ = run(tmp_path, inputs, "second")
+    (first, entry), (second, _) = (run(tmp_path, inputs, name) for name in ("first", "second"))
     obj = entry["objects"]["chair"]
     assert obj["silhouette_iou"] > 0.97 and obj["doubts"] == [] and obj["source"] == "found"
     assert 0 <= obj["runner_up"]["score"] < obj["score"]
@@ -94,25 +84,16 @@ def test_found_from_nothing_and_the_same_bytes_twice(tmp_path):
 
 def test_exif_of_a_crop_is_found_out(tmp_path, caplog):
     inputs, _, camera, _ = step(tmp_path, chair(), chair(), focal=90.0, source="exif")
-    with caplog.at_level(logging.WARNING, "factorlib.align"):
-        entry = run(tmp_path, inputs)[1]
+    entry = run(tmp_path, inputs)[1]["camera"]
     assert "EXIF" in caplog.text and "camera.focal_px" in caplog.text
-    assert entry["camera"]["focal_source"] == "estimated" and entry["camera"]["focal_px"] == pytest.approx(
-        camera.focal, rel=0.2
-    )
+    assert entry["focal_source"] == "estimated" and entry["focal_px"] == pytest.approx(camera.focal, rel=0.2)
 
 
 def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, caplog):
     inputs, _, _, _ = step(tmp_path, chair(), blob(), focal=300.0, source="dataset")
-    with caplog.at_level(logging.WARNING, "factorlib.align"):
-        out, entry = run(tmp_path, inputs)
-    obj = entry["objects"]["chair"]
-    assert (
-        obj["doubts"]
-        and obj["left_out"]
-        and "keypoints or pose" in caplog.text
-        and "left out of the solve" in caplog.text
-    )
+    out, entry = run(tmp_path, inputs)
+    assert entry["objects"]["chair"]["doubts"] and entry["objects"]["chair"]["left_out"]
+    assert "keypoints or pose" in caplog.text and "left out of the solve" in caplog.text
     maps = read_exr(out / "a.exr")
     assert (maps["label"] > 0).any() and not maps["confidence"].any()
     kept, entry = run(tmp_path, inputs, "kept", keep_doubtful=True)
@@ -122,8 +103,7 @@ def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, c
 
 
 def test_a_given_pose_is_doubted_but_never_left_out(tmp_path):
-    inputs, _, _, _ = step(tmp_path, chair(), blob(), pose_given=True, focal=300.0, source="dataset")
-    out, entry = run(tmp_path, inputs)
+    out, entry = run(tmp_path, step(tmp_path, chair(), blob(), **KNOWN)[0])
     obj = entry["objects"]["chair"]
     assert obj["doubts"] and not obj["left_out"] and read_exr(out / "a.exr")["confidence"].any()
 
@@ -134,94 +114,118 @@ def test_object_without_a_pixel_is_refused(tmp_path):
         run(tmp_path, inputs)
 
 
+# ── given poses and cameras that contradict the photo ────────────────────────────────────────────────────────────────
+
+
+def moved(tmp_path, translation, **known):
+    inputs, *_ = step(tmp_path, blob(), blob(), **KNOWN | known)
+    inputs.facts["dataset.objects"]["objects"][0]["pose"]["translation"] = list(translation)
+    return inputs
+
+
+@pytest.mark.parametrize("z, known", [(-5.0, {}), (-1e6, {"focal": None, "source": None}), (-0.2, {})])
+def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, known):
+    with warnings.catch_warnings(), pytest.raises(InputError, match="is not before the camera") as caught:
+        warnings.simplefilter("error")
+        run(tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
+    assert caught.value.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.value.cure
+    with pytest.raises(InputError) as caught:
+        check_before_camera(blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap")
+    assert caught.value.key == "cameras.colmap: hall: vase"
+
+
+def test_a_pose_around_the_camera_and_a_material_that_no_object_has_are_warned_of(tmp_path, caplog):
+    inputs = moved(tmp_path, (0.0, 0.0, 0.5))
+    inputs.facts["dataset.materials"].append("wood")
+    label = read_exr(inputs["masks"] / "a.exr")["label"].copy()
+    label[:20, :30] = 2
+    write_masks(inputs["masks"], "a", label, 300.0, "dataset")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(tmp_path, inputs)
+    assert "vertices behind the camera" in caplog.text and "a: chair: its pose (dataset)" in caplog.text
+    assert "material 'wood' has 600 pixels in the mask, but no object of the photo has it" in caplog.text
+    assert "material 'white'" not in caplog.text
+
+
+@pytest.mark.parametrize("focal, centre, words", [
+    (800.0, (-1.0, 240.0), ["principal point (-1, 240) lies outside"]), (800.0, (320.0, 1e6), ["lies outside"]),
+    (1.0, (320.0, 240.0), ["field of view of 179.6°"]), (1e7, (320.0, 240.0), ["field of view"]),
+    (800.0, (320.0, 240.0), []), (None, (0.0, 480.0), []),
+])  # fmt: skip
+def test_a_camera_that_few_photos_have_is_warned_of(caplog, focal, centre, words):
+    with caplog.at_level(logging.WARNING, "factorlib.align"):
+        warn_of_camera(focal, centre, (640, 480), "hall")
+    assert all(word in caplog.text for word in words) and len(caplog.records) == len(words)
+
+
+# ── earlier poses, and photos that were averaged down ────────────────────────────────────────────────────────────────
+
+
 def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
     """The inputs, with a folder that names the pose."""
     folder = tmp_path / "earlier"
     folder.mkdir()
-    obj = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "runner_up": runner_up}
-    write_json(
-        folder / "poses.json",
-        {
-            "a": {
-                "camera": {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)},
-                "objects": {"chair": obj},
-            }
-        },
-    )
+    camera = {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}
+    entry = {"camera": camera, "objects": {"chair": entry_of(pose, runner_up=runner_up)}}
+    write_json(folder / "poses.json", {"a": entry})
     return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
 
 
-def test_an_earlier_pose_and_focal_length_are_used_as_they_are(tmp_path):
+def test_an_earlier_pose_and_focal_length_are_used_as_they_are_unless_the_dataset_gives_one(tmp_path):
     inputs, _, camera, pose = step(tmp_path, chair(), chair())
     entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera))[1]
     obj = entry["objects"]["chair"]
-    assert obj["rotation"] == pose.rotation.tolist() and obj["translation"] == pose.translation.tolist()
+    assert is_at(obj, pose) and obj["source"] == "refined"
+    assert obj["score"] > 0.97 and obj["doubts"] == [] and obj["runner_up"] is None
     assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["focal_source"] == "estimated"
-    assert obj["source"] == "refined" and obj["score"] > 0.97 and obj["doubts"] == [] and obj["runner_up"] is None
+    (tmp_path / "given").mkdir()
+    inputs, _, camera, pose = step(tmp_path / "given", chair(), chair(), **KNOWN)
+    other = earlier(tmp_path / "given", inputs, Pose(np.eye(3), pose.translation), camera)
+    obj = run(tmp_path / "given", other)[1]["objects"]["chair"]
+    assert obj["source"] == "given" and np.allclose(obj["rotation"], pose.rotation)
 
 
 def test_an_earlier_pose_is_judged_like_any_other(tmp_path):
     """A rival that nobody ruled out is still a doubt, and so is a pose that misses the mask."""
     inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    turned = rotation_of_vector(np.array([0.0, 2.0, 0.0])) @ pose.rotation
-    rival = {
-        "rotation": turned.tolist(),
-        "translation": pose.translation.tolist(),
-        "score": 1.0,
-        "normal_difference_deg": 60.0,
-    }
+    turned = Pose(rotation_of_vector(np.array([0.0, 2.0, 0.0])) @ pose.rotation, pose.translation)
+    rival = entry_of(turned, score=1.0, normal_difference_deg=60.0)
     obj = run(tmp_path, earlier(tmp_path, inputs, pose, camera, rival), "rival")[1]["objects"]["chair"]
-    assert (
-        obj["left_out"]
-        and "another pose" in obj["doubts"][0]
-        and np.allclose(obj["runner_up"]["rotation"], turned, atol=1e-9)
-    )
+    assert obj["left_out"] and "another pose" in obj["doubts"][0]
+    assert np.allclose(obj["runner_up"]["rotation"], turned.rotation, atol=1e-9)
     wrong = tmp_path / "wrong"
     wrong.mkdir()
-    obj = run(wrong, earlier(wrong, inputs, Pose(turned, pose.translation), camera))[1]["objects"]["chair"]
+    obj = run(wrong, earlier(wrong, inputs, turned, camera))[1]["objects"]["chair"]
     assert obj["left_out"] and obj["silhouette_iou"] < 0.9
-
-
-def test_a_pose_that_the_dataset_gives_goes_before_an_earlier_one(tmp_path):
-    inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True, focal=300.0, source="dataset")
-    entry = run(tmp_path, earlier(tmp_path, inputs, Pose(np.eye(3), pose.translation), camera))[1]
-    assert entry["objects"]["chair"]["source"] == "given" and np.allclose(
-        entry["objects"]["chair"]["rotation"], pose.rotation
-    )
 
 
 def in_a_file_twice_as_large(inputs, **camera):
     """The photo as `masks` averages one of 401 × 300 pixels down, with a camera in those pixels."""
-    facts = {**FACTS, "factor": 2, "original_size": [401, 300], "focal_px": 300.0, "focal_source": "dataset"}
-    write_json(inputs["masks"] / "a.json", facts)
+    file = inputs["masks"] / "a.json"
+    facts = {"factor": 2, "original_size": [401, 300], "focal_px": 300.0, "focal_source": "dataset"}
+    write_json(file, {**read_json(file), **facts})
     inputs.facts["dataset.objects"]["camera"] = camera
     return inputs
 
 
-def test_the_middle_of_an_averaged_photo_is_that_of_its_file(tmp_path):
-    inputs, _, _, _ = step(tmp_path, chair(), chair(), pose_given=True)
-    camera = run(tmp_path, in_a_file_twice_as_large(inputs))[1]["camera"]
-    assert camera["principal_point"] == [100.25, 75.0] and camera["focal_px"] == 300.0 and camera["factor"] == 2
+def test_the_middle_and_an_earlier_focal_length_of_an_averaged_photo_are_those_of_its_file(tmp_path):
+    inputs, _, camera, pose = step(tmp_path, chair(), chair(), pose_given=True)
+    entry = run(tmp_path, in_a_file_twice_as_large(inputs))[1]["camera"]
+    assert entry["principal_point"] == [100.25, 75.0] and entry["focal_px"] == 300.0 and entry["factor"] == 2
+    del inputs.facts["dataset.objects"]["objects"][0]["pose"]
+    entry = run(tmp_path, earlier(tmp_path, inputs, pose, camera, focal=600.0), "again")[1]
+    assert entry["camera"]["focal_px"] == 300.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.97
 
 
 def test_keypoints_and_principal_point_are_pixels_of_the_file(tmp_path):
-    inputs, caster, camera, pose = step(tmp_path, chair(), chair())
+    inputs, _, camera, pose = step(tmp_path, chair(), chair())
     corners = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0]])
     pixels = 2 * camera.project(pose.apply(corners))
-    keypoints = [{"pixel": list(p), "point": list(q)} for p, q in zip(pixels.tolist(), corners.tolist())]
+    keypoints = [{"pixel": p, "point": q} for p, q in zip(pixels.tolist(), corners.tolist())]
     inputs.facts["dataset.objects"]["objects"][0]["keypoints"] = keypoints
     entry = run(tmp_path, in_a_file_twice_as_large(inputs, principal_point=[200.0, 150.0]))[1]
     obj = entry["objects"]["chair"]
-    assert (
-        obj["source"] == "keypoints" and obj["doubts"] == [] and np.allclose(obj["rotation"], pose.rotation, atol=0.02)
-    )
+    assert obj["source"] == "keypoints" and obj["doubts"] == []
+    assert np.allclose(obj["rotation"], pose.rotation, atol=0.02)
     assert entry["camera"]["principal_point"] == [100.0, 75.0]
-
-
-def test_an_earlier_focal_length_of_another_factor_is_scaled(tmp_path):
-    inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    with_poses = in_a_file_twice_as_large(
-        earlier(tmp_path, inputs, pose, camera, focal=600.0)
-    )  # of the file, before it was averaged
-    entry = run(tmp_path, with_poses)[1]
-    assert entry["camera"]["focal_px"] == 300.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.97

@@ -2,6 +2,8 @@
 
 import json
 import logging
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -25,6 +27,9 @@ LABEL[9:15, 4:20] = 2
 LABEL[0] = 255
 RADIANCE = np.random.default_rng(1).uniform(0, 0.8, (H, W, 3)).astype(np.float32)
 CHANNELS = {"R", "G", "B", "label", "valid", "left_out", "object", "clipped.R", "clipped.G", "clipped.B"}
+SMALLER = masks.Params(pixels=100)  # of the 152 that show a material: factor 2
+OWN = [ObjectMask("a", None), ObjectMask("b", "own.png")]
+GIVEN = {"image": "photo.exr", "encoding": None, "masks": "mask.png", "focal_px": None, "illumination": "kitchen"}
 
 
 @pytest.fixture
@@ -32,29 +37,18 @@ def folder(tmp_path):
     (tmp_path / "in").mkdir()
     write_rgb_exr(tmp_path / "in" / "photo.exr", RADIANCE)
     Image.fromarray(LABEL).save(tmp_path / "in" / "mask.png")
+    Image.fromarray(LABEL == 2).save(tmp_path / "in" / "own.png")
     return tmp_path
 
 
-def run(folder, progress=lambda *_: None, params=masks.Params(), **facts):
+def run(folder, params=masks.Params(), **facts):
     """The channels and the summary the stage writes for a photo `kitchen` with the given facts."""
-    given = {
-        "image": "photo.exr",
-        "encoding": None,
-        "masks": "mask.png",
-        "focal_px": None,
-        "illumination": "kitchen",
-        "objects": [],
-    }
-    photo = PhotoSlice(**given | facts)
-    inputs = Inputs(
-        folders={},
-        facts={"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": MATERIALS},
-        files={path.name: path for path in (folder / "in").iterdir()},
-        photo="kitchen",
-    )
+    photo = PhotoSlice(**GIVEN | {"objects": []} | facts)
+    given = {"dataset.photo": msgspec.to_builtins(photo), "dataset.materials": MATERIALS}
+    inputs = Inputs({}, given, {path.name: path for path in (folder / "in").iterdir()}, "kitchen")
     out = folder / "out"
     out.mkdir(exist_ok=True)
-    masks.main(params, inputs, out, progress)
+    masks.main(params, inputs, out, lambda *_: None)
     assert sorted(path.name for path in out.iterdir()) == ["kitchen.exr", "kitchen.json"]
     return read_exr(out / "kitchen.exr"), json.loads((out / "kitchen.json").read_text())
 
@@ -67,7 +61,7 @@ def refusal(folder, **facts):
     return str(caught.value)
 
 
-def test_channels_say_what_photo_and_mask_say(folder):
+def test_channels_say_what_photo_and_mask_say_in_the_same_bytes_again(folder):
     channels, summary = run(folder)
     assert set(channels) == CHANNELS
     np.testing.assert_array_equal(np.dstack([channels[c] for c in "RGB"]), RADIANCE)
@@ -76,18 +70,14 @@ def test_channels_say_what_photo_and_mask_say(folder):
     np.testing.assert_array_equal(channels["left_out"], LABEL == 255)
     assert not channels["object"].any() and not channels["clipped.R"].any()
     assert summary == {
-        "width": W,
-        "height": H,
-        "factor": 1,
-        "original_size": [W, H],
-        "focal_px": None,
-        "focal_source": None,
+        "width": W, "height": H, "factor": 1, "original_size": [W, H], "focal_px": None, "focal_source": None,
         "encoding": "linear",
-        "exposure": None,
-        "illumination": "kitchen",
-        "pixels": {"red": 56, "wood": 96},
-        "clipped_fraction": 0.0,
-    }
+        "exposure": None, "illumination": "kitchen", "pixels": {"red": 56, "wood": 96}, "clipped_fraction": 0.0,
+    }  # fmt: skip
+    first = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    run(folder)
+    assert first == {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    np.testing.assert_array_equal(run(folder, objects=OWN)[0]["object"], 2 * (LABEL == 2))
 
 
 def test_clipped_channels_are_marked_and_stay_valid(folder):
@@ -100,7 +90,7 @@ def test_clipped_channels_are_marked_and_stay_valid(folder):
     assert summary["clipped_fraction"] == pytest.approx(1 / 152) and summary["encoding"] == "srgb"
 
 
-def test_nan_pixels_are_not_valid_and_are_told(folder, caplog):
+def test_nan_pixels_are_not_valid_and_are_told_and_nothing_but_nan_is_refused(folder, caplog):
     radiance = RADIANCE.copy()
     radiance[2, 3, 1], radiance[3, 3, 0] = np.nan, np.inf
     write_rgb_exr(folder / "in" / "photo.exr", radiance)
@@ -109,102 +99,68 @@ def test_nan_pixels_are_not_valid_and_are_told(folder, caplog):
     assert channels["valid"][2, 3] == channels["valid"][3, 3] == 0 and summary["pixels"]["red"] == 54
     assert channels["label"][2, 3] == 1 and all(np.isfinite(channel).all() for channel in channels.values())
     assert "2 of the 152 pixels" in caplog.text and "photo.exr" in caplog.text
-
-
-def test_nothing_but_nan_in_the_mask_is_refused(folder):
-    radiance = RADIANCE.copy()
     radiance[(LABEL > 0) & (LABEL < 255)] = np.nan
     write_rgb_exr(folder / "in" / "photo.exr", radiance)
+    [path.unlink() for path in (folder / "out").iterdir()]
     message = refusal(folder)
     assert "photo.exr" in message and "NaN" in message
 
 
-def test_own_masks_number_the_objects(folder):
-    Image.fromarray(LABEL == 2).save(folder / "in" / "own.png")
-    channels, _ = run(folder, objects=[ObjectMask("a", None), ObjectMask("b", "own.png")])
-    np.testing.assert_array_equal(channels["object"], 2 * (LABEL == 2))
-
-
-@pytest.mark.parametrize(
-    "given, source, expected", [(812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))]
-)
-def test_focal_of_the_dataset_goes_before_exif(folder, given, source, expected):
+def test_focal_of_the_dataset_goes_before_exif_and_is_of_the_photo_as_it_is(folder):
     spec = oiio.ImageSpec(W, H, 3, oiio.UINT8)
     spec.attribute("Exif:FocalLengthIn35mmFilm", 50)
     output = oiio.ImageOutput.create("photo.jpg")
-    assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(
-        np.full((H, W, 3), 90, dtype=np.uint8)
-    )
+    assert output.open(str(folder / "in" / "photo.jpg"), spec) and output.write_image(np.full((H, W, 3), 90, np.uint8))
     output.close()
-    _, summary = run(folder, image="photo.jpg", focal_px=given)
-    assert summary["focal_source"] == source and summary["focal_px"] == pytest.approx(expected)
+    for given, source, expected in ((812.0, "dataset", 812.0), (None, "exif", 50 / np.hypot(36, 24) * np.hypot(W, H))):
+        summary = run(folder, image="photo.jpg", focal_px=given)[1]
+        assert summary["focal_source"] == source and summary["focal_px"] == pytest.approx(expected)
+    assert run(folder, params=SMALLER, focal_px=812.0)[1]["focal_px"] == 406.0
 
 
-def test_the_same_input_is_the_same_bytes(folder):
-    run(folder)
-    first = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
-    run(folder)
-    assert first == {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
-
-
-def _truncated(folder):
+def test_bad_input_is_refused_and_nothing_is_left(folder):
     path = folder / "in" / "photo.exr"
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def _empty(folder):
+    content = path.read_bytes()
+    path.write_bytes(content[:-100])
+    assert all(word in refusal(folder) for word in ("photo.exr", "photos[kitchen].image", "truncated"))
+    path.write_bytes(content)
     Image.fromarray(LABEL * 0).save(folder / "in" / "mask.png")
-
-
-@pytest.mark.parametrize(
-    "spoil, said",
-    [
-        (_truncated, ["photo.exr", "photos[kitchen].image", "truncated"]),
-        (_empty, ["mask.png", "the mask is empty"]),
-    ],
-)
-def test_bad_input_is_refused_and_nothing_is_left(folder, spoil, said):
-    spoil(folder)
-    message = refusal(folder)
-    assert all(word in message for word in said), message
-
-
-SMALLER = masks.Params(pixels=100)  # of the 152 that show a material: factor 2
+    assert all(word in refusal(folder) for word in ("mask.png", "the mask is empty"))
+    Image.fromarray(LABEL).save(folder / "in" / "mask.png")
+    with pytest.raises(InputError, match=r"megapixels; at most 0\.0001"):
+        run(folder, params=masks.Params(most_megapixels=0.0001))
+    specks = np.zeros((H, W), np.uint8)
+    specks[::4, ::4] = 1
+    Image.fromarray(specks).save(folder / "in" / "mask.png")
+    with pytest.raises(InputError, match="specks"):  # that averaging loses
+        run(folder, params=masks.Params(frame=100))
 
 
 def test_a_photo_of_many_pixels_is_averaged_down_and_says_so(folder):
-    Image.fromarray(LABEL == 2).save(folder / "in" / "own.png")
-    channels, summary = run(folder, params=SMALLER, objects=[ObjectMask("a", None), ObjectMask("b", "own.png")])
-    mean = RADIANCE.reshape(H // 2, 2, W // 2, 2, 3).mean((1, 3))
+    channels, summary = run(folder, params=SMALLER, objects=OWN)
+    mean, label = RADIANCE.reshape(H // 2, 2, W // 2, 2, 3).mean((1, 3)), box_majority(LABEL, 2)
     np.testing.assert_allclose(np.dstack([channels[c] for c in "RGB"]), mean, rtol=1e-6)
-    label = box_majority(LABEL, 2)
     np.testing.assert_array_equal(channels["label"], np.where(label == 255, 0, label))
     np.testing.assert_array_equal(channels["left_out"], label == 255)
     np.testing.assert_array_equal(channels["object"], 2 * box_majority((LABEL == 2).astype("u1"), 2))
     np.testing.assert_array_equal(channels["valid"], channels["label"] > 0)
-    assert (summary["factor"], summary["original_size"]) == (2, [W, H]) and (summary["width"], summary["height"]) == (
-        W // 2,
-        H // 2,
-    )
+    assert (summary["factor"], summary["original_size"]) == (2, [W, H])
+    assert (summary["width"], summary["height"]) == (W // 2, H // 2)
     assert summary["pixels"] == {"red": int((label == 1).sum()), "wood": int((label == 2).sum())}
 
 
-@pytest.mark.parametrize(
-    "params, factor",
-    [
-        ({"pixels": 152}, 1),
-        ({"pixels": 151}, 2),
-        ({"frame": H * W}, 1),
-        ({"frame": 100}, 2),
-        ({"frame": 100, "pixels": 100}, 2),
-    ],
-)
-def test_the_factor_is_the_least_that_fits_both_bounds(folder, params, factor):
-    assert run(folder, params=masks.Params(**params))[1]["factor"] == factor
+FACTORS = [
+    ({"pixels": 152}, 1),
+    ({"pixels": 151}, 2),
+    ({"frame": H * W}, 1),
+    ({"frame": 100}, 2),
+    ({"frame": 100, "pixels": 100}, 2),
+]
 
 
-def test_a_given_focal_length_is_of_the_photo_as_it_is(folder):
-    assert run(folder, params=SMALLER, focal_px=812.0)[1]["focal_px"] == 406.0
+def test_the_factor_is_the_least_that_fits_both_bounds(folder):
+    for params, factor in FACTORS:
+        assert run(folder, params=masks.Params(**params))[1]["factor"] == factor
 
 
 def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
@@ -218,19 +174,40 @@ def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
     codes[3, 3, 1] = 255
     Image.fromarray(codes).save(folder / "in" / "photo.png")
     channels, summary = run(folder, image="photo.png", params=SMALLER)
-    assert np.argwhere(channels["clipped.G"]).tolist() == [[1, 1]] and summary["clipped_fraction"] == pytest.approx(
-        1 / sum(summary["pixels"].values())
-    )
+    assert np.argwhere(channels["clipped.G"]).tolist() == [[1, 1]]
+    assert summary["clipped_fraction"] == pytest.approx(1 / sum(summary["pixels"].values()))
 
 
-def test_a_mask_of_specks_that_averaging_loses_is_refused(folder):
-    specks = np.zeros((H, W), np.uint8)
-    specks[::4, ::4] = 1
-    Image.fromarray(specks).save(folder / "in" / "mask.png")
-    with pytest.raises(InputError, match="specks"):
-        run(folder, params=masks.Params(frame=100))
+METERED = """
+import json, sys
+from pathlib import Path
+from factorlib.runner.cost import Meter
+from factorlib.stage import Inputs
+from stages import masks
+
+folder, facts = Path(sys.argv[1]), json.loads(sys.argv[2])
+meter = Meter()
+masks.main(masks.Params(), Inputs({}, facts, {name: folder / name for name in ("a.jpg", "a.png")}, "a"), folder)
+print(json.dumps(meter.read(1)))
+"""
+MOST_MB = 900  # floating-point radiance of the photo alone would be 576; 300 are Python and its libraries
 
 
-def test_the_largest_photo_is_a_parameter(folder):
-    with pytest.raises(InputError, match=r"megapixels; at most 0\.0001"):
-        run(folder, params=masks.Params(most_megapixels=0.0001))
+@pytest.mark.long
+def test_a_photo_of_48_megapixels_is_read_in_strips_within_the_memory_of_a_step(tmp_path):
+    wave = np.sin(np.arange(8000) / 50)[None] * np.sin(np.arange(6000) / 70)[:, None]
+    picture = np.repeat((110 + 100 * wave).astype(np.uint8)[..., None], 3, axis=2)
+    Image.fromarray(picture).save(tmp_path / "a.jpg", quality=90)
+    label = np.zeros((6000, 8000), np.uint8)
+    label[1000:5000, 2000:6000], label[2000:4000, 3000:5000] = 1, 2  # a third of the photo
+    Image.fromarray(label).save(tmp_path / "a.png", compress_level=1)
+    del wave, label, picture
+    facts = {
+        "dataset.photo": {**GIVEN, "image": "a.jpg", "masks": "a.png", "objects": []},
+        "dataset.materials": MATERIALS,
+    }
+    command = [sys.executable, "-c", METERED, str(tmp_path), json.dumps(facts)]
+    cost = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    summary = json.loads((tmp_path / "a.json").read_text())
+    assert summary["factor"] == 4 and sum(summary["pixels"].values()) == 1_000_000
+    assert (summary["width"], summary["height"]) == (2000, 1500) and cost["memory_mb"] < MOST_MB

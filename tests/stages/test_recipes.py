@@ -10,7 +10,7 @@ from factorlib.images.exr import read_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
@@ -23,42 +23,38 @@ def made(tmp_path_factory):
     return made_export.make_exported(tmp_path_factory.mktemp("made"))
 
 
+def changed(made, fact, value):
+    return Inputs(made.folders, {**made.facts, fact: value}, made.files)
+
+
 def drawn(made, out, recipe, **files):
     facts = {**made.facts, "recipe": msgspec.to_builtins(recipe)}
-    inputs = Inputs(
-        made.folders, facts, {**made.files, **{f"recipe file:{name}": path for name, path in files.items()}}
-    )
+    given = {f"recipe file:{name}": path for name, path in files.items()}
     out.mkdir()
-    recipes.main(recipes.Params(), inputs, out, silent)
+    recipes.main(recipes.Params(), Inputs(made.folders, facts, {**made.files, **given}), out, silent)
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
 
 
+PICTURES = {"front": ["front.exr", "front.png"], "side": ["side.exr", "side.png"]}
+FRONT = {"photos": ["front"], "samples": 1}
 KINDS = [
-    (schema.Resynthesis(samples=2), ["front.exr", "front.png", "side.exr", "side.png"]),
-    (schema.View(photos=["side"], samples=2, width=32, background="light"), ["side.exr", "side.png"]),
-    (
-        schema.Turntable(photos=["front"], samples=1, frames=3),
-        ["front.gif", "front/000.png", "front/001.png", "front/002.png"],
-    ),
-    (
-        schema.MovingLight(photos=["front"], samples=1, frames=2, width=16),
-        ["front.gif", "front/000.png", "front/001.png"],
-    ),
-    (schema.Relight(samples=1, rotate=30.0), ["front/side.exr", "front/side.png", "side/front.exr", "side/front.png"]),
-    (schema.Transfer(materials={"red": "unseen"}, photos=["front"], samples=2), ["front.exr", "front.png"]),
-    (schema.Insert(photos=["front"], samples=2), ["front.exr", "front.png"]),
-    (
-        schema.Insert(photos=["front"], samples=2, mesh="egg", material="brass", at=(40.0, 50.0)),
-        ["front.exr", "front.png"],
-    ),
-    (schema.Grid(samples=2, size=16), ["grid.exr", "grid.png", "grid.txt"]),
-]
+    (schema.Resynthesis(samples=1), PICTURES["front"] + PICTURES["side"]),
+    (schema.View(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
+    (schema.Turntable(**FRONT, frames=3), ["front.gif", *(f"front/00{k}.png" for k in range(3))]),
+    (schema.MovingLight(**FRONT, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
+    (schema.Relight(samples=1, rotate=30.0), [*(f"front/{name}" for name in PICTURES["side"]),
+    *(f"side/{name}" for name in PICTURES["front"])]),
+    (schema.Transfer(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
+    (schema.Insert(**FRONT), PICTURES["front"]),
+    (schema.Insert(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), PICTURES["front"]),
+    (schema.Grid(samples=1, size=16), ["grid.exr", "grid.png", "grid.txt"]),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("recipe, files", KINDS, ids=lambda value: type(value).__name__)
 def test_files_of_every_kind_and_the_same_bytes_again(made, tmp_path, recipe, files):
     ground = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
-    made = Inputs(made.folders, {**made.facts, "dataset.ground": {p: ground for p in made_export.MESHES}}, made.files)
+    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, ground))
     first, second = (drawn(made, tmp_path / name, recipe) for name in "ab")
     assert sorted(first) == sorted(files) and first == second
 
@@ -72,28 +68,25 @@ def test_the_photo_stays_where_no_object_is(made, tmp_path):
     assert np.array_equal(found[far], photo[far]) and not np.array_equal(found[~empty], photo[~empty])
 
 
-def test_a_material_of_ones_own_is_what_is_seen(made, tmp_path):
-    write_materials(
-        tmp_path / "own.json", MaterialTable({"black": solved(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0), ERROR)})
-    )
-    recipe = schema.Transfer(photos=["front"], materials={"red": "black"}, table="own.json", samples=4)
+def own_material(made, tmp_path, material):
+    write_json(tmp_path / "own.json", MaterialTable({"own": solved(material, ERROR)}))
+    recipe = schema.Transfer(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)
     drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
+
+
+def test_a_material_of_ones_own_is_what_is_drawn(made, tmp_path):
+    own_material(made, tmp_path, Reflectance((0.0,) * 3, (0.0,) * 3, 1.0))
     inside = read_exr(made["align"] / "front.exr")["confidence"] > 0
-    dark = read_exr(tmp_path / "out" / "front.exr")["G"][inside]
-    assert (dark == 0).mean() > 0.9
+    assert (read_exr(tmp_path / "out" / "front.exr")["G"][inside] == 0).mean() > 0.9
 
 
 def test_a_material_that_reflects_more_than_arrives_is_refused(made, tmp_path):
-    write_json(
-        tmp_path / "own.json", MaterialTable({"too much": solved(Reflectance((0.9,) * 3, (0.3,) * 3, 0.5), ERROR)})
-    )
-    recipe = schema.Transfer(photos=["front"], materials={"red": "too much"}, table="own.json")
     with pytest.raises(InputError, match="more light is reflected than arrives"):
-        drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
+        own_material(made, tmp_path, Reflectance((0.9,) * 3, (0.3,) * 3, 0.5))
 
 
 def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
-    """Light from the right of the map's middle, +x, is a quarter of the width from the left edge: the right side of the ball is lit."""
+    """Light from +x is a quarter of the map's width from its left edge: the right side of the ball is lit."""
     lat_long = np.full((16, 32, 3), 0.01)
     lat_long[6:10, 7:9] = 50.0
     write_rgb_exr(tmp_path / "lamp.exr", lat_long)
@@ -113,31 +106,25 @@ def test_frames_of_an_animation_turn_once(made, tmp_path):
     assert min(np.abs(frames[0] - other).mean() for other in frames[1:]) > 1
 
 
-def test_a_photo_without_objects_is_refused(made, tmp_path):
-    objects = {**made.facts["dataset.objects"], "front": {"camera": {}, "objects": [], "meshes": {}}}
-    empty = Inputs(made.folders, {**made.facts, "dataset.objects": objects}, made.files)
+def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
+    nothing = {"camera": {}, "objects": [], "meshes": {}}
+    some = changed(made, "dataset.objects", {**made.facts["dataset.objects"], "front": nothing})
     with pytest.raises(InputError, match="'front' has no objects to draw"):
-        drawn(empty, tmp_path / "out", schema.Resynthesis(photos=["front"]))
-
-
-def test_a_photo_that_cannot_be_drawn_is_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
-    objects = {**made.facts["dataset.objects"], "front": {"camera": {}, "objects": [], "meshes": {}}}
-    some = Inputs(made.folders, {**made.facts, "dataset.objects": objects}, made.files)
-    assert sorted(drawn(some, tmp_path / "out", schema.Resynthesis(samples=1))) == ["side.exr", "side.png"]
+        drawn(some, tmp_path / "named", schema.Resynthesis(photos=["front"]))
+    assert sorted(drawn(some, tmp_path / "out", schema.Resynthesis(samples=1))) == PICTURES["side"]
     assert "front: left out" in caplog.text
-    none = Inputs(made.folders, {**made.facts, "dataset.objects": dict.fromkeys(objects, objects["front"])}, made.files)
+    none = changed(made, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
     with pytest.raises(InputError, match="no objects"):
         drawn(none, tmp_path / "none", schema.Resynthesis())
 
 
 def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
-    grounds = {
+    below = {
         **made.facts["dataset.ground"],
         "front": {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}},
     }  # y is down
-    below = Inputs(made.folders, {**made.facts, "dataset.ground": grounds}, made.files)
     with pytest.raises(InputError, match="'front' was taken from below"):
-        drawn(below, tmp_path / "out", schema.Insert(photos=["front"], samples=1))
+        drawn(changed(made, "dataset.ground", below), tmp_path / "out", schema.Insert(photos=["front"], samples=1))
 
 
 def test_a_mesh_without_height_is_refused(made, tmp_path):

@@ -25,22 +25,13 @@ def step(folder, poses: dict[str, Pose]):
     inside = (maps.label > 0).astype("f4")
     for stage in ("masks", "align"):
         (folder / stage).mkdir(parents=True)
-    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")} | {
-        f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")
-    }
+    channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
     write_exr(folder / "align" / "a.exr", {**channels, "label": maps.label, "confidence": inside})
-    clipped = {f"clipped.{c}": 0 * inside for c in "RGB"}
-    write_exr(
-        folder / "masks" / "a.exr", {**{c: inside for c in "RGB"}, **clipped, "label": maps.label, "valid": inside}
-    )
-    write_json(
-        folder / "masks" / "a.json",
-        {"width": CAMERA.width, "height": CAMERA.height, "factor": 1, "original_size": [CAMERA.width, CAMERA.height]},
-    )
-    placed = {
-        name: {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-        for name, pose in poses.items()
-    }
+    channels = dict.fromkeys("RGB", inside) | {f"clipped.{c}": 0 * inside for c in "RGB"}
+    write_exr(folder / "masks" / "a.exr", {**channels, "label": maps.label, "valid": inside})
+    size = [CAMERA.width, CAMERA.height]
+    write_json(folder / "masks" / "a.json", {"width": size[0], "height": size[1], "factor": 1, "original_size": size})
+    placed = {n: {"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for n, p in poses.items()}
     camera = {"focal_px": CAMERA.focal, "principal_point": list(CAMERA.centre)}
     write_json(folder / "align" / "a.json", {"camera": camera, "objects": placed})
     write_ply(folder / "ball.ply", mesh)
@@ -53,9 +44,8 @@ def step(folder, poses: dict[str, Pose]):
             "meshes": {"ball": {"file": "ball.ply", "material": "white"}},
         },
     }
-    return Inputs(
-        {stage: folder / stage for stage in ("masks", "align")}, facts, {"ball.ply": folder / "ball.ply"}, "a"
-    )
+    folders = {stage: folder / stage for stage in ("masks", "align")}
+    return Inputs(folders, facts, {"ball.ply": folder / "ball.ply"}, "a")
 
 
 def run(folder, inputs, **params):
@@ -64,36 +54,33 @@ def run(folder, inputs, **params):
     return folder / "a.parquet"
 
 
-@pytest.fixture
-def two(tmp_path):
-    return step(tmp_path, {"left": LEFT, "right": RIGHT})
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    return step(tmp_path_factory.mktemp("two"), {"left": LEFT, "right": RIGHT})
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, two):
+    return run(tmp_path_factory.mktemp("whole") / "out", two)
 
 
 def test_one_ball_sees_everything_and_its_file_says_nothing_of_visibility(tmp_path):
     inputs = step(tmp_path, {"left": LEFT})
     one, other = run(tmp_path / "1", inputs), run(tmp_path / "2", inputs, directions=0)
-    assert read_observations(one).visibility is None
-    assert one.read_bytes() == other.read_bytes()
+    assert read_observations(one).visibility is None and one.read_bytes() == other.read_bytes()
 
 
-def test_two_balls_hide_each_other_where_they_face(tmp_path, two):
-    seen = read_observations(run(tmp_path / "out", two))
-    hidden = (seen.visibility < 255).mean(1)
-    left = seen.x < 40
+def test_two_balls_hide_each_other_where_they_face_in_the_same_bytes_again(tmp_path, two, whole):
+    seen = read_observations(whole)
+    hidden, left = (seen.visibility < 255).mean(1), seen.x < 40
     assert seen.visibility.shape[1] == urm.Params().directions
     assert hidden[left & (seen.normal[:, 0] > 0.6)].min() > hidden[left & (seen.normal[:, 0] < -0.2)].max()
     assert (hidden[~left & (seen.normal[:, 0] > 0.2)] == 0).all()
+    assert run(tmp_path / "again", two).read_bytes() == whole.read_bytes()
 
 
-def test_the_same_bytes_again(tmp_path, two):
-    assert (
-        run(tmp_path / "1", two, merge_degrees=3.0).read_bytes()
-        == run(tmp_path / "2", two, merge_degrees=3.0).read_bytes()
-    )
-
-
-def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_path, two, monkeypatch):
-    whole = read_observations(run(tmp_path / "whole", two))
+def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_path, two, whole, monkeypatch):
+    whole = read_observations(whole)
     monkeypatch.setattr(urm, "sample", lambda seen, most: sample(seen, 600))
     part = read_observations(run(tmp_path / "part", two))
     assert len(whole) > 1000 > len(part) == 600

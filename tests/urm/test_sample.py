@@ -21,8 +21,10 @@ def many(n: int = 20_000, seed: int = 0) -> Observations:
     y, x = np.divmod(np.arange(n), 200)
     order = random.permutation(n)
     return Observations(
-        normal=normal[order].astype("f4"), view=np.tile([0.0, 0.0, -1.0], (n, 1)).astype("f4"), radiance=random.uniform(0.5, 1.5, (n, 3)),
-        clipped=clipped[order], material=(np.arange(n) % 2)[order].astype("i2"), photo=np.zeros(n, "i4"), illumination=np.zeros(n, "i4"),
+        normal=normal[order].astype("f4"), view=np.tile([0.0, 0.0, -1.0], (n, 1)).astype("f4"),
+        radiance=random.uniform(0.5, 1.5, (n, 3)),
+        clipped=clipped[order], material=(np.arange(n) % 2)[order].astype("i2"), photo=np.zeros(n, "i4"),
+        illumination=np.zeros(n, "i4"),
         x=x.astype("i4"), y=y.astype("i4"), weight=random.uniform(0.1, 1, n).astype("f4"),
         materials=("red", "white"), photos=("a",), illuminations=("a",), exposures=(0.5,),
     )  # fmt: skip

@@ -1,9 +1,13 @@
+"""Observations of photos: which pixels, in files, one after another, merged, and brought to one exposure."""
+
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.conventions import FRONT
 from factorlib.errors import InputError
+from factorlib.urm.cells import groups
+from factorlib.urm.exposure import at_one_exposure, relative_exposures
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import COLUMNS, OPTIONAL, concatenate, read_observations, write_observations
@@ -16,13 +20,9 @@ def photo_and_geometry(size=64):
     z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     one = inside.astype("f4")
     geometry = {
-        "normal.x": x * one,
-        "normal.y": y * one,
-        "normal.z": z * one,
-        "view.x": 0 * one,
-        "view.y": 0 * one,
+        "normal.x": x * one, "normal.y": y * one, "normal.z": z * one, "view.x": 0 * one, "view.y": 0 * one,
         "view.z": -one,
-    }
+    }  # fmt: skip
     geometry |= {"label": np.where(x < 0, 1, 2) * one, "confidence": one}
     photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": np.where(x < 0, 1, 2) * one, "valid": one}
     photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}
@@ -132,3 +132,47 @@ def test_merging_never_mixes_clipped_with_unclipped():
 def test_merging_nothing_is_the_identity():
     seen = observations()
     assert merge(seen, 0.0) is seen
+
+
+@pytest.mark.parametrize("largest", [1, 7, 3 * 10**8], ids=["one value", "few", "too many for one number"])
+def test_groups_are_those_of_unique_rows(largest):
+    rng = np.random.default_rng(0)
+    keys = rng.integers(-largest, largest, (500, 4))
+    keys = np.vstack([keys, keys[::3]])[rng.permutation(667)]
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    found_first, found_group = groups(keys)
+    np.testing.assert_array_equal(found_first, first)
+    np.testing.assert_array_equal(found_group, group.reshape(-1))
+
+
+def exposed(name, illumination, exposure):
+    return msgspec.structs.replace(observations(name, illumination), exposures=(exposure,))
+
+
+def test_photos_of_one_light_are_brought_to_the_exposure_of_its_first():
+    seen = concatenate([exposed("c", "room", 8.0), exposed("a", "room", 2.0), exposed("b", "garden", 5.0)])
+    relative = relative_exposures(seen)
+    assert relative == {"a": 1.0, "b": 1.0, "c": 4.0}
+    same = at_one_exposure(seen, relative)
+    of_c = seen.photo == seen.photos.index("c")
+    np.testing.assert_allclose(same.radiance[of_c], seen.radiance[of_c] / 4)
+    np.testing.assert_array_equal(same.radiance[~of_c], seen.radiance[~of_c])
+
+
+def test_one_photo_that_does_not_say_leaves_the_light_as_it_is():
+    seen = concatenate([exposed("a", "room", 2.0), exposed("b", "room", None), exposed("c", "room", 4.0)])
+    relative = relative_exposures(seen)
+    assert set(relative.values()) == {1.0}
+    assert at_one_exposure(seen, relative) is seen
+
+
+def test_exposures_pass_through_files_and_merging(tmp_path):
+    seen = exposed("a", "room", 2.0)
+    write_observations(tmp_path / "a.parquet", seen)
+    assert read_observations(tmp_path / "a.parquet").exposures == (2.0,) == merge(seen, 5.0).exposures
+    unknown, silent = exposed("a", "room", None), observations("a", "room")
+    for name, part in (("b", unknown), ("c", msgspec.structs.replace(silent, exposures=()))):
+        write_observations(tmp_path / f"{name}.parquet", part)
+    assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "c.parquet").read_bytes(), (
+        "what is unknown leaves no trace"
+    )
