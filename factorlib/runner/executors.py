@@ -1,21 +1,22 @@
 """Where steps run: `concurrent.futures` executors of one process each, all within the machine's cores.
 
-The number of threads of a step's numerics is part of its spec, for sums depend on it; how many steps run at once, and
-over how many cores a step spreads independent work, is the machine's affair.  A process pool whose process is killed gives up all its work, so each has one process and one step:
-what is killed is that step's affair alone.  Any executor with `submit` will do in place of a pool.
+The number of threads of a step's numerics is part of its spec, for sums depend on it; how many steps run at once, and over
+how many cores a step spreads independent work, is the machine's affair.  A process pool whose process is killed gives up all
+its work, so each has one process and one step: what is killed is that step's affair alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, ClassVar
+from typing import Any
 
 from factorlib import arithmetic
 from factorlib.runner.stop import whole
@@ -25,10 +26,10 @@ from factorlib.runner.worker import limit_threads
 class Pools:
     """Executors by number of threads; `free` says whether a step that needs so many cores may start now."""
 
-    def __init__(self, cores: int | None = None):
-        self.cores = cores or machine_cores()
+    def __init__(self) -> None:
+        self.cores = machine_cores()
         self._spare: dict[int, list[Executor]] = {}
-        self._busy: dict[Future, tuple[int, Executor]] = {}
+        self._busy: dict[Future, tuple[int, int, Executor]] = {}
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
@@ -37,7 +38,7 @@ class Pools:
 
     def submit(self, cores: int, threads: int, function: Callable, *arguments: Any) -> Future:
         """Start `function(*arguments)` in a worker process of `threads` threads, which takes `cores` cores; returns its future."""
-        with whole(), _OfWorkers():
+        with whole(), _environment():
             spare = self._spare.setdefault(threads, [])
             executor = spare.pop() if spare else _executor(threads)
             try:
@@ -55,14 +56,11 @@ class Pools:
 
     def close(self, kill: bool = False) -> None:
         """End all worker processes; `kill`: at once, whatever they do."""
-        executors = [e for spare in self._spare.values() for e in spare] + [
-            executor for _, _, executor in self._busy.values()
-        ]
-        if kill:
-            for process in multiprocessing.active_children():
-                process.kill()
-        # Each executor is shut down by one call that waits.  After `shutdown(wait=False)` a second call would not wait, and its thread could
-        # still be closing pipes when Python ends, which prints a traceback.
+        executors = [e for spare in self._spare.values() for e in spare] + [e for _, _, e in self._busy.values()]
+        for process in multiprocessing.active_children() if kill else []:
+            process.kill()
+        # Each executor is shut down by one call that waits.  After `shutdown(wait=False)` a second call would not wait, and its
+        # thread could still be closing pipes when Python ends, which prints a traceback.
         with ThreadPoolExecutor(max(1, len(executors))) as enders:
             list(enders.map(lambda executor: executor.shutdown(cancel_futures=True), executors))
 
@@ -72,27 +70,23 @@ def machine_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def _environment() -> Iterator[None]:
+    """Workers that start within walk their sets in the same order, and compute the same bits, every time."""
+    fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES}
+    before = {name: os.environ[name] for name in fixed if name in os.environ}
+    os.environ.update(fixed)
+    try:
+        yield
+    finally:
+        for name in fixed.keys() - before.keys():
+            os.environ.pop(name, None)
+        os.environ.update(before)
+
+
 def _executor(threads: int) -> Executor:
-    return ProcessPoolExecutor(
-        1, mp_context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(threads, os.getpid())
-    )
-
-
-class _OfWorkers:
-    """The environment of workers that start meanwhile: they walk their sets in the same order, and compute the same bits, every time."""
-
-    VARIABLES: ClassVar = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES}
-
-    def __enter__(self) -> None:
-        self.before = {name: os.environ.get(name) for name in self.VARIABLES}
-        os.environ.update(self.VARIABLES)
-
-    def __exit__(self, *exception: object) -> None:
-        for name, value in self.before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_start, initargs=(threads, os.getpid()))
 
 
 def _start(threads: int, parent: int) -> None:

@@ -229,7 +229,7 @@ def test_an_input_edited_while_it_is_read_gives_no_result(project, capsys):
 
 
 def test_a_disk_that_gives_back_something_else_does_not_loop(project, monkeypatch, capsys):
-    from factorlib.runner.integrity import Inspector
+    from factorlib.runner.store import Inspector
 
     monkeypatch.setattr(
         Inspector, "damage", lambda self, output, files: ["total.txt: other content"] if "total.txt" in files else []

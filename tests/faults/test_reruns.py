@@ -27,9 +27,8 @@ from faults.tries import note
 
 from factorlib.errors import InputError
 from factorlib.runner import survey as survey_module
-from factorlib.runner.closure import Source, Sources, source_of
+from factorlib.runner.closure import Packages, Source, Sources, Unknown, other_than, source_of
 from factorlib.runner.filehash import FileHashes
-from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Listing, difference, plan
 from factorlib.runner.project import LIBRARY, Project, Provider, photo_sets
@@ -433,13 +432,13 @@ CONDITIONAL = (
 )
 
 
-def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default():
+def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default(tmp_path):
     """A key that is too new costs time; one that is too old would give the result of another parameter."""
-    from factorlib.runner.defaults import UNKNOWN, names_of, other_than, values_of
-
-    names = names_of(ast.parse(CONDITIONAL))
-    assert values_of("m", "Params", lambda module: names) == {"gain": UNKNOWN}
-    assert other_than({"gain": UNKNOWN}, {"gain": 1}) == {"gain": 1}
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "s.py").write_text(CONDITIONAL)
+    defaults = Sources([tmp_path], FileHashes(None)).stage_params("m", "s", tmp_path / "pipeline.yaml")
+    assert defaults == {"gain": "GAIN"} and isinstance(defaults["gain"], Unknown)
+    assert other_than(defaults, {"gain": 1}) == {"gain": 1} and other_than(defaults, {"gain": "GAIN"}) != {}
 
 
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
