@@ -17,7 +17,6 @@ from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
-from factorlib.align.doubts import doubts
 from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
@@ -25,7 +24,7 @@ from tqdm import tqdm
 from benchmarks.tools import Clock, Tables, exacts
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
-from factorlib.align.trust import trust_in
+from factorlib.align.trust import doubts, trust_in
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.meshes.mesh import Mesh

@@ -21,13 +21,8 @@ from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
-NOT_OURS = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ELOOP,
-    errno.ENAMETOOLONG,
-}  # what the system refuses to this user
+# What the system refuses to this user.
+NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 
 
 def project() -> Project:
@@ -40,12 +35,48 @@ def project() -> Project:
     return Project(Path(root).resolve(), photo_sets())
 
 
-# ── what the environment says where the command line does not: make passes it on so, untouched by any shell ──────────
+# ── options ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _cores(word: str) -> int:
+    if not word.isdigit() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"{word!r} is no number of cores: a whole number from 1")
+    return int(word)
+
+
+def _option(*flags: str, **more: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    return flags, more
+
+
+ON, MANY, FEW = {"action": "store_true"}, {"action": "append"}, {"nargs": "*"}
+OPTIONS = {  # as `ArgumentParser.add_argument` takes them
+    "dataset": _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET"),
+    "set": _option("--set", dest="settings", metavar="X.Y=Z", help="stage.parameter=value; else SET", **MANY),
+    "force": _option("--force", help="whatever the store holds, or without asking; as FORCE=1", **ON),
+    "recipe": _option(
+        "--recipe", dest="recipes", help="pictures: a path, a name in recipes/, or all; else RECIPE", **MANY
+    ),
+    "stages": _option("stages", help="stages; all without it", **FEW),
+    "mermaid": _option("--mermaid", help="as a Mermaid diagram", **ON),
+    "photo": _option("--photo", help="its name, or a recipe's; else PHOTO"),
+    "photos": _option("--photos", type=Path, help="folder; else PHOTOS"),
+    "masks": _option("--masks", type=Path, help="folder; else MASKS"),
+    "meshes": _option("--meshes", type=Path, help="folder; else MESHES"),
+    "first": _option("first", nargs="?", help="folder of a result, as build/eames; else A"),
+    "second": _option("second", nargs="?", help="another; else B"),
+    "sheet": _option("--sheet", help="also draw photos, labels and meshes; as SHEET=1", **ON),
+    "scheduler": _option("scheduler", help="its address, as tcp://10.0.0.1:8786"),
+    "cores": _option("--cores", type=_cores, help="that it computes on; default: all of this machine"),
+    "name": _option("name"),
+}
+
+
+# ── what the environment says where the command line does not: make passes NAME=value on so, untouched by any shell ──
 
 
 def named(dataset: str | None, optional: bool = False) -> str | None:
     """The dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
-    dataset = os.environ.get("DATASET") if dataset is None else dataset
+    dataset = os.environ.get("DATASET") if dataset is None else dataset  # an empty one is not none
     if dataset is None and not optional:
         cure = "add DATASET=<a name in data/, or a path to a folder>"
         raise InputError("no dataset is named", key="DATASET", cure=cure)
@@ -57,11 +88,6 @@ def chosen(settings: list[str] | None) -> list[str]:
     return settings or [os.environ.get("SET", "")]
 
 
-def forced(force: bool) -> bool:
-    """Whether to run again what is current: --force or FORCE=1."""
-    return switched_on("FORCE", force)
-
-
 def switched_on(key: str, option: bool) -> bool:
     """Whether an option, or the environment's `key`, is on.  InputError where the latter is neither 0, 1 nor empty."""
     word = os.environ.get(key, "")
@@ -70,34 +96,37 @@ def switched_on(key: str, option: bool) -> bool:
     return option or word == "1"
 
 
+def forced(force: bool) -> bool:
+    """Whether to run again what is current: --force or FORCE=1."""
+    return switched_on("FORCE", force)
+
+
 def agreed(force: bool) -> bool:
     """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
     return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
 def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
-    """What is asked for, by the options, else by the environment; without `stages` all of them."""
-    recipes = asked.recipes or [name for name in [os.environ.get("RECIPE")] if name]
+    """What is asked for; without `stages` all of them."""
+    recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
     force = forced(getattr(asked, "force", False))
     return verbs.Wish(named(asked.dataset), stages or None, chosen(asked.settings), force, recipes)
 
 
-def _stages(asked: Namespace) -> list[str] | None:
-    return asked.stages or os.environ.get("STAGE", "").split() or None
-
-
 def _path(given: Path | None, key: str) -> Path | None:
-    """The option's path, else the one that the environment names."""
     return given or (Path(os.environ[key]).expanduser() if os.environ.get(key) else None)
 
 
 # ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
+def _stages(asked: Namespace) -> list[str] | None:
+    return asked.stages or os.environ.get("STAGE", "").split() or None
+
+
 def _stage(asked: Namespace) -> int:
-    known = project()
-    verbs.check_stage(known, asked.name, list(VERBS))
-    return verbs.make(known, wish(asked, [asked.name]))
+    verbs.check_stage(project(), asked.name, list(VERBS))
+    return verbs.make(project(), wish(asked, [asked.name]))
 
 
 def _new(asked: Namespace) -> int:
@@ -119,141 +148,65 @@ def _worker(asked: Namespace) -> int:
     return 0
 
 
-def _cores(word: str) -> int:
-    if not word.isdigit() or int(word) < 1:
-        raise argparse.ArgumentTypeError(f"{word!r} is no number of cores: a whole number from 1")
-    return int(word)
-
-
-OPTIONS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {  # as `ArgumentParser.add_argument` takes them
-    "dataset": (("--dataset", "-d"), {"help": "its name in data/, or a path to its folder; else DATASET"}),
-    "set": (
-        ("--set",),
-        {"dest": "settings", "action": "append", "metavar": "X.Y=Z", "help": "stage.parameter=value; else SET"},
-    ),
-    "force": (
-        ("--force",),
-        {"action": "store_true", "help": "whatever the store holds, or without asking; as FORCE=1"},
-    ),
-    "recipe": (
-        ("--recipe",),
-        {
-            "dest": "recipes",
-            "action": "append",
-            "help": "pictures to make: a path, a name in recipes/, or all; else RECIPE",
-        },
-    ),
-    "stages": (("stages",), {"nargs": "*", "help": "stages; all without it"}),
-    "mermaid": (("--mermaid",), {"action": "store_true", "help": "as a Mermaid diagram"}),
-    "photo": (("--photo",), {"help": "its name, or a recipe's; else PHOTO"}),
-    **{
-        word: ((f"--{word}",), {"type": Path, "help": f"folder; else {word.upper()}"})
-        for word in ("photos", "masks", "meshes")
-    },
-    "first": (("first",), {"nargs": "?", "help": "folder of a result, as build/eames; else A"}),
-    "second": (("second",), {"nargs": "?", "help": "another; else B"}),
-    "sheet": (("--sheet",), {"action": "store_true", "help": "also draw photos, labels and meshes; as SHEET=1"}),
-    "scheduler": (("scheduler",), {"help": "its address, as tcp://10.0.0.1:8786"}),
-    "cores": (("--cores",), {"type": _cores, "help": "that it computes on; default: all of this machine"}),
-    "name": (("name",), {}),
-}
 ASKED = "dataset set force recipe"
-VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, function, help
-    "all": (
-        ASKED,
-        lambda a: verbs.make(project(), wish(a)),
-        "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes.",
+RUN: dict[str, Callable[[Namespace], int]] = {
+    "all": lambda a: verbs.make(project(), wish(a)),
+    "stage": _stage,
+    "plan": lambda a: verbs.show_plan(project(), wish(a, a.stages)),
+    "why": lambda a: verbs.show_why(project(), wish(a, a.stages)),
+    "status": lambda a: verbs.show_status(project(), wish(a, a.stages)),
+    "graph": lambda a: verbs.show_graph(project(), a.mermaid),
+    "logs": lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo or os.environ.get("PHOTO") or None),
+    "params": lambda a: verbs.show_params(project(), _stages(a)),
+    "new": _new,
+    "compare": _compare,
+    "validate": lambda a: verbs.validate(
+        project(), named(a.dataset), chosen(a.settings), switched_on("SHEET", a.sheet)
     ),
-    "stage": (
-        f"name {ASKED}",
-        _stage,
-        "Run one stage and what it needs (`python -m factorlib solve`); `render` with a recipe makes its pictures alone.",
-    ),
-    "plan": (
-        f"stages {ASKED}",
-        lambda a: verbs.show_plan(project(), wish(a, a.stages)),
-        "What would run; with a recipe and no stage, for its pictures alone.",
-    ),
-    "why": (
-        f"stages {ASKED}",
-        lambda a: verbs.show_why(project(), wish(a, a.stages)),
-        "Every reason why it would run.",
-    ),
-    "status": (
-        "stages dataset set recipe",
-        lambda a: verbs.show_status(project(), wish(a, a.stages)),
-        "How far each stage is, and what the current results warned of.",
-    ),
-    "graph": (
-        "mermaid dataset",
-        lambda a: verbs.show_graph(project(), a.mermaid),
-        "The stages and what they take, as text or as a Mermaid diagram.",
-    ),
+    "verify": lambda a: verbs.verify(project(), named(a.dataset, True)),
+    "clean": lambda a: verbs.clean(project(), named(a.dataset, True)),
+    "gc": lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+    "worker": _worker,
+    "ship": lambda a: verbs.ship(project(), a.name, named(a.dataset)),
+}
+VERBS = {  # in the order of `--help`: options, help
+    "all": (ASKED, "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
+    "stage": (f"name {ASKED}", "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),
+    "plan": (f"stages {ASKED}", "What would run; with a recipe and no stage, for its pictures alone."),
+    "why": (f"stages {ASKED}", "Every reason why it would run."),
+    "status": ("stages dataset set recipe", "How far each stage is, and what the current results warned of."),
+    "graph": ("mermaid dataset", "The stages and what they take, as text or as a Mermaid diagram."),
     "logs": (
         "stages dataset set recipe photo",
-        lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo or os.environ.get("PHOTO") or None),
-        "What current results cost and were made with: time, peak memory, versions, warnings (make logs STAGE=… PHOTO=…).",
+        "What current results cost and were made with: time, memory, versions.",
     ),
-    "params": (
-        "stages",
-        lambda a: verbs.show_params(project(), _stages(a)),
-        "Every parameter of stages with default, range and meaning (make params STAGE=…).",
-    ),
+    "params": ("stages", "Every parameter of stages with default, range and meaning (make params STAGE=…)."),
     "new": (
         "dataset photos masks meshes",
-        _new,
-        "Begin a dataset of your own: copy photos, masks and meshes to data/<name>, and write its dataset.yaml.",
+        "Begin data/<name> of your own photos, masks and meshes, with a dataset.yaml.",
     ),
-    "compare": (
-        "first second",
-        _compare,
-        "A page that shows two results side by side: parameters, numbers, materials, lights and re-syntheses.",
-    ),
-    "validate": (
-        "dataset set sheet",
-        lambda a: verbs.validate(project(), named(a.dataset), chosen(a.settings), switched_on("SHEET", a.sheet)),
-        "Check pipeline.yaml, settings and dataset without running anything.",
-    ),
-    "verify": (
-        "dataset",
-        lambda a: verbs.verify(project(), named(a.dataset, True)),
-        "Read every kept result, of a dataset or of all, and name what is damaged.",
-    ),
-    "clean": (
-        "dataset",
-        lambda a: verbs.clean(project(), named(a.dataset, True)),
-        "Forget a dataset's results, or, where neither --dataset nor DATASET is given, those of all.",
-    ),
-    "gc": (
-        "force",
-        lambda a: verbs.collect(project(), lambda: agreed(a.force)),
-        "Show which results are current for no dataset, and delete them; a terminal is asked first.",
-    ),
+    "compare": ("first second", "A page that shows two results side by side: parameters, numbers, materials, lights."),
+    "validate": ("dataset set sheet", "Check pipeline.yaml, settings and dataset without running anything."),
+    "verify": ("dataset", "Read every kept result, of a dataset or of all, and name what is damaged."),
+    "clean": ("dataset", "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
+    "gc": ("force", "Show which results are current for no dataset, and delete them; a terminal is asked first."),
     "worker": (
         "scheduler cores",
-        _worker,
-        "Work for the Dask cluster of a scheduler, until it ends; further options are those of `dask worker` (docs/distributed.md).",
+        "Work for a Dask scheduler until it ends; further options are those of `dask worker`.",
     ),
-    "ship": (
-        "name dataset",
-        lambda a: verbs.ship(project(), a.name, named(a.dataset)),
-        "Put a stage's current result into the package (for those who change the stage).",
-    ),
+    "ship": ("name dataset", "Put a stage's current result into the package (for those who change the stage)."),
 }
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """Reads the words of every verb; `run` in what it returns is the verb's function."""
-    whole = argparse.ArgumentParser(
-        program, description="Any other word is the name of a stage: it is run, and what it needs."
-    )
-    add = whole.add_subparsers(title="verbs", metavar="verb", required=True).add_parser
-    for name, (options, function, text) in VERBS.items():
-        one = add(name, help=text, description=text, allow_abbrev=False)
-        one.set_defaults(run=function)
-        for option in options.split():
-            names, how = OPTIONS[option]
-            one.add_argument(*names, **how)
+    """Reads the words of every verb; `verb` in what it returns is its name."""
+    text = "Any other word is the name of a stage: it is run, and what it needs."
+    whole = argparse.ArgumentParser(program, description=text)
+    verbs_ = whole.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
+    for name, (options, text) in VERBS.items():
+        one = verbs_.add_parser(name, help=text, description=text, allow_abbrev=False)
+        for flags, more in (OPTIONS[option] for option in options.split()):
+            one.add_argument(*flags, **more)
     return whole
 
 
@@ -263,10 +216,10 @@ def run(words: list[str], program: str) -> int:
         words = ["stage", *words]
     known = parser(program)
     asked, further = known.parse_known_args(words or ["--help"])
-    if further and asked.run is not _worker:
+    if further and asked.verb != "worker":
         known.error(f"unrecognized arguments: {' '.join(further)}")
     asked.further = further
-    return asked.run(asked)
+    return RUN[asked.verb](asked)
 
 
 def main() -> NoReturn:

@@ -5,7 +5,6 @@ To move a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `ma
 
 from __future__ import annotations
 
-import sys
 import tomllib
 from importlib.metadata import distribution, requires
 from pathlib import Path
@@ -26,37 +25,26 @@ LEFT_OUT = {
     "python-dateutil": {"tzdata"},  # the system has its own
     "dash": {"flask", "requests", "retrying", "nest-asyncio", "importlib-metadata", "comm"},
 }
-APART = {"torch"}  # installed before the others, from an index of its own
-
-
-def pinned(project: dict) -> list[str]:
-    """Lines `name==version` of the project's closure, by name; `project`: that table of pyproject.toml.
-
-    Raises PackageNotFoundError for a package that is needed and not installed.
-    """
-    asked = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
-    found: dict[str, str] = {}
-    waiting = [(Requirement(text), "") for text in asked]
-    while waiting:
-        requirement, extra = waiting.pop()
-        name = canonicalize_name(requirement.name)
-        if name in found or (requirement.marker and not requirement.marker.evaluate({"extra": extra})):
-            continue
-        installed = distribution(name)
-        found[name] = f"{installed.metadata['Name']}=={installed.version}"
-        needed = [Requirement(text) for text in requires(name) or []]
-        kept = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, set())]
-        waiting += [(each, extra) for each in kept for extra in ("", *requirement.extras)]
-    return sorted((line for name, line in found.items() if name not in APART), key=str.lower)
 
 
 def lock_text() -> str:
-    """What requirements.lock should say."""
-    return HEAD + "".join(
-        f"{line}\n" for line in pinned(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"])
-    )
+    """What requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    waiting = [(Requirement(text), "") for text in project["dependencies"] + project["optional-dependencies"]["dev"]]
+    lines: dict[str, str] = {}
+    while waiting:
+        requirement, extra = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if name in lines or (requirement.marker and not requirement.marker.evaluate({"extra": extra})):
+            continue
+        lines[name] = f"{distribution(name).metadata['Name']}=={distribution(name).version}\n"
+        needed = [Requirement(text) for text in requires(name) or []]
+        needed = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, ())]
+        waiting += [(each, extra) for each in needed for extra in ("", *requirement.extras)]
+    del lines["torch"]  # installed before the others, from an index of its own
+    return HEAD + "".join(sorted(lines.values(), key=str.lower))
 
 
 if __name__ == "__main__":
     write_text(ROOT / "requirements.lock", lock_text())
-    sys.stdout.write("requirements.lock is written\n")
+    print("requirements.lock is written")

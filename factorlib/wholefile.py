@@ -87,9 +87,8 @@ def bytes_of(write: Callable[[str], None]) -> bytes:
     Where the system has no files in memory, a temporary one stands in.  There, too, room can end (`ulimit -f`): then
     there is none for one byte more.
     """
-    with (
-        open(os.memfd_create("factorlib"), "r+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile() as stream
-    ):
+    in_memory = hasattr(os, "memfd_create")
+    with open(os.memfd_create("factorlib"), "r+b") if in_memory else tempfile.TemporaryFile() as stream:
         try:
             write(f"/dev/fd/{stream.fileno()}")
         finally:

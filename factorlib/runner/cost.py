@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import os
 import platform
@@ -13,12 +14,14 @@ class Meter:
     """Started where it is made."""
 
     def __init__(self) -> None:
-        _reset_peak()
+        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux counts the peak anew
+            stream.write("5")
         self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
         self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
 
     def read(self, threads: int, cores: int) -> dict:
         """Cost since the meter was made: wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
+        facts = {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()}
         return {
             "started": self.started,
             "seconds": round(time.perf_counter() - self.wall, 3),
@@ -26,29 +29,13 @@ class Meter:
             "memory_mb": round(_peak_bytes() / 2**20, 1),
             "threads": threads,
             "cores": cores,
-            "machine": {
-                "system": platform.system(),
-                "processor": platform.machine(),
-                "cores": os.cpu_count(),
-                "python": platform.python_version(),
-            },
+            "machine": facts | {"python": platform.python_version()},
         }
 
 
 def _cpu_seconds() -> float:
-    return sum(
-        resource.getrusage(who).ru_utime + resource.getrusage(who).ru_stime
-        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    )
-
-
-def _reset_peak() -> None:
-    """Linux can start counting anew; elsewhere the peak is that of the worker so far."""
-    try:
-        with open("/proc/self/clear_refs", "w") as stream:
-            stream.write("5")
-    except OSError:
-        pass
+    usage = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
 def _peak_bytes() -> int:

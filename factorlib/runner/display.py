@@ -10,6 +10,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, TextIO
 
 from factorlib.runner.plan import Planned, Step
@@ -46,95 +47,92 @@ class Plain:
 @contextlib.contextmanager
 def plain_streams() -> Iterator[None]:
     """Within, standard output and standard error are plain."""
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(Plain, before)
-    try:
+    with contextlib.redirect_stdout(Plain(sys.stdout)), contextlib.redirect_stderr(Plain(sys.stderr)):
         yield
-    finally:
-        sys.stdout, sys.stderr = before
+
+
+@dataclass
+class Live:
+    """A step that runs: when it began and was last heard of, which share of it is done, and what it does."""
+
+    started: float
+    spoke: float
+    share: float = 0.0
+    words: str = ""
 
 
 class Display:
     """Plain lines: what starts, what it warns of, how long it took."""
 
-    def __init__(self, stream: TextIO | None = None):
-        self.stream = stream or sys.stderr
-        self.totals: dict[str, int] = {}
-        self.left: dict[str, int] = {}
-        self.shares: dict[Step, float] = {}  # of each running step, how much is done
-        self._said: set[str | Step] = set()  # warnings, and steps that wait
+    def __init__(self) -> None:
+        self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
+        self.running: dict[Step, Live] = {}
         self._begun: set[str] = set()
-        self._spoke: dict[Step, float] = {}
-        self._started: dict[Step, float] = {}
-        self._words: dict[Step, str] = {}
+        self._told: set[str | Step] = set()  # warnings, and steps that wait
 
     def plan(self, planned: list[Planned]) -> None:
         """Take over the state of the plan as it is now."""
-        self.totals, self.left = {}, {}
+        self.stages = {p.step.stage: [0, 0] for p in planned}
         for p in planned:
-            self.totals[p.step.stage] = self.totals.get(p.step.stage, 0) + 1
-            self.left[p.step.stage] = self.left.get(p.step.stage, 0) + (p.status != "current")
+            self.stages[p.step.stage][0] += 1
+            self.stages[p.step.stage][1] += p.status != "current"
 
     def say(self, text: str) -> None:
         """Print a line."""
-        print(printable(text), file=self.stream, flush=True)
-
-    def start(self, step: Step) -> None:
-        """A step begins; printed for the first step of a stage only."""
-        self._started[step] = self._spoke[step] = time.monotonic()
-        self.shares[step] = 0.0
-        if step.stage not in self._begun:
-            self._begun.add(step.stage)
-            left = self.left.get(step.stage, 1)
-            items = f"{left} {'photo' if step.photo else 'recipe'}{'s' * (left > 1)} …"
-            self.line(step.stage, "…" if step.of is None else items)
+        print(printable(text), file=sys.stderr, flush=True)
 
     def line(self, stage: str, text: str) -> None:
         """Print how far a stage is."""
         self.say(f"{stage:<10} {text}".rstrip())
 
+    def _once(self, what: str | Step, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self.say(text)
+
+    def start(self, step: Step) -> None:
+        """A step begins; printed for the first step of a stage only."""
+        self.running[step] = Live(time.monotonic(), time.monotonic())
+        if step.stage not in self._begun:
+            self._begun.add(step.stage)
+            _, left = self.stages.setdefault(step.stage, [1, 1])
+            kind = "photo" if step.photo else "recipe"
+            self.line(step.stage, "…" if step.of is None else f"{left} {kind}{'s' * (left > 1)} …")
+
     def waits(self, step: Step) -> None:
         """A step waits for another run to make its result; printed once."""
-        if step not in self._said:
-            self._said.add(step)
-            self.say(f"{step}: waiting: another run is making it")
+        self._once(step, f"{step}: waiting: another run is making it")
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
         """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does; `tick` shows it."""
-        self.shares[step] = min(done / total, 1.0) if total else 0.0
-        self._words[step] = f"{f'{done / total:4.0%}' if total else ''} {printable(text)}".strip()
+        live = self.running[step]
+        live.share = min(done / total, 1.0) if total else 0.0
+        live.words = f"{f'{done / total:4.0%}' if total else ''} {printable(text)}".strip()
 
     def tick(self) -> None:
         """Show life: print a line for every step that has been silent for BEAT seconds."""
         now = time.monotonic()
-        for step, spoke in self._spoke.items():
-            if now - spoke >= BEAT:
-                self._spoke[step] = now
-                seconds = now - self._started[step]
-                self.line(step.stage, f"{step.of or '':<16} {seconds:6.0f} s  {self._words.get(step, '')}")
+        for step, live in self.running.items():
+            if now - live.spoke >= BEAT:
+                live.spoke = now
+                self.line(step.stage, f"{step.of or '':<16} {now - live.started:6.0f} s  {live.words}")
 
     def warn(self, step: Step, text: str) -> None:
         """Print a warning; one that was printed before is left out."""
-        if text not in self._said:
-            self._said.add(text)
-            self.say(f"warning: {step}: {text}")
+        self._once(text, f"warning: {step}: {text}")
 
     def finish(self, step: Step, seconds: float) -> None:
         """A step is done, after `seconds`."""
-        self.left[step.stage] = self.left.get(step.stage, 1) - 1
-        self._end(step)
+        self.stages[step.stage][1] -= 1
+        self.running.pop(step, None)
         self.line(step.stage, f"{step.of or '':<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
         """A step ended with an error; `traceback` names the file with details of a defect of the program."""
-        self._end(step)
+        self.running.pop(step, None)
         self.say(f"error: {step}: {error}")
         if traceback:
             self.say(f"  this is a defect of the program, not of your input; details: {traceback}")
-
-    def _end(self, step: Step) -> None:
-        for table in (self._spoke, self._words, self.shares):
-            table.pop(step, None)
 
     def close(self) -> None:
         """Nothing more will be shown."""
@@ -143,21 +141,16 @@ class Display:
 class Bars(Display):
     """On a terminal a bar for each stage that runs, warnings and errors above them; running steps count by their share."""
 
-    def __init__(self, console: Any = None):
+    def __init__(self) -> None:
         from rich import progress
         from rich.console import Console
 
         super().__init__()
         stream = sys.stderr.stream if isinstance(sys.stderr, Plain) else sys.stderr  # rich moves the cursor itself
-        columns = [
-            progress.SpinnerColumn(),
-            progress.TextColumn("{task.description:<10}"),
-            progress.BarColumn(24),
-            progress.TextColumn("{task.fields[count]:>7}"),
-            progress.TimeElapsedColumn(),
-            progress.TextColumn("{task.fields[words]}", markup=False),
-        ]
-        self.bars = progress.Progress(*columns, console=console or Console(file=stream))
+        texts = [progress.TextColumn(f"{{task.{text}}}", markup=False) for text in ("description:<10", "fields[words]")]
+        count = progress.TextColumn("{task.fields[count]:>7}")
+        columns = [progress.SpinnerColumn(), texts[0], progress.BarColumn(24), count, progress.TimeElapsedColumn()]
+        self.bars = progress.Progress(*columns, texts[1], console=Console(file=stream))
         self._rows: dict[str, int] = {}
         self.bars.start()
 
@@ -174,10 +167,10 @@ class Bars(Display):
         for stage in self._begun:
             if stage not in self._rows:
                 self._rows[stage] = self.bars.add_task(stage, total=1.0, count="", words="")
-            total, left = self.totals.get(stage, 1), self.left.get(stage, 1)
-            running = {step: share for step, share in self.shares.items() if step.stage == stage}
-            words = "; ".join(f"{step.of or ''} {self._words.get(step, '')}".strip() for step in running)
-            done, count = total - left + sum(running.values()), f"{total - left}/{total}"
+            total, left = self.stages[stage]
+            running = {step: live for step, live in self.running.items() if step.stage == stage}
+            words = "; ".join(f"{step.of or ''} {live.words}".strip() for step, live in running.items())
+            done, count = total - left + sum(live.share for live in running.values()), f"{total - left}/{total}"
             self.bars.update(self._rows[stage], completed=done, total=total, count=count, words=words[:80])
             if left == 0:
                 self.bars.stop_task(self._rows[stage])
@@ -188,31 +181,29 @@ class Bars(Display):
         self.bars.stop()
 
 
-def display_for(stream: TextIO | None = None) -> Display:
-    """What fits the stream (default: standard error); bars, and what draws them, are loaded for a terminal only."""
-    stream = stream or sys.stderr
-    return Bars() if stream.isatty() else Display(stream)
+def display_for() -> Display:
+    """What fits standard error; bars, and what draws them, are loaded for a terminal only."""
+    return Bars() if sys.stderr.isatty() else Display()
 
 
 @contextlib.contextmanager
-def shown_if_long(what: str, stream: TextIO | None = None) -> Iterator[Callable[[float, float], None]]:
+def shown_if_long(what: str) -> Iterator[Callable[[float, float], None]]:
     """A report (done, total) for work outside the pipeline: shown as a step called `what` once PATIENCE is over."""
-    started, step, display = time.monotonic(), Step(what), None
+    started, step, displays = time.monotonic(), Step(what), []
 
     def report(done: float, total: float) -> None:
         """Note how much is done; nothing is printed for short work."""
-        nonlocal display
-        if display is None and time.monotonic() - started >= PATIENCE:
-            display = display_for(stream)
-            display.start(step)
-        if display is not None:
+        if not displays and time.monotonic() - started >= PATIENCE:
+            displays.append(display_for())
+            displays[0].start(step)
+        for display in displays:
             display.progress(step, done, total, "")
             display.tick()
 
     try:
         yield report
-        if display is not None:
+        for display in displays:
             display.finish(step, time.monotonic() - started)
     finally:
-        if display is not None:
+        for display in displays:
             display.close()

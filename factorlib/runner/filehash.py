@@ -17,7 +17,7 @@ from factorlib.wholefile import replace_file
 T = TypeVar("T")
 Signature = tuple[int, int, int, int]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-FORMAT = 4  # of the cache; one of another format is made anew
+FORMAT = 5  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
 
 
@@ -33,6 +33,11 @@ def hash_of_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
 
 
+def is_file_of(digest: str, path: Path) -> bool:
+    """Whether there is such a file, with that content."""
+    return path.is_file() and hash_of_file(path) == digest
+
+
 def left_over(name: str) -> bool:
     """Whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
 
@@ -42,58 +47,56 @@ def left_over(name: str) -> bool:
     return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"
 
 
+def read_cache(path: Path | None, type_: type[T]) -> T | None:
+    """What a cache holds; None where there is none, or it is damaged or of another kind."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=type_) if path else None
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+
+
 def write_cache(path: Path, tables: Any) -> None:
-    """In whole or not at all; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
+    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, msgspec.json.encode(tables))
 
 
-def _known(entry: Any, now: Signature, type_: Any) -> Any:
-    """What a file's entry in the cache holds; None where it is of another state of the file, or damaged."""
-    try:
-        then, value = msgspec.convert(entry, tuple[Signature, Any])
-        return msgspec.convert(value, type_) if then == now else None
-    except (msgspec.ValidationError, OverflowError):
-        return None
+class _Tables(msgspec.Struct):
+    format: int
+    contents: dict[str, Any]
+    sources: dict[str, Any]
 
 
 class FileHashes:
-    """A cache beside the store; `save` writes it, in whole or not at all."""
+    """A cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
 
     def __init__(self, cache: Path | None):
-        self.cache = cache
-        self._contents, self._sources = (table if isinstance(table, dict) else {} for table in self._read())
-        self._changed = False
+        self.cache, self._changed = cache, False
+        tables = read_cache(cache, _Tables)
+        self._tables = tables if tables and tables.format == FORMAT else _Tables(FORMAT, {}, {})
 
     def content(self, path: Path) -> str:
         """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
-        return self._remembered(self._contents, path, lambda: hash_of_file(path), Hash)
+        return self._remembered(self._tables.contents, path, lambda: hash_of_file(path), Hash)
 
     def source(self, path: Path, parse: Callable[[], T], type_: type[T]) -> T:
         """What `parse` makes of a file of source, remembered; type_: what that is."""
-        return self._remembered(self._sources, path, parse, type_)
+        return self._remembered(self._tables.sources, path, parse, type_)
 
     def _remembered(self, table: dict, path: Path, make: Callable, type_: type) -> Any:
         now = signature(path)
-        known = _known(table.get(str(path)), now, type_)
-        if known is not None:
-            return known
+        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
+            then, value = msgspec.convert(table[str(path)], tuple[Signature, Any])
+            if then == now:
+                return msgspec.convert(value, type_)
         value = make()
         if signature(path) == now and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
             table[str(path)], self._changed = (now, value), True
         return value
 
-    def _read(self) -> tuple[dict, dict]:
-        try:
-            tables = msgspec.json.decode(self.cache.read_bytes())
-            return (tables["contents"], tables["sources"]) if tables["format"] == FORMAT else ({}, {})
-        except (AttributeError, OSError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
-            return {}, {}
-
     def save(self) -> None:
         """Write the cache, where there is anything new to write."""
-        if not self._changed or self.cache is None:
-            return
-        write_cache(self.cache, {"format": FORMAT, "contents": self._contents, "sources": self._sources})
-        self._changed = False
+        if self._changed and self.cache is not None:
+            write_cache(self.cache, self._tables)
+            self._changed = False

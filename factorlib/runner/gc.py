@@ -1,4 +1,4 @@
-"""Taking away: what killed runs left, results that no dataset's last run needs, and a dataset's results.
+"""Looking after a store: what killed runs left, what is damaged, what no dataset needs, and forgetting a dataset's results.
 
 Each run has a folder in store/tmp and holds a lock on it while it lives; the operating system frees the lock of a run
 that was killed, so a folder whose lock can be taken is rubbish, and no command is needed to unlock anything.
@@ -7,6 +7,7 @@ that was killed, so a folder whose lock can be taken is rubbish, and no command 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import uuid
@@ -17,14 +18,15 @@ import msgspec
 from filelock import FileLock, Timeout
 
 from factorlib.errors import InputError
-from factorlib.runner.home import Home, made_homes
-from factorlib.runner.plan import Step
+from factorlib.runner.home import Home, gathered, made_homes
+from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.plan import Step, key_of
 from factorlib.runner.project import Project
-from factorlib.runner.store import Store, is_alive, sweep_drafts
+from factorlib.runner.store import Entry, Inspector, Store, damage_of, is_alive, stamps_of, sweep_drafts
 
 Gone = tuple[list[Path], list[Path]]  # what was deleted, and what is left beside it, for the runner did not make it
+Damage = tuple[Path, list[str], list[str]]  # where; a line for each fault; whose result, as `masks/kitchen (eames)`
 LEFT_OVER = "left over"  # what was damaged, and files without a key
-INPUT = "input:"  # of the fields of a record, those that name a result it was made from
 
 
 @contextlib.contextmanager
@@ -34,7 +36,6 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
     folder, lock = store.tmp / name, FileLock(store.tmp / f"{name}.lock")
     store.locks.mkdir(parents=True, exist_ok=True)
     with _door(store, say):
-        sweep(store)
         lock.acquire()
         folder.mkdir(parents=True)
     try:
@@ -48,9 +49,7 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
 @contextlib.contextmanager
 def alone(store: Store) -> Iterator[None]:
     """For what deletes results: no run goes on, and none starts meanwhile."""
-    store.tmp.mkdir(parents=True, exist_ok=True)
     with _door(store, lambda _: None):
-        sweep(store)
         if any(store.tmp.glob("run-*.lock")):
             raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
         yield
@@ -58,6 +57,7 @@ def alone(store: Store) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
+    """Only one command at a time is within; what dead runs left is gone."""
     store.tmp.mkdir(parents=True, exist_ok=True)
     door = FileLock(store.root / "door.lock")
     try:
@@ -66,52 +66,34 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         say("waiting: the store is being cleaned by another command")
         door.acquire()
     try:
+        _sweep(store)
         yield
     finally:
         door.release()
 
 
-def sweep(store: Store) -> None:
+def _sweep(store: Store) -> None:
     """Delete what dead runs left in tmp, and their drafts of keys, logs and caches."""
     for lock_file in store.tmp.glob("run-*.lock"):
-        lock = FileLock(lock_file)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            continue
-        shutil.rmtree(lock_file.with_suffix(""), ignore_errors=True)
-        lock.release()
-        lock_file.unlink(missing_ok=True)
+        with contextlib.suppress(Timeout), FileLock(lock_file).acquire(timeout=0):
+            shutil.rmtree(lock_file.with_suffix(""), ignore_errors=True)
+            lock_file.unlink(missing_ok=True)
     for folder in (store.keys, store.logs, store.cache):
         sweep_drafts(folder)
     alive = {path.stem for path in store.tmp.glob("run-*.lock")}
     for path in store.tmp.iterdir():
-        if path.is_dir() and path.name not in alive and not _maker_lives(path.name):
+        kind, pid, *_ = f"{path.name}--".split("-")
+        in_use = kind == "view" and pid.isdigit() and is_alive(int(pid))  # view-<process>-…
+        if path.is_dir() and path.name not in alive and not in_use:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _maker_lives(name: str) -> bool:
-    """Whether the process that a draft is named for, `view-<pid>-…`, still is."""
-    kind, _, rest = name.partition("-")
-    pid = rest.partition("-")[0]
-    return kind == "view" and pid.isdigit() and is_alive(int(pid))
-
-
-# ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Freed(msgspec.Struct, frozen=True):
-    """How many results were deleted, and how many bytes that freed."""
-
-    results: int
-    bytes: int
+# ── what nothing needs ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Unneeded(msgspec.Struct, frozen=True):
-    """Results of one stage that no dataset's last run needs.
-
-    bytes: of files that nothing else needs;  oldest, newest: when they were kept, seconds since 1970
-    """
+    """Results of one stage that no dataset's last run needs: how many, the bytes of files that nothing else needs, and when
+    the oldest and the newest were kept, in seconds since 1970."""
 
     stage: str
     results: int
@@ -125,38 +107,35 @@ def unneeded(project: Project) -> list[Unneeded]:
     store = Store(project.build / "store")
     keys, trees, _ = _dead(project, store)
     sizes = {path.name: _size(path) for path in trees}
-    found: dict[str, list[tuple[float, int]]] = {}
+    groups: dict[str, list[tuple[float, int]]] = {}
     for path in keys:
         entry = store.entry(path.stem)
         stage = entry.record.get("stage", LEFT_OVER) if entry else LEFT_OVER
-        found.setdefault(stage, []).append((path.stat().st_mtime, sizes.pop(entry.output, 0) if entry else 0))
-    if sizes:
-        kept = [(path.stat().st_mtime, sizes[path.name]) for path in trees if path.name in sizes]
-        found.setdefault(LEFT_OVER, []).extend(kept)
-    groups = [
-        Unneeded(s, len(r), sum(b for _, b in r), min(t for t, _ in r), max(t for t, _ in r)) for s, r in found.items()
-    ]
-    return sorted(groups, key=lambda group: (-group.bytes, group.stage))
+        groups.setdefault(stage, []).append((path.stat().st_mtime, sizes.pop(entry.output, 0) if entry else 0))
+    for path in (path for path in trees if path.name in sizes):
+        groups.setdefault(LEFT_OVER, []).append((path.stat().st_mtime, sizes[path.name]))
+    table = [Unneeded(s, len(r), sum(b for _, b in r), min(r)[0], max(r)[0]) for s, r in groups.items()]
+    return sorted(table, key=lambda group: (-group.bytes, group.stage))
 
 
-def collect(project: Project) -> Freed:
-    """Delete every result that is not current for some dataset, nor what such a one was made from; refused while a run goes on."""
+def collect(project: Project) -> tuple[int, int]:
+    """Delete every result that is not current for some dataset, nor what such a one was made from; how many, and their bytes.
+
+    Raises InputError while a run goes on.
+    """
     store = Store(project.build / "store")
     with alone(store):
         keys, trees, rest = _dead(project, store)
-        freed = sum(_size(path) for path in trees)
+        freed = sum(map(_size, trees))
         for path in keys + trees + rest:
-            _delete(path, store.tmp / f"gc-{os.getpid()}-{path.name}")
-    return Freed(len(keys), freed)
-
-
-def _delete(path: Path, aside: Path) -> None:
-    """A folder goes from its place by one rename: where this is killed, no part of it is taken for a result that is damaged."""
-    if path.is_dir() and not path.is_symlink():
-        os.rename(path, aside)
-        shutil.rmtree(aside)
-    else:
-        path.unlink()
+            if (
+                path.is_dir() and not path.is_symlink()
+            ):  # by one rename: a part of it might be taken for a damaged result
+                os.rename(path, aside := store.tmp / f"gc-{os.getpid()}-{path.name}")
+                shutil.rmtree(aside)
+            else:
+                path.unlink()
+    return len(keys), freed
 
 
 def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[Path]]:
@@ -179,31 +158,81 @@ def _needed(store: Store, current: set[str]) -> set[str]:
     that anew in the meantime, with other parameters.
     """
     entries = {path.stem: entry for path in store.keys.glob("*.json") if (entry := store.entry(path.stem))}
-    gave: dict[tuple[str, str], list[str]] = {}
+    gave: dict[tuple[str, str], set[str]] = {}
     for key, entry in entries.items():
-        gave.setdefault((_step(entry.record), entry.output), []).append(key)
-    found, stack = set(current), list(current)
+        gave.setdefault((f"input:{_step(entry.record)}", entry.output), set()).add(key)
+    needed, stack = set(current), [key for key in current if key in entries]
     while stack:
-        record = entries[key].record if (key := stack.pop()) in entries else {}
-        above = {
-            other
-            for name, output in record.items()
-            if name.startswith(INPUT)
-            for other in gave.get((name.removeprefix(INPUT), output), [])
-        }
-        stack += above - found
-        found |= above
-    return found
+        inputs = [item for item in entries[stack.pop()].record.items() if item[0].startswith("input:")]
+        above = set().union(*(gave.get(item, set()) for item in inputs)) - needed
+        stack += above
+        needed |= above
+    return needed
 
 
-def _step(record: dict) -> str:
-    return str(Step(record.get("stage", LEFT_OVER), record.get("photo"), record.get("recipe")))
+def _step(record: dict) -> Step:
+    return Step(record.get("stage", LEFT_OVER), record.get("photo"), record.get("recipe"))
+
+
+def _size(path: Path) -> int:
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+
+
+# ── what is damaged ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> tuple[int, list[Damage]]:
+    """Read the results that `homes` name, or everything in the store; how many there are, and what is damaged.
+
+    What is damaged is no longer taken for right by its size and time: the next run makes it again.
+    """
+    inspector, users = Inspector(store.root), {}
+    for home in homes:
+        for step, key in home.keys().items():
+            users.setdefault(key, []).append(f"{step} ({home.folder.name})")
+    keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if everything else set()))
+    damaged, trees, entries = [], {}, {}
+    for key in keys:
+        if (entry := store.entry(key)) is None:
+            damaged.append((store.keys / f"{key}.json", ["missing or not readable"], users.get(key, [])))
+            continue
+        entries[key], names = entry, users.get(key) or [f"{_step(entry.record)} (of an earlier run)"]
+        trees.setdefault(entry.output, (entry.files, []))[1].extend(names)
+        if key_of(entry.record) != key:
+            damaged.append((store.keys / f"{key}.json", ["its record is not the one that made the key"], names))
+    for output, (files, names) in trees.items():  # every tree once, whichever keys gave it
+        damaged.append((store.tree(output), inspector.thorough(output, files), names))
+    for home in homes:
+        for stage in pipeline.stages:
+            link = home.folder / stage
+            if link.is_dir() and link.resolve().parent == store.views.resolve():
+                steps = {step: key for step, key in home.keys().items() if step.startswith(f"{stage}/")}
+                photos = {step.partition("/")[2]: entries[key] for step, key in steps.items() if key in entries}
+                faults = _of_view(store, link.resolve(), photos, pipeline.stages[stage].gather)
+                damaged.append((link, faults, [f"{stage} ({home.folder.name})"]))
+    inspector.save()
+    return len(keys), [damage for damage in damaged if damage[1]]
+
+
+def _of_view(store: Store, view: Path, photos: dict[str, Entry], gather: str | None) -> list[str]:
+    """A photo of which there is any file must be there in whole; one that failed in the last run is not."""
+    names = stamps_of(view).keys()
+    there = {photo: entry for photo, entry in photos.items() if names & entry.files.keys()}
+    files = {name: hash_ for entry in there.values() for name, hash_ in entry.files.items()}
+    if gather:
+        with contextlib.suppress(OSError, InputError):  # of a tree that is damaged
+            table = gathered(store, {photo: entry.output for photo, entry in there.items()})
+            files[gather] = hashlib.sha256(table.encode()).hexdigest()[:32]
+    return damage_of(view, files, {})
+
+
+# ── forgetting ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def forget(project: Project, home: Home) -> Gone:
     """Delete a dataset's links and marks; what they led to in the store goes with the next gc."""
     with alone(Store(project.build / "store")):
-        return _forget(project, home)
+        return _forget(home)
 
 
 def forget_all(project: Project) -> Gone:
@@ -212,7 +241,7 @@ def forget_all(project: Project) -> Gone:
         return [], []
     store = Store(project.build / "store")
     with alone(store):
-        parts = [_forget(project, home) for home in made_homes(project)]
+        parts = [_forget(home) for home in made_homes(project)]
         deleted, left = ([path for part in parts for path in part[which]] for which in (0, 1))
         if not store.root.is_symlink():
             shutil.rmtree(store.root)
@@ -221,19 +250,15 @@ def forget_all(project: Project) -> Gone:
     return deleted, left
 
 
-def _forget(project: Project, home: Home) -> Gone:
+def _forget(home: Home) -> Gone:
     """Only what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
-    folders = [
-        folder
-        for folder in home.folder.iterdir()
-        if folder.is_dir() and not folder.is_symlink() and folder != home.errors
-    ]
+    entries = list(home.folder.iterdir())
+    folders = [path for path in entries if path.is_dir() and not path.is_symlink() and path != home.errors]
     pictures = [path for folder in folders for path in folder.iterdir() if _is_link_to_result(path)]  # of recipes
-    ours = [path for path in home.folder.iterdir() if _is_link_to_result(path)] + pictures
+    ours = [path for path in entries if _is_link_to_result(path)] + pictures
     ours += [path for path in (home.keys_file, home.log) if path.is_symlink() or path.is_file()]
     ours += sorted(home.folder.glob(".current.*"))
-    if not home.errors.is_symlink():
-        ours += sorted(home.errors.glob("*.txt"))
+    ours += [] if home.errors.is_symlink() else sorted(home.errors.glob("*.txt"))
     for path in (*ours, home.mark):
         path.unlink()
     for folder in (*dict.fromkeys(path.parent for path in pictures), home.errors, home.folder):
@@ -245,7 +270,3 @@ def _forget(project: Project, home: Home) -> Gone:
 
 def _is_link_to_result(path: Path) -> bool:
     return path.is_symlink() and os.readlink(path).startswith(("../store/", "../../store/"))
-
-
-def _size(path: Path) -> int:
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())

@@ -27,10 +27,9 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
-from factorlib.runner.integrity import Inspector, stamps_of
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.project import RESERVED, Project, check_name, is_path
-from factorlib.runner.store import Store, sweep_drafts
+from factorlib.runner.store import Inspector, Store, stamps_of, sweep_drafts
 from factorlib.wholefile import replace_file, write_text
 
 if TYPE_CHECKING:
@@ -42,10 +41,7 @@ LONGEST = 85  # bytes of the name of a step's files, to which suffixes are added
 
 
 class Home(msgspec.Struct, frozen=True):
-    """One such folder, directly in build/.
-
-    log: what runs cost and reported;  mark: says whose results these are;  errors: tracebacks, by step
-    """
+    """One such folder, directly in build/."""
 
     folder: Path
 
@@ -103,20 +99,20 @@ def made_home(project: Project, dataset: str) -> Home | None:
 
     A name is that of a home in build/; a path must be the one that the home was made for.  InputError for whatever else.
     """
-    found = project.find_dataset(dataset)
-    folder = found or Path(os.path.abspath(dataset))
+    there = project.find_dataset(dataset)
+    folder = there or Path(os.path.abspath(dataset))
     home = _home_named(project, folder.name)
     if not home.mark.is_file():
-        if found is not None:
+        if there is not None:
             return None
         known = [other.folder.name for other in made_homes(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
     owner = owner_of(project, home)
-    there = owner is not None and os.path.isdir(owner)
-    theirs = owner is not None and not (found and there and owner.samefile(found)) and owner != folder
-    if theirs and (is_path(dataset) or (found and there)):
-        word = shlex.quote(str(owner if there else home.folder.name))
+    lives = owner is not None and os.path.isdir(owner)
+    theirs = owner is not None and not (there and lives and owner.samefile(there)) and owner != folder
+    if theirs and (is_path(dataset) or (there and lives)):
+        word = shlex.quote(str(owner if lives else home.folder.name))
         raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={word}")
     return home
 
@@ -131,18 +127,16 @@ def made_homes(project: Project) -> list[Home]:
 
 
 def _other_owner(home: Home, owner: Path, dataset: Path, cure: str) -> InputError:
-    name = home.folder.name
-    words = f"two datasets are called {name!r}: build/{name} holds the results of {owner}"
+    words = f"two datasets are called {home.folder.name!r}: build/{home.folder.name} holds the results of {owner}"
     return InputError(words, file=dataset, cure=cure)
 
 
 def owner_of(project: Project, home: Home) -> Path | None:
     """The dataset whose results these are; None where nothing says it."""
-    try:
+    with contextlib.suppress(OSError):
         words = home.mark.read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
-    except OSError:
-        return None
-    return project.root / words if words else None
+        return project.root / words if words else None
+    return None
 
 
 def claim(project: Project, home: Home, dataset: Path) -> None:
@@ -156,50 +150,47 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
 # ── after a run, or where there was nothing to run ───────────────────────────────────────────────────────────────────
 
 
-def remember(survey: Survey, more: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
+def remember(survey: Survey, made: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
     """Write down which key each step has now; steps of photos and stages that are no more are dropped.
 
-    more: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
+    made: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
     """
-    planned = [] if more is not None else survey.planned(frozenset()) if planned is None else planned
+    planned = [] if made is not None else survey.planned(frozenset()) if planned is None else planned
     stages, before = survey.spec.pipeline.stages, survey.home.last_keys()
-    there = {str(step) for stage in stages for step in survey.spec.steps_of(stage)}
-    over_recipes = tuple(
-        f"{name}/" for name, stage in stages.items() if stage.over == "recipe"
-    )  # others were asked for before
-    keys = {step: key for step, key in before.items() if step in there or step.startswith(over_recipes)} | (more or {})
-    keys |= {str(p.step): p.key for p in planned if p.status == "current"}
+    steps = [step for stage in stages for step in survey.spec.steps_of(stage)]
+    names, others = {*map(str, steps)}, tuple(f"{n}/" for n, stage in stages.items() if stage.over == "recipe")
+    keys = {name: key for name, key in before.items() if name in names or name.startswith(others)}  # asked for before
+    keys |= (made or {}) | {str(p.step): p.key for p in planned if p.status == "current"}
     if keys != before:
         claim(survey.project, survey.home, survey.data.folder)
         replace_file(survey.home.keys_file, json_text(keys).encode())
-    if more is None:
-        _show(survey, planned)
+    if made is None:
+        current = [p for p in planned if p.status == "current"]
+        _show(survey, current)
+        failed = {label(step) for step in steps} - {label(p.step) for p in current}
+        for path in (path for path in survey.home.errors.glob("*.txt") if path.stem not in failed):
+            path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
+        with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
+            survey.home.errors.rmdir()
+        sweep_drafts(survey.home.folder)
         survey.outputs.inspector.save()
 
 
-def _show(survey: Survey, planned: list[Planned]) -> None:
+def _show(survey: Survey, current: list[Planned]) -> None:
     """Point the links at the current results; of a stage over photos, at one folder with all of them; one for each recipe."""
     home, stages = survey.home.folder, survey.spec.pipeline.stages
-    current: dict[str, dict[str | None, str]] = {}
-    for p in (p for p in planned if p.status == "current"):
+    of_stages: dict[str, dict[str | None, str]] = {}
+    for p in current:
         if p.step.recipe:
             point(home / p.step.stage / p.step.recipe, survey.store.tree(p.output))
         else:
-            current.setdefault(p.step.stage, {})[p.step.photo] = p.output
-    for name, outputs in current.items():
+            of_stages.setdefault(p.step.stage, {})[p.step.photo] = p.output
+    for name, outputs in of_stages.items():
         view = stages[name].over and view_of(survey.store, survey.outputs.inspector, outputs, stages[name].gather)
         point(home / name, view or survey.store.tree(outputs[None]))
     for link in home.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in stages:
             link.unlink(missing_ok=True)
-    failed = {label(step) for stage in stages for step in survey.spec.steps_of(stage)}
-    failed -= {label(p.step) for p in planned if p.status == "current"}
-    for path in survey.home.errors.glob("*.txt"):  # what is written of a failure goes with success, or with the step
-        if path.stem not in failed:
-            path.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
-        survey.home.errors.rmdir()
-    sweep_drafts(home)
 
 
 def label(step: Step) -> str:
@@ -291,16 +282,12 @@ def sound_lines(path: Path) -> list[bytes]:
         lines = path.read_bytes().splitlines()
     except FileNotFoundError:
         return []
-    sound = [line for line in lines if _is_event(line)]
+    sound = []
+    for line in lines:
+        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            event = msgspec.json.decode(line, type=dict)
+            sound += [line] if isinstance(event.get("event"), str) else []
     if len(sound) < len(lines):
         words = "%s: %d damaged lines are left out; the results are not affected"
         log.warning(words, path, len(lines) - len(sound))
     return sound
-
-
-def _is_event(line: bytes) -> bool:
-    try:
-        event = msgspec.json.decode(line)
-        return isinstance(event, dict) and isinstance(event.get("event"), str)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError):
-        return False

@@ -22,7 +22,7 @@ LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a pat
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
 PROCESSES, DASK = "processes", "dask"
-EXECUTORS = (PROCESSES, DASK)
+EXECUTORS, WHERE = (PROCESSES, DASK), ("executor=", "scheduler=")  # the latter begin settings
 ADDRESS = re.compile(r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+")
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
@@ -78,13 +78,21 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {name: value for name, value in self.params.items() if name not in self.given}
 
     @property
-    def folders(self) -> dict[str, Any]:
-        """The folders that were named, as they were written."""
-        return {name: self.params[name] for name in self.given if self.params.get(name) is not None}
+    def folders(self) -> dict[str, Path]:
+        """The folders that parameters name, from where the user stands; links are followed now, for results move on."""
+        return {name: _folder(name, str(self.params[name])) for name in self.given if self.params.get(name) is not None}
+
+
+def _folder(param: str, named: str) -> Path:
+    try:
+        return Path(named).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
+        words = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
+        raise InputError(words, key=param, cure="name a folder") from error
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """pipeline.yaml.
+    """What pipeline.yaml says.
 
     executor:  where steps run, which changes no bit and no key: `processes` of this machine, or the workers of a cluster of `dask`
     scheduler: the address of that cluster's scheduler; without one, a cluster of this machine's cores
@@ -101,10 +109,8 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def needed(self, targets: list[str] | None) -> list[str]:
         """The targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
-        wanted = (
-            {name for name, stage in self.stages.items() if not stage.optional} if targets is None else set(targets)
-        )
-        order = self.order()
+        usual = [name for name, stage in self.stages.items() if not stage.optional]
+        wanted, order = set(usual if targets is None else targets), self.order()
         for name in reversed(order):
             if name in wanted:
                 wanted.update(self.stages[name].upstream)
@@ -118,83 +124,51 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     """
     pipeline = read_yaml(path, Pipeline)
     if pipeline.format != FORMAT:
-        raise InputError(
-            f"format {pipeline.format} is not known",
-            file=path,
-            key="format",
-            cure=f"this version reads format: {FORMAT}",
-        )
+        words, cure = f"format {pipeline.format} is not known", f"this version reads format: {FORMAT}"
+        raise InputError(words, file=path, key="format", cure=cure)
     _check_executor(pipeline, path, "")
+    known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
-        _check_stage(name, stage, pipeline, known_slices, path)
+        _check_stage(name, stage, known, path)
     try:
         pipeline.order()
     except CycleError as error:
-        circle = " <- ".join(error.args[1])
-        raise InputError(
-            f"stages that need each other: {circle}",
-            file=path,
-            key="stages",
-            cure="make the second pass a stage of its own",
-        ) from None
+        words, cure = " <- ".join(error.args[1]), "make the second pass a stage of its own"
+        raise InputError(f"stages that need each other: {words}", file=path, key="stages", cure=cure) from None
     return pipeline
 
 
 def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
-    if pipeline.executor not in EXECUTORS:
-        shown = repr(pipeline.executor[:SHOWN])
-        raise InputError(
-            f"there is no executor {shown}",
-            file=file,
-            key=f"{prefix}executor",
-            cure=did_you_mean(pipeline.executor, EXECUTORS),
-        )
-    if pipeline.scheduler is None:
-        return
-    if pipeline.executor != DASK:
+    name, address = pipeline.executor, pipeline.scheduler
+    if name not in EXECUTORS:
+        words, cure = f"there is no executor {name[:SHOWN]!r}", did_you_mean(name, EXECUTORS)
+        raise InputError(words, file=file, key=f"{prefix}executor", cure=cure)
+    if address is not None and name != DASK:
         cure = "add executor: dask" if file else 'write SET="executor=dask scheduler=…"'
         raise InputError("only Dask has a scheduler", file=file, key=f"{prefix}scheduler", cure=cure)
-    if not ADDRESS.fullmatch(pipeline.scheduler):
-        shown = repr(pipeline.scheduler[:SHOWN])
-        raise InputError(
-            f"{shown} is no address",
-            file=file,
-            key=f"{prefix}scheduler",
-            cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786",
-        )
+    if address is not None and not ADDRESS.fullmatch(address):
+        words, cure = f"{address[:SHOWN]!r} is no address", "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+        raise InputError(words, file=file, key=f"{prefix}scheduler", cure=cure)
 
 
-def _check_stage(name: str, stage: Stage, pipeline: Pipeline, known_slices: tuple[str, ...], path: Path) -> None:
+def _check_stage(name: str, stage: Stage, known: list[str], path: Path) -> None:
     if not NAME.fullmatch(name) or name in TAKEN:
-        raise InputError(
-            f"a stage cannot be called {name!r}",
-            file=path,
-            key="stages",
-            cure="give it another name, of a-z, 0-9 and _",
-        )
+        words, cure = f"a stage cannot be called {name!r}", "give it another name, of a-z, 0-9 and _"
+        raise InputError(words, file=path, key="stages", cure=cure)
+    key = f"stages.{name}"
     if stage.gather is not None:
-        check_name(stage.gather, "a gathered file", file=path, key=f"stages.{name}.gather")
-    for entry in stage.inputs:
-        known = [DATASET + s for s in known_slices] + list(pipeline.stages)
-        if entry not in known:
-            raise InputError(
-                f"there is no {entry!r}", file=path, key=f"stages.{name}.inputs", cure=did_you_mean(entry, known)
-            )
-    for param in stage.given:
-        if param in stage.inputs:
-            raise InputError(
-                f"{param!r} is a stage already",
-                file=path,
-                key=f"stages.{name}.given",
-                cure="call the parameter something else",
-            )
+        check_name(stage.gather, "a gathered file", file=path, key=f"{key}.gather")
     if stage.gather and stage.over != "photo":
-        raise InputError(
-            "only what is made per photo can be gathered",
-            file=path,
-            key=f"stages.{name}.gather",
-            cure="add over: photo",
-        )
+        words = "only what is made per photo can be gathered"
+        raise InputError(words, file=path, key=f"{key}.gather", cure="add over: photo")
+    for entry in (entry for entry in stage.inputs if entry not in known):
+        raise InputError(f"there is no {entry!r}", file=path, key=f"{key}.inputs", cure=did_you_mean(entry, known))
+    for param in (param for param in stage.given if param in stage.inputs):
+        cure = "call the parameter something else"
+        raise InputError(f"{param!r} is a stage already", file=path, key=f"{key}.given", cure=cure)
+
+
+# ── settings of the command line ─────────────────────────────────────────────────────────────────────────────────────
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
@@ -204,10 +178,16 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
     """
-    words = [word for text in settings for word in _words(text)]
-    pipeline = _with_executor(pipeline, [word for word in words if _is_of_executor(word)])
+    words = _words(settings)
+    where = dict(word.split("=", 1) for word in words if word.startswith(WHERE))  # the last of each kind counts
+    if where:
+        executor = where.get("executor", pipeline.executor)
+        kept = None if where.get("executor") == PROCESSES else pipeline.scheduler  # which drops that of pipeline.yaml
+        scheduler = where.get("scheduler", kept) or None
+        pipeline = msgspec.structs.replace(pipeline, executor=executor, scheduler=scheduler)
+        _check_executor(pipeline, None, "SET ")
     stages = dict(pipeline.stages)
-    for word in (word for word in words if not _is_of_executor(word)):
+    for word in (word for word in words if not word.startswith(WHERE)):
         stage, keys, value = _setting(word, stages)
         stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
     return msgspec.structs.replace(pipeline, stages=stages)
@@ -219,7 +199,7 @@ def words_by_key(settings: list[str]) -> dict[str, str]:
     >>> words_by_key(["solve.lobes=64"])
     {'stages.solve.params.lobes': 'solve.lobes=64'}
     """
-    targets = {word: word.partition("=")[0].partition(".") for text in settings for word in _words(text)}
+    targets = {word: word.partition("=")[0].partition(".") for word in _words(settings)}
     return {f"stages.{stage}.params.{keys}": word for word, (stage, _, keys) in targets.items()}
 
 
@@ -227,8 +207,7 @@ def said_of_settings(error: InputError, words: dict[str, str]) -> InputError:
     """The same error, of the setting where it is about one, not of the file whose value that replaces."""
     for key, word in reversed(words.items()):
         if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
-            shown = word if len(word) <= SHOWN else word[:SHOWN] + "…"
-            return InputError(error.found, key=f"SET {shown}", cure=error.cure)
+            return InputError(error.found, key=f"SET {_cut(word)}", cure=error.cure)
     return error
 
 
@@ -238,72 +217,60 @@ def executor_words(settings: list[str]) -> list[str]:
     >>> executor_words(["executor=dask scheduler=tcp://10.0.0.1:8786"])
     ['executor=dask', 'scheduler=tcp://10.0.0.1:8786']
     """
-    words = [word for text in settings for word in _words(text)]
-    for word in words:
-        if not _is_of_executor(word):
-            cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
-            raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
+    words = _words(settings)
+    for word in (word for word in words if not word.startswith(WHERE)):
+        cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
+        raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
     return words
 
 
-def _is_of_executor(word: str) -> bool:
-    return word.startswith(("executor=", "scheduler="))
+def _words(settings: list[str]) -> list[str]:
+    words = []
+    for text in settings:
+        try:
+            words += shlex.split(text)
+        except ValueError as error:
+            said = f"{text[:SHOWN]!r} cannot be split into words ({error})"
+            raise InputError(said, key="SET", cure="close every quote") from error
+    return words
 
 
-def _with_executor(pipeline: Pipeline, words: list[str]) -> Pipeline:
-    """The last word of each kind counts; `executor=processes` drops the scheduler of pipeline.yaml."""
-    given = dict(word.split("=", 1) for word in words)
-    if not given:
-        return pipeline
-    kept = None if given.get("executor") == PROCESSES else pipeline.scheduler
-    scheduler = given.get("scheduler", kept) or None
-    found = msgspec.structs.replace(pipeline, executor=given.get("executor", pipeline.executor), scheduler=scheduler)
-    _check_executor(found, None, "SET ")
-    return found
-
-
-def _words(text: str) -> list[str]:
-    try:
-        return shlex.split(text)
-    except ValueError as error:
-        raise InputError(
-            f"{text[:SHOWN]!r} cannot be split into words ({error})", key="SET", cure="close every quote"
-        ) from error
+def _cut(word: str) -> str:
+    return word if len(word) <= SHOWN else word[:SHOWN] + "…"
 
 
 def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
     target, equals, value = word.partition("=")
     stage, *keys = target.split(".")
-    shown = word if len(word) <= SHOWN else word[:SHOWN] + "…"
     if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
-        raise InputError(f"{shown!r} is no setting", key="SET", cure=_how(target, keys))
+        near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
+        how = 'write stage.parameter=value, as in SET="solve.cells=800"'
+        raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=near if near.startswith("did") else how)
+    key = f"SET {_cut(word)}"
     if stage not in stages:
-        raise InputError(f"there is no stage {stage!r}", key=f"SET {shown}", cure=did_you_mean(stage, stages))
+        raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
     try:
-        return stage, keys, parse_yaml(value, f"SET {shown}")
+        return stage, keys, parse_yaml(value, key)
     except (ValueError, RecursionError) as error:  # thousands of digits or brackets
-        raise InputError(
-            f"not readable as a value ({error})", key=f"SET {shown}", cure="write a number, a word, or a short list"
-        ) from error
+        cure = "write a number, a word, or a short list"
+        raise InputError(f"not readable as a value ({error})", key=key, cure=cure) from error
 
 
-def _how(target: str, keys: list[str]) -> str:
-    near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
-    return near if near.startswith("did") else 'write stage.parameter=value, as in SET="solve.cells=800"'
+def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
+    first, *rest = keys
+    if rest:
+        inner = params.get(first, {})
+        value = _set(inner if isinstance(inner, dict) else {}, rest, value)
+    return {**params, first: value}
 
 
-def check_values(pipeline: Pipeline, file: Path) -> Pipeline:
-    """The pipeline, where every parameter is something that a key can hold: finite numbers of 64 bits, and text."""
+def check_values(pipeline: Pipeline, file: Path) -> None:
+    """Raises InputError for a parameter that no key can hold: each must be a finite number of 64 bits, or text."""
     for name, stage in pipeline.stages.items():
         for key, value in _leaves(stage.params, f"stages.{name}.params"):
             if wrong := _no_value(value):
-                raise InputError(
-                    f"{str(value)[:SHOWN]!r} {wrong}",
-                    file=file,
-                    key=key,
-                    cure="write a number, a word, or leave it out",
-                )
-    return pipeline
+                words, cure = f"{str(value)[:SHOWN]!r} {wrong}", "write a number, a word, or leave it out"
+                raise InputError(words, file=file, key=key, cure=cure)
 
 
 def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
@@ -323,11 +290,3 @@ def _no_value(value: Any) -> str | None:
     if isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
         return "is not text"
     return None
-
-
-def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
-    first, *rest = keys
-    if rest:
-        inner = params.get(first, {})
-        value = _set(inner if isinstance(inner, dict) else {}, rest, value)
-    return {**params, first: value}

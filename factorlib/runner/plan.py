@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import msgspec
 
-from factorlib.runner.integrity import in_short
 from factorlib.runner.pipeline import DATASET, Pipeline
 
 Record = dict[str, Any]
@@ -67,12 +66,12 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """What the store holds: output hash by key; and the record each step had when it last was current here.
+    """What the store holds: output hash by key (asked by `get`); and the record each step had when it last was current here.
 
     damaged: by key, what is wrong with a result that is not as it was kept, and so has no output
     """
 
-    outputs: Mapping[str, str]
+    outputs: Any
     previous: Mapping[str, Record]
     damaged: Mapping[str, list[str]] = {}
 
@@ -92,58 +91,43 @@ def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Pl
     """Every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
     planned: dict[Step, Planned] = {}
     for step in spec.steps():
-        planned[step] = _planned(step, spec, hashes[step], listing, planned)
+        above = [planned[each] for each in spec.above(step)]
+        open_ = [each.step for each in above if each.output is None]
+        outputs = {each.step: each.output for each in above}
+        planned[step] = (_below if open_ else _known)(step, spec, hashes[step], outputs, listing)
     return list(planned.values())
 
 
-def _planned(step: Step, spec: Spec, own: Record, listing: Listing, planned: Mapping[Step, Planned]) -> Planned:
-    above = [planned[found] for found in spec.above(step)]
-    open_ = [found for found in above if found.output is None]
-    before = listing.previous.get(str(step))
-    if open_:
-        return _planned_below(step, own, above, open_, before, step in spec.forced)
-    record = {**own, **inputs_of(spec, step, {found.step: found.output for found in above})}
-    key = key_of(record)
-    output = listing.outputs.get(key)
-    if step in spec.forced:
-        return Planned(step, "to run", ["forced"], record, key)
+def _known(step: Step, spec: Spec, own: Record, outputs: Mapping[Step, str], listing: Listing) -> Planned:
+    """A step whose inputs are all made."""
+    stages = spec.pipeline.stages
+    above = [name for name in stages[step.stage].upstream if step.photo is None]
+    gathered = {f"gathered:{name}": stages[name].gather for name in above if stages[name].gather}
+    record = {**own, **{f"input:{above}": output for above, output in outputs.items()}, **gathered}
+    key, before = key_of(record), listing.previous.get(str(step))
+    output = None if step in spec.forced else listing.outputs.get(key)
     if output is not None:
         return Planned(step, "current", [], record, key, output)
-    if key in listing.damaged:
-        return Planned(step, "to run", [f"its result is damaged: {in_short(listing.damaged[key])}"], record, key)
-    reasons = difference(before, record) if before is not None else ["not made yet"]
-    return Planned(step, "to run", reasons or ["its result is gone"], record, key)
+    if step in spec.forced:
+        reasons = ["forced"]
+    elif key in listing.damaged:
+        reasons = [f"its result is damaged: {in_short(listing.damaged[key])}"]
+    else:
+        reasons = ["not made yet"] if before is None else difference(before, record) or ["its result is gone"]
+    return Planned(step, "to run", reasons, record, key)
 
 
-def _planned_below(
-    step: Step, own: Record, above: list[Planned], open_: list[Planned], before: Record | None, forced: bool
-) -> Planned:
-    """A step under others that are still to run."""
-    if forced:
-        return Planned(step, "to run", ["forced"])
-    if before is None:
-        return Planned(step, "to run", ["not made yet"])
-    known = {**own, **{f"input:{found.step}": found.output for found in above if found.output is not None}}
-    waiting = {f"input:{found.step}" for found in open_}
-    changes = difference({k: v for k, v in before.items() if k not in waiting}, {**_gathered_of(before), **known})
-    if changes:
-        return Planned(step, "to run", changes)
-    return Planned(step, "maybe", [f"if {names(found.step for found in open_)} comes out different"])
-
-
-def _gathered_of(record: Record) -> Record:
-    return {k: v for k, v in record.items() if k.startswith("gathered:")}
-
-
-def inputs_of(spec: Spec, step: Step, outputs: Mapping[Step, str]) -> Record:
-    """The part of a step's record that is the results it is handed."""
-    gathers = {
-        name: spec.pipeline.stages[name].gather
-        for name in spec.pipeline.stages[step.stage].upstream
-        if step.photo is None
-    }
-    gathered = {f"gathered:{name}": file for name, file in gathers.items() if file}
-    return {f"input:{above}": outputs[above] for above in spec.above(step)} | gathered
+def _below(step: Step, spec: Spec, own: Record, outputs: Mapping[Step, str | None], listing: Listing) -> Planned:
+    """A step under others that are still to run: it must run if what is known already changed, else that is open."""
+    before = listing.previous.get(str(step))
+    if step in spec.forced or before is None:
+        return Planned(step, "to run", ["forced" if step in spec.forced else "not made yet"])
+    open_ = [above for above, output in outputs.items() if output is None]
+    waiting = {f"input:{above}" for above in open_}
+    inputs = {f"input:{above}": output for above, output in outputs.items() if output is not None}
+    gathered = {name: value for name, value in before.items() if name.startswith("gathered:")}
+    changes = difference({k: v for k, v in before.items() if k not in waiting}, {**gathered, **own, **inputs})
+    return Planned(step, "to run" if changes else "maybe", changes or [f"if {names(open_)} comes out different"])
 
 
 def key_of(record: Record) -> str:
@@ -171,16 +155,14 @@ _KIND = {
 
 def difference(before: Record, after: Record) -> list[str]:
     """What changed between two records, in words, one line per cause."""
-    changed = [
-        name for name in sorted(before.keys() | after.keys()) if before.get(name, _ABSENT) != after.get(name, _ABSENT)
-    ]
-    return [_change(name, before, after) for name in changed]
+    both = sorted(before.keys() | after.keys())
+    return [_change(name, before, after) for name in both if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
 
 
 _ABSENT = object()
 _HASHED = ("source", "file", "recipe file", "given", "input", "data")
 _LONGEST = 80  # characters of a value that are shown
-_NAMED = 4  # names that came or went
+_NAMED, _FILES = 4, 3  # names that came or went; files of one result that are named
 
 
 def _change(name: str, before: Record, after: Record) -> str:
@@ -196,10 +178,11 @@ def _change(name: str, before: Record, after: Record) -> str:
 
 def _shown(value: Any, record: Record, kind: str, what: str) -> str:
     if value is _ABSENT and kind == "param":
-        return f"{record[f'default:{what}']} (the default)" if f"default:{what}" in record else "default"
+        default = record.get(f"default:{what}", _ABSENT)
+        return "default" if default is _ABSENT else f"{_shown(default, record, 'default', what)} (the default)"
     if value is _ABSENT or (value is None and kind == "facts"):
         return "not given" if kind == "facts" else "none"
-    text = value if kind == "default" else json.dumps(value, ensure_ascii=False)
+    text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
@@ -209,6 +192,14 @@ def _come_and_gone(old: list, new: list) -> str:
     if not all(isinstance(name, str) for name in came + gone):
         return ""
     return ", ".join([*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])])
+
+
+def in_short(damage: list[str]) -> str:
+    """
+    >>> in_short(["a: missing", "b: missing", "c: missing", "d: missing"])
+    'a: missing; b: missing; c: missing; 1 more'
+    """
+    return "; ".join([*damage[:_FILES], *([f"{len(damage) - _FILES} more"] if len(damage) > _FILES else [])])
 
 
 def names(steps: Iterable[Step]) -> str:

@@ -39,11 +39,6 @@ class Recipe(msgspec.Struct, frozen=True):
     files: dict[str, Path]
 
 
-def no_recipes(path: Path) -> Recipe:
-    """Stands in where a data set knows no recipes."""
-    raise InputError("this data set knows no recipes", file=path)
-
-
 class Data(msgspec.Struct, frozen=True):
     """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
 
@@ -57,7 +52,7 @@ class Data(msgspec.Struct, frozen=True):
     photos: list[str]
     slice: Callable[[str, str | None], Slice]
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
-    recipe: Callable[[Path], Recipe] = no_recipes
+    recipe: Callable[[Path], Recipe] | None = None
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
 
 
@@ -82,25 +77,20 @@ def photo_sets() -> Provider:
         take_sigterm_back()
 
         def recipe(file: Path) -> Recipe:
-            """Read when one is asked for."""
+            """Read a recipe when one is asked for."""
             from factorlib.recipe.read import files_of, read_recipe
 
-            found = read_recipe(file, dataset)
-            return Recipe(msgspec.to_builtins(found), files_of(found, file))
+            read = read_recipe(file, dataset)
+            return Recipe(msgspec.to_builtins(read), files_of(read, file))
 
         @cache
         def look() -> Any:
             """`factorlib.validation`, by its name as stages are, when it is first asked for: it imports science."""
             return importlib.import_module("factorlib.validation").Validation(dataset)
 
-        return Data(
-            dataset.folder,
-            [photo.name for photo in dataset.spec.photos],
-            partial(dataset_slice, dataset),
-            lambda *of: look().faults(*of),
-            recipe,
-            lambda files: look().recipe_faults(files),
-        )
+        photos, faults = [photo.name for photo in dataset.spec.photos], lambda *of: look().faults(*of)
+        slice_, recipe_faults = partial(dataset_slice, dataset), lambda files: look().recipe_faults(files)
+        return Data(dataset.folder, photos, slice_, faults, recipe, recipe_faults)
 
     return Provider(SLICES, read)
 
@@ -134,9 +124,8 @@ class Project(msgspec.Struct, frozen=True):
 
     def dataset_folder(self, name: str) -> Path:
         """A dataset by its name in data/, or by its path; InputError where it is not there."""
-        found = self.find_dataset(name)
-        if found is not None:
-            return found
+        if (folder := self.find_dataset(name)) is not None:
+            return folder
         known = [p.parent.name for p in (self.root / "data").glob("*/dataset.yaml")]
         cure = did_you_mean(name, known) if known and not is_path(name) else HOW
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
@@ -145,37 +134,33 @@ class Project(msgspec.Struct, frozen=True):
         """The same, None where it is not there; InputError for what can be no dataset's name or path."""
         if not is_path(name) or name.rstrip("/") in ("", ".", ".."):
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
-            if (found := _folder_at(self.root / "data" / name, name)) is not None:
-                return found
-        found = _folder_at(Path(os.path.abspath(name)), name)
-        if found is not None:
-            check_name(found.name, "a dataset", file=found, key="DATASET", reserved=RESERVED)
-            if self.root.is_relative_to(found) or found == self.build:
+            if (folder := _folder_at(self.root / "data" / name, name)) is not None:
+                return folder
+        if (folder := _folder_at(Path(os.path.abspath(name)), name)) is not None:
+            check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)
+            if self.root.is_relative_to(folder) or folder == self.build:
                 words = "a dataset cannot be the folder that holds the project"
-                raise InputError(words, file=found, key="DATASET", cure=HOW)
-        return found
+                raise InputError(words, file=folder, key="DATASET", cure=HOW)
+        return folder
 
     def recipes(self, data: Data, words: list[str]) -> dict[str, Recipe]:
         """The recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
 
         InputError where one is not there, is not good, or two are called the same.
         """
-        folders = (
-            self.root / "recipes",
-            self.root / "recipes" / data.folder.name,
-        )  # one of the data set's own goes before
-        known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+        shared, own = self.root / "recipes", self.root / "recipes" / data.folder.name  # the latter goes before
+        known = {path.stem: path for folder in (shared, own) for path in sorted(folder.glob("*.yaml"))}
         paths = [path for word in words for path in (known.values() if word == ALL else [_recipe_at(word, known)])]
-        found: dict[str, Recipe] = {}
+        recipes: dict[str, Recipe] = {}
         for path in dict.fromkeys(paths):
             name = check_name(path.stem, "a recipe", file=path, key="RECIPE", most=200)
-            if name in found:
+            if name in recipes:
                 words = f"two recipes are called {name!r}: their pictures would lie in one folder"
                 raise InputError(words, file=path, cure="rename one of them")
-            found[name] = data.recipe(path)
-        if not found and ALL in words:
+            recipes[name] = data.recipe(path)
+        if not recipes and ALL in words:
             raise InputError("there is none in recipes/", key="RECIPE", cure="name a file: RECIPE=<path>.yaml")
-        return found
+        return recipes
 
 
 def is_path(name: str) -> bool:
@@ -199,11 +184,11 @@ def _recipe_at(word: str, known: dict[str, Path]) -> Path:
     path = Path(os.path.abspath(word))
     if word in known or path.is_file():
         return known.get(word, path)
-    if "/" in word or path.suffix:
-        raise InputError(
-            "there is no such recipe", file=word, key="RECIPE", cure=did_you_mean(path.stem, [*known, ALL])
-        )
-    raise InputError(f"there is no recipe {word!r}", key="RECIPE", cure=did_you_mean(word, [*known, ALL]))
+    of_path = "/" in word or path.suffix
+    words, cure = "there is no such recipe", did_you_mean(path.stem if of_path else word, [*known, ALL])
+    raise InputError(
+        words if of_path else f"there is no recipe {word!r}", file=word if of_path else None, key="RECIPE", cure=cure
+    )
 
 
 def check_name(
@@ -230,6 +215,6 @@ def check_name(
         "it is not UTF-8": name.encode(errors="replace").decode() != name,
         f"it has {length} bytes, {most} may be": length > most,
     }
-    if found := next((words for words, holds in wrong.items() if holds), None):
-        raise InputError(f"{kind} cannot be called {name!r}: {found}", file=file, key=key, cure="give it another name")
+    if why := next((words for words, holds in wrong.items() if holds), None):
+        raise InputError(f"{kind} cannot be called {name!r}: {why}", file=file, key=key, cure="give it another name")
     return name

@@ -1,8 +1,8 @@
 """Results that others have made: in a store that several checkouts share, and those that ship with the source.
 
-`FACTORLIB_STORE=<folder>` names it.  It is laid out as every store is, but nothing there is used in place: a result is copied
-into the checkout's own store, its key compared with its record and every file with its hash, and what a checkout makes is copied
-there where it may write.  So a shared store that vanishes, is damaged or read-only costs time and no result, and no
+`FACTORLIB_STORE=<folder>` names the former.  It is laid out as every store is, but nothing there is used in place: a result is
+copied into the checkout's own store, its key compared with its record and every file with its hash, and what a checkout makes
+is copied there where it may write.  So a shared store that vanishes, is damaged or read-only costs time and no result, and no
 command deletes anything in it: `gc` and `clean` know the checkout's own store alone.
 
 A shipped result lies where the package is, with what it was made from.  A step takes it where its parameters, and the sources
@@ -24,7 +24,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.filehash import hash_of_file, is_file_of
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
@@ -34,7 +34,6 @@ from factorlib.wholefile import replace_file
 VARIABLE = "FACTORLIB_STORE"
 NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
 ABANDONED = 86400.0  # seconds after which a draft in the shared store is taken to be of a run that was killed
-
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
 
@@ -43,22 +42,17 @@ Say = Callable[[str], None]
 
 def shared_store(own: Path) -> Path | None:
     """The folder that FACTORLIB_STORE names, None where it names none or `own`; InputError where there is no such folder."""
-    named = os.environ.get(VARIABLE)
-    if not named:
+    if not (named := os.environ.get(VARIABLE)):
         return None
     folder = Path(named).expanduser()
     try:
-        if not folder.is_dir():
-            raise InputError(
-                "there is no such folder", file=named, key=VARIABLE, cure="make it, or name another; it may be empty"
-            )
-        return None if own.is_dir() and folder.samefile(own) else folder.resolve()
+        if folder.is_dir():
+            return None if own.is_dir() and folder.samefile(own) else folder.resolve()
     except (OSError, RuntimeError, ValueError) as error:  # no right to look, links in a circle, a NUL
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"cannot be looked at ({error})", file=named[:100], key=VARIABLE, cure="name a folder that you may read"
-        ) from error
+        words, cure = f"cannot be looked at ({error})", "name a folder that you may read"
+        raise InputError(words, file=named[:100], key=VARIABLE, cure=cure) from error
+    cure = "make it, or name another; it may be empty"
+    raise InputError("there is no such folder", file=named, key=VARIABLE, cure=cure)
 
 
 def fetch(
@@ -72,7 +66,7 @@ def fetch(
         entry = shared.entry(key)
         if entry is None:
             return None
-        if key_of(entry.record) == key and _copied(shared.tree(entry.output), draft, entry.files):
+        if key_of(entry.record) == key and copied(shared.tree(entry.output), draft, entry.files):
             taken = own.take_in(record, draft)
             _copy_log(shared, own, key)
             return taken
@@ -92,8 +86,11 @@ def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
         there = shared.entry(key)
         if there and holds(shared.tree(there.output), there.files):
             return
-        _drop_abandoned(shared)
-        if _copied(own.tree(entry.output), draft, entry.files):
+        for path in shared.tmp.glob("offer-*"):
+            with contextlib.suppress(OSError):
+                if time.time() - path.stat().st_mtime > ABANDONED:
+                    shutil.rmtree(path, ignore_errors=True)
+        if copied(own.tree(entry.output), draft, entry.files):
             shared.take_in(entry.record, draft)
             _copy_log(own, shared, key)
             shared.keep(key, entry)
@@ -104,7 +101,7 @@ def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
+def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
     """Copy the files of a tree; whether each is what its hash says.  No name may lead out of the draft."""
     if any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in files):
         return False
@@ -124,68 +121,54 @@ def _copy_log(source: Store, target: Store, key: str) -> None:
         replace_file(target.log(key), b"".join(line + b"\n" for line in lines))
 
 
-def _drop_abandoned(shared: Store) -> None:
-    for path in shared.tmp.glob("offer-*"):
-        with contextlib.suppress(OSError):
-            if time.time() - path.stat().st_mtime > ABANDONED:
-                shutil.rmtree(path, ignore_errors=True)
-
-
 # ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Shipped(msgspec.Struct, frozen=True):
+    """What made_from.json says: the part of the record that the result depends on, and the hash of each file."""
+
+    record: Record
+    files: dict[str, str]
 
 
 def made_from(record: Record, modules: list[str]) -> Record:
     """The part of a step's record that a result made by `modules` depends on.
 
-    >>> made_from({"param:steps": 3, "source:stages.train": "1", "source:factorlib.errors": "2", "package:torch": "2.13"}, ["stages.train"])
+    >>> made_from({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
     {'param:steps': 3, 'source:stages.train': '1'}
     """
     own = {f"source:{module}" for module in modules}
     return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
 
 
-class Shipped(msgspec.Struct, frozen=True):
-    """What made_from.json says: the record, as far as the result depends on it, and the hash of each file."""
-
-    record: Record
-    files: dict[str, str]
-
-
 def shipped_folder(roots: list[Path], shipping: Shipping, record: Record) -> Path | None:
-    """The folder, below one of `roots`, whose result is that of `record`; None where it was made from something else.
-
-    Raises InputError where a file in it is not the one that was shipped.
-    """
-    for path in (root / shipping.folder for root in roots if (root / shipping.folder / MADE_FROM).is_file()):
-        shipped = _read(path)
-        if shipped.record == made_from(record, shipping.made_by):
-            for name, digest in shipped.files.items():
-                if not (path / name).is_file() or hash_of_file(path / name) != digest:
-                    raise InputError("is not the file that was shipped with the source", file=path / name, cure=CURE)
-            return path
+    """The folder, below one of `roots`, whose result is that of `record`; None where it was made from something else."""
+    for folder in (root / shipping.folder for root in roots):
+        if (folder / MADE_FROM).is_file() and _shipped(folder).record == made_from(record, shipping.made_by):
+            return folder
     return None
 
 
-def _read(folder: Path) -> Shipped:
+def _shipped(folder: Path) -> Shipped:
     try:
         return msgspec.json.decode((folder / MADE_FROM).read_bytes(), type=Shipped)
     except msgspec.DecodeError as error:
-        raise InputError(
-            f"does not say what the shipped files were made from ({error})", file=folder / MADE_FROM, cure=CURE
-        ) from None
+        words = f"does not say what the shipped files were made from ({error})"
+        raise InputError(words, file=folder / MADE_FROM, cure=CURE) from None
 
 
 def copy_shipped(folder: Path, out: Path) -> None:
-    """The files of a shipped result, as the step's own."""
-    for name in _read(folder).files:
-        shutil.copyfile(folder / name, out / name)
+    """The files of a shipped result, as the step's own.  Raises InputError where they are not those that were shipped."""
+    files = _shipped(folder).files
+    if not copied(folder, out, files):
+        wrong = next((name for name in files if not is_file_of(files[name], folder / name)), MADE_FROM)
+        raise InputError("is not the file that was shipped with the source", file=folder / wrong, cure=CURE)
 
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
     """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
-    target = root / shipping.folder
+    target, files = root / shipping.folder, {path.name: path.read_bytes() for path in sorted(result.iterdir())}
     target.mkdir(parents=True, exist_ok=True)
-    files = {path.name: path.read_bytes() for path in sorted(result.iterdir())}
     for name, content in files.items():
         replace_file(target / name, content)
     shipped = Shipped(made_from(record, shipping.made_by), {name: hash_of_file(target / name) for name in files})

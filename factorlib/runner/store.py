@@ -9,6 +9,10 @@
     build/store/locks, tmp, cache
 
 A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.
+
+A tree is right if its files are exactly those of its record, with their contents; what an editor or a desktop leaves
+(`left_over`) is no part of it.  Sizes and times that a tree had when its contents were right are remembered in a cache, so
+that a tree is read once.  A byte that flips under the same size and time is found only where every content is read.
 """
 
 from __future__ import annotations
@@ -19,21 +23,23 @@ import json
 import os
 import re
 import shutil
+import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.integrity import Inspector, hashes_of_tree
+from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
 from factorlib.wholefile import replace_file, sync, sync_tree
 
 DRAFT = re.compile(r"\..+\.([0-9]{1,9})")  # of `factorlib.wholefile.replace_file`: a dot, the name, the process
 OLD = 3600.0  # seconds: what is younger may be written by a process of another machine that shares the folder
+Stamp = tuple[int, int]  # size in bytes, time of the content in ns
+NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -49,19 +55,9 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        (
-            self.trees,
-            self.keys,
-            self.logs,
-            self.views,
-            self.locks,
-            self.tmp,
-            self.cache,
-            self.unfinished,
-            self.damaged,
-        ) = (
-            root / name for name in ("trees", "keys", "logs", "views", "locks", "tmp", "cache", "unfinished", "damaged")
-        )
+        self.trees, self.keys, self.logs, self.views = map(root.joinpath, ("trees", "keys", "logs", "views"))
+        self.unfinished, self.damaged = root / "unfinished", root / "damaged"
+        self.locks, self.tmp, self.cache = root / "locks", root / "tmp", root / "cache"
 
     def entry(self, key: str) -> Entry | None:
         """What is written of a key, None where it was never made; whether its tree is there and right an Inspector says."""
@@ -72,11 +68,11 @@ class Store:
         return entry if output_of(entry.files) == entry.output else None
 
     def tree(self, output: str) -> Path:
-        """Folder of the tree with hash `output`."""
+        """The folder of the tree with that hash."""
         return self.trees / output
 
     def log(self, key: str) -> Path:
-        """File with the log of the result of `key`."""
+        """The file with the log of the result of a key."""
         return self.logs / f"{key}.jsonl"
 
     def take_in(self, record: dict, folder: Path) -> tuple[Entry, Path | None]:
@@ -94,10 +90,11 @@ class Store:
 
     def keep(self, key: str, entry: Entry) -> None:
         """From now on `key` has that result."""
-        self.keys.mkdir(parents=True, exist_ok=True)
-        if (self.keys / f"{key}.json").is_dir():
-            self._set_aside(self.keys / f"{key}.json")
-        replace_file(self.keys / f"{key}.json", json_text(entry).encode())
+        path = self.keys / f"{key}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            self._set_aside(path)
+        replace_file(path, json_text(entry).encode())
 
     def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
         """Make `folder` the folder `target` by one rename, unless what stands there is right; where that is now, if not."""
@@ -124,7 +121,107 @@ class Store:
         return aside
 
 
-class Outputs(Mapping):
+def output_of(files: dict[str, str]) -> str:
+    """The hash of a tree: of its files' names and contents."""
+    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
+
+
+# ── whether results are as they were kept ────────────────────────────────────────────────────────────────────────────
+
+
+def stamps_of(folder: Path) -> dict[str, Stamp]:
+    """{relative path: stamp} of what lies below a folder; empty where there is none."""
+    return dict(_stamps(folder, ""))
+
+
+def _stamps(folder: str | Path, above: str) -> Iterator[tuple[str, Stamp]]:
+    try:
+        entries = [entry for entry in os.scandir(folder) if not left_over(entry.name)]
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _stamps(entry.path, f"{above}{entry.name}/")
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            facts = entry.stat(follow_symlinks=False)
+            yield above + entry.name, (facts.st_size, facts.st_mtime_ns) if stat.S_ISREG(facts.st_mode) else NO_FILE
+
+
+def hashes_of_tree(folder: Path) -> dict[str, str]:
+    """{relative path: content hash} of every file below a folder, sorted; refuses links, which would lead out of it."""
+    stamps = sorted(stamps_of(folder).items())
+    if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
+        raise InputError(f"a stage left {other!r}, which is no file", file=folder / other, cure="write a file")
+    return {name: hash_of_file(folder / name) for name, _ in stamps}
+
+
+def holds(tree: Path, files: dict[str, str]) -> bool:
+    """Whether a folder has exactly those files, every content read."""
+    try:
+        return hashes_of_tree(tree) == files
+    except (OSError, InputError):
+        return False
+
+
+def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]) -> list[str]:
+    """How a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
+    now = stamps_of(folder)
+    lines = [(name, _fault(folder / name, files[name], now.get(name), right.get(name))) for name in sorted(files)]
+    lines += [(name, "no file of this result") for name in sorted(now.keys() - files.keys())]
+    return [f"{name}: {words}" for name, words in lines if words]
+
+
+def _fault(path: Path, hash_: str, now: Stamp | None, right: Stamp | None) -> str:
+    if now is None or now == NO_FILE:
+        return "a link, or no file" if now else "missing"
+    try:
+        return "" if now == right or hash_of_file(path) == hash_ else "other content"
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+
+
+class Inspector:
+    """Looks at the trees and views of a store.  known: by tree or view, the stamps of its files when contents were right."""
+
+    def __init__(self, root: Path):
+        self.root, self.cache, self._changed = root, root / "cache" / "trees.json", False
+        self.known = read_cache(self.cache, dict[str, dict[str, Stamp]]) or {}
+        self._wrong: dict[str, tuple[dict[str, Stamp], list[str]]] = {}
+
+    def damage(self, output: str, files: Mapping[str, str]) -> list[str]:
+        """What is wrong with a tree that should hold `files` (relative path -> hash), a line each; empty where nothing is."""
+        now = stamps_of(self.root / "trees" / output)
+        if now and now == self.known.get(output):
+            return []
+        if output not in self._wrong or self._wrong[output][0] != now:
+            self._wrong[output] = now, self.thorough(output, files, self.known.get(output, {}))
+        return self._wrong[output][1]
+
+    def thorough(self, output: str, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
+        """The same, with every content read, but for files whose stamps are in `right`."""
+        tree = self.root / "trees" / output
+        now, damage = stamps_of(tree), damage_of(tree, files, right or {})
+        if damage:
+            self._changed |= self.known.pop(output, None) is not None
+        else:
+            self.remember(output, now)
+        return damage
+
+    def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
+        """Note the stamps of a tree or view whose contents were right."""
+        if self.known.get(name) != stamps:
+            self.known[name], self._changed = stamps, True
+
+    def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
+        if self._changed:
+            places = (self.root / "trees", self.root / "views")
+            write_cache(self.cache, {n: s for n, s in self.known.items() if any((p / n).is_dir() for p in places)})
+            self._changed = False
+
+
+class Outputs:
     """Output hash by key, each looked up once; none of a key whose tree is not as it was kept.
 
     damaged: by key, what is wrong with its tree
@@ -136,18 +233,15 @@ class Outputs(Mapping):
         self._known: dict[str, str] = {}
         self._entries: dict[str, Entry | None] = {}
 
-    def get(self, key: str, default: Any = None) -> Any:
-        """Tree hash of a key; `default` where there is no result, or its tree is damaged (then `damaged` says how)."""
-        if key not in self._known:
-            entry = self.entry(key)
-            if entry is None:
-                return default
+    def get(self, key: str) -> str | None:
+        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
+        if key not in self._known and (entry := self.entry(key)):
             self.damaged.pop(key, None)
             if damage := self.inspector.damage(entry.output, entry.files):
                 self.damaged[key] = damage
-                return default
-            self._known[key] = entry.output
-        return self._known[key]
+            else:
+                self._known[key] = entry.output
+        return self._known.get(key)
 
     def entry(self, key: str) -> Entry | None:
         """`Store.entry`, read once."""
@@ -165,41 +259,18 @@ class Outputs(Mapping):
         before = {key: self._known.get(key) for key in keys}
         for key in before:
             self.forget(key)
-        now = {key: self.get(key) for key in before}
-        return None not in now.values() and now == before
-
-    def __getitem__(self, key: str) -> str:
-        found = self.get(key)
-        if found is None:
-            raise KeyError(key)
-        return found
-
-    def __iter__(self) -> Iterator[str]:
-        return (path.stem for path in self.store.keys.glob("*.json"))
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
+        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
 
 
-def output_of(files: dict[str, str]) -> str:
-    """The hash of a tree: of its files' names and contents."""
-    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
-
-
-def holds(tree: Path, files: dict[str, str]) -> bool:
-    """Whether a folder has exactly those files, every content read."""
-    try:
-        return hashes_of_tree(tree) == files
-    except (OSError, InputError):
-        return False
+# ── what killed writers left ─────────────────────────────────────────────────────────────────────────────────────────
 
 
 def sweep_drafts(folder: Path) -> None:
     """Delete the drafts of writers that were killed: their process is no more, and they are OLD."""
     for path in folder.glob(".*"):
-        found = DRAFT.fullmatch(path.name)
+        named = DRAFT.fullmatch(path.name)
         with contextlib.suppress(OSError):
-            if found and not is_alive(int(found[1])) and time.time() - path.lstat().st_mtime > OLD:
+            if named and not is_alive(int(named[1])) and time.time() - path.lstat().st_mtime > OLD:
                 path.unlink()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,15 +13,11 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain
-from factorlib.runner.closure import Closure, Sources
-from factorlib.runner.defaults import other_than
+from factorlib.runner.closure import Packages, Sources, other_than
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
-from factorlib.runner.packages import Packages
 from factorlib.runner.pipeline import (
     DATASET,
-    Pipeline,
-    Stage,
     check_values,
     read_pipeline,
     said_of_settings,
@@ -30,6 +27,13 @@ from factorlib.runner.pipeline import (
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project, Recipe
 from factorlib.runner.store import Outputs, Store
+from factorlib.runner.worker import Code, check_params
+
+READ = (
+    "file:",
+    "recipe file:",
+    f"facts:{DATASET}",
+)  # fields of a record: the part of the dataset and recipe that a step reads
 
 
 @dataclass
@@ -58,6 +62,43 @@ class Survey:
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
 
+    def code(self, name: str, cores: int = 1) -> Code:
+        """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
+        stage, project = self.spec.pipeline.stages[name], self.project
+        taken = cores if stage.cores == "all" else min(stage.cores, cores)
+        file, words = project.pipeline_file, self.words
+        return Code(project.root, project.package, name, stage.values, file, stage.threads, taken, words)
+
+    def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
+        """What is wrong with the files that steps read, those of their recipes too, each fault once.
+
+        Where several stages take a slice, it is looked at by the parameters of the first.
+        new: only where the step's part of the dataset, or a file of its recipe, is another than that of its last result
+        """
+        faults, done = {}, set()
+        for step in steps:
+            stage, before = self.spec.pipeline.stages[step.stage], self.previous.get(str(step))
+            now = {name: value for name, value in self.records[step].items() if name.startswith(READ)}
+            if new and before is not None and now == {k: v for k, v in before.items() if k.startswith(READ)}:
+                continue
+            errors = self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
+            for slice_ in stage.slices:
+                if (slice_, step.photo) not in done:
+                    done.add((slice_, step.photo))
+                    errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
+            faults |= dict.fromkeys(map(str, errors))
+        return list(faults)
+
+    def wrong_values(self, planned: list[Planned]) -> list[str]:
+        """Of the parameters that steps would run with: one out of its range, or of another kind.
+
+        Only a stage that is given any is imported, which takes seconds where it computes.
+        """
+        open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
+        codes = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values]
+        outcomes = map(check_params, codes)  # a stage that cannot be loaded says so when it is run
+        return [outcome.error for outcome in outcomes if outcome.error and not outcome.traceback]
+
 
 def survey(
     project: Project,
@@ -71,162 +112,97 @@ def survey(
 
     recipes: paths or names of those that are asked for; without any, stages over recipes have no steps
     """
-    words, pipeline = (
-        words_by_key(settings),
-        with_settings(read_pipeline(project.pipeline_file, project.provider.slices), settings),
-    )
-    try:
-        check_values(pipeline, project.pipeline_file)
-    except InputError as error:
-        raise said_of_settings(error, words) from None
-    for name in targets or []:
-        if name not in pipeline.stages:
-            raise InputError(
-                f"there is no stage {name!r}", file=project.pipeline_file, cure=did_you_mean(name, pipeline.stages)
-            )
-    folder = project.dataset_folder(dataset)
-    data = project.provider.read(folder)
+    file, words = project.pipeline_file, words_by_key(settings)
+    pipeline = with_settings(read_pipeline(file, project.provider.slices), settings)
+    with _said_of(words):
+        check_values(pipeline, file)
+    for name in (name for name in targets or [] if name not in pipeline.stages):
+        raise InputError(f"there is no stage {name!r}", file=file, cure=did_you_mean(name, pipeline.stages))
+    data = project.provider.read(project.dataset_folder(dataset))
     home, store = home_of(project, data.folder), Store(project.build / "store")
     asked = project.recipes(data, recipes or [])
     spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
     if force:
         forced = pipeline.stages if targets is None else targets
         spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
-    hashes, packages = FileHashes(store.cache / "files.json"), Packages(store.cache / "packages.json")
-    try:
-        records = _records(project, spec, data, hashes, packages, asked)
-    except InputError as error:
-        raise said_of_settings(error, words) from None
+    hashes = FileHashes(store.cache / "files.json")
+    with _said_of(words):
+        records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
-        packages.save()
     outputs = Outputs(store)
     entries = {step: outputs.entry(key) for step, key in home.last_keys(warn=True).items()}
-    return Survey(
-        project,
-        data,
-        home,
-        store,
-        spec,
-        records,
-        outputs,
-        {step: e.record for step, e in entries.items() if e},
-        asked,
-        words,
-    )
+    previous = {step: entry.record for step, entry in entries.items() if entry}
+    return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
+
+
+@contextlib.contextmanager
+def _said_of(words: dict[str, str]) -> Iterator[None]:
+    """What is wrong with a setting is said of the setting."""
+    try:
+        yield
+    except InputError as error:
+        raise said_of_settings(error, words) from None
 
 
 def _records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages, recipes: dict[str, Recipe]
 ) -> dict[Step, Record]:
-    sources = Sources(project.source_roots, hashes)
-    _check_params(project, spec.pipeline, sources)
+    sources, stages, file = Sources(project.source_roots, hashes), spec.pipeline.stages, project.pipeline_file
+    wanted = spec.pipeline.needed(spec.targets)
+    defaults = {
+        name: sources.stage_params(project.package, name, file)
+        for name, stage in stages.items()
+        if stage.params or name in wanted
+    }
+    for name, stage in (
+        (name, stages[name]) for name in defaults
+    ):  # names alone: values are checked where it is loaded
+        known = [*defaults[name], *stage.given]
+        for param in (param for param in stage.params if param not in known):
+            words, cure = f"the stage {name!r} has no parameter {param!r}", did_you_mean(param, known)
+            raise InputError(
+                words, file=file, key=f"stages.{name}.params.{param}", cure=cure if known else "leave it out"
+            )
     records = {}
-    for name in spec.pipeline.needed(spec.targets):
-        of_stage = _stage_record(
-            name, spec.pipeline, sources.closure(project.package, name, project.pipeline_file), packages
-        )
-        values = other_than(sources.default_values(project.package, name), spec.pipeline.stages[name].values)
-        of_stage |= {f"param:{param}": value for param, value in values.items()}
-        of_stage |= {
-            f"default:{param}": text
-            for param, text in sources.stage_params(project.package, name, project.pipeline_file).items()
-        }
-        of_stage |= _given(name, spec.pipeline, project, hashes)
+    for name in wanted:
+        stage, closure = stages[name], sources.closure(project.package, name, file)
+        values = other_than(defaults[name], stage.values)
+        record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
+        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record()
+        record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
+        record |= {f"param:{param}": value for param, value in values.items()}
+        record |= {f"default:{param}": value for param, value in defaults[name].items()}
+        for param, folder in stage.folders.items():
+            for given in stage.given[param]:
+                words = f"name a folder with {', '.join(stage.given[param])}, such as the result of an earlier run of the stage"
+                record[f"given:{param}/{given}"] = _given(project, folder, given, f"{name}.{param}", words, hashes)
         for step in spec.steps_of(name):
-            records[step] = of_stage | {"photo": step.photo} | _slices(step, spec.pipeline, data, hashes)
+            records[step] = record | {"photo": step.photo}
+            for slice_ in (data.slice(each, step.photo) for each in stage.slices):
+                records[step] |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
+                records[step] |= {f"file:{each}": _hash(data.folder, each, hashes) for each in slice_.files}
             if step.recipe is not None:
-                records[step] |= {"recipe": step.recipe} | _recipe(recipes[step.recipe], hashes)
+                recipe = recipes[step.recipe]
+                records[step] |= {"recipe": step.recipe} | {f"recipe:{f}": value for f, value in recipe.facts.items()}
+                files = recipe.files.items()
+                records[step] |= {f"recipe file:{each}": _hash(path.parent, path.name, hashes) for each, path in files}
     return records
 
 
-def _recipe(recipe: Recipe, hashes: FileHashes) -> Record:
-    """What a recipe says, and the files it names, by content."""
-    files = {f"recipe file:{name}": _content(path, hashes) for name, path in recipe.files.items()}
-    return {f"recipe:{field}": value for field, value in recipe.facts.items()} | files
-
-
-def _check_params(project: Project, pipeline: Pipeline, sources: Sources) -> None:
-    """Names of parameters, without importing a stage; their values are checked when it is loaded."""
-    for name, stage in pipeline.stages.items():
-        if not stage.params:
-            continue
-        known = [*sources.stage_params(project.package, name, project.pipeline_file), *stage.given]
-        for param in stage.params:
-            if param not in known:
-                where = f"stages.{name}.params.{param}"
-                cure = did_you_mean(param, known) if known else "leave it out"
-                raise InputError(
-                    f"the stage {name!r} has no parameter {param!r}", file=project.pipeline_file, key=where, cure=cure
-                )
-
-
-def _stage_record(name: str, pipeline: Pipeline, closure: Closure, packages: Packages) -> Record:
-    stage = pipeline.stages[name]
-    record = {
-        "stage": name,
-        "threads": stage.threads,
-        "python": f"{sys.version_info[0]}.{sys.version_info[1]}",
-        "makes": stage.makes,
-    }
-    return (
-        record
-        | closure.record()
-        | {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
-    )
-
-
-def _given(name: str, pipeline: Pipeline, project: Project, hashes: FileHashes) -> Record:
-    """The files of the folders that parameters name, by content."""
-    stage, record = pipeline.stages[name], {}
-    for param, files in ((param, stage.given[param]) for param in stage.folders):
-        folder = given_folder(stage, param)
-        for file in files:
-            try:
-                if os.path.lexists(folder / file):
-                    check_plain(
-                        folder / file, "a result", f"{name}.{param}", most_bytes=None
-                    )  # a pipe or a device would never end
-                record[f"given:{param}/{file}"] = hashes.content(folder / file)
-            except (OSError, TypeError):
-                found = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"
-                key, cure = (
-                    f"{name}.{param}",
-                    f"name a folder with {', '.join(files)}, such as the result of an earlier run of the stage",
-                )
-                raise InputError(found, file=project.shown(folder), key=key, cure=cure) from None
-    return record
-
-
-def given_folder(stage: Stage, param: str) -> Path:
-    """The folder that a parameter names, from where the user stands; links are followed now, for results move on."""
-    named = str(stage.folders[param])
+def _given(project: Project, folder: Path, file: str, key: str, cure: str, hashes: FileHashes) -> str:
     try:
-        return Path(named).resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
-        found = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
-        raise InputError(found, key=param, cure="name a folder") from error
-
-
-def _slices(step: Step, pipeline: Pipeline, data: Data, hashes: FileHashes) -> Record:
-    """The slices of the dataset that a step declares, field by field, and the files they name, by content."""
-    record: Record = {}
-    for name in pipeline.stages[step.stage].slices:
-        slice_ = data.slice(name, step.photo)
-        record |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
-        for file in slice_.files:
-            record[f"file:{file}"] = _hash(data.folder, file, hashes)
-    return record
-
-
-def _content(path: Path, hashes: FileHashes) -> str:
-    return _hash(path.parent, path.name, hashes)
+        if os.path.lexists(folder / file):
+            check_plain(folder / file, "a result", key, most_bytes=None)  # a pipe or a device would never end
+        return hashes.content(folder / file)
+    except (OSError, TypeError):
+        words = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"
+        raise InputError(words, file=project.shown(folder), key=key, cure=cure) from None
 
 
 def _hash(folder: Path, file: str, hashes: FileHashes) -> str:
     try:
         return hashes.content(folder / file)
     except OSError as error:
-        raise InputError(
-            f"the file {file!r} cannot be read ({error.strerror})", file=folder, cure="check its name and permissions"
-        ) from error
+        words = f"the file {file!r} cannot be read ({error.strerror})"
+        raise InputError(words, file=folder, cure="check its name and permissions") from error

@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -16,15 +16,15 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.home import Home, claim, label, made_home, made_homes, remember, sound_lines
-from factorlib.runner.params import parameters
-from factorlib.runner.pipeline import DATASET, read_pipeline
-from factorlib.runner.plan import Planned, Step, difference
+from factorlib.runner.pipeline import Pipeline, read_pipeline
+from factorlib.runner.plan import Planned, difference
 from factorlib.runner.project import ALL, RESERVED, Project, check_name, is_path
 from factorlib.runner.shared import shared_store
+from factorlib.runner.shared import ship as put_into_package
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
 from factorlib.runner.store import Store
 from factorlib.runner.survey import Survey, survey
-from factorlib.runner.worker import Code, load_stage, value_fault
+from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
@@ -51,30 +51,36 @@ class Wish(msgspec.Struct, frozen=True):
     recipes: list[str] = []
 
 
-def surveyed(project: Project, wish: Wish) -> Survey:
-    """The survey of what is wanted.  Recipes add the stages over them; with the target `render` they are all that is wanted."""
-    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
+def surveyed(project: Project, wish: Wish, look: bool = False) -> Survey:
+    """The survey of what is wanted.  Recipes add the stages over them; with the target `render` they are all that is wanted.
+
+    look: without running it: where recipes are named and no stage, of the recipes alone
+    """
+    stages, targets, recipes = _pipeline(project).stages, wish.targets, wish.recipes
     over_recipes = [name for name, stage in stages.items() if stage.over == "recipe"]
-    targets, recipes = wish.targets, wish.recipes
-    if recipes:
-        usual = [name for name, stage in stages.items() if not stage.optional] if targets is None else targets
-        targets = over_recipes if targets == [RENDER] else [*usual, *over_recipes]
+    if recipes and (targets == [RENDER] or (look and targets is None)):
+        targets = over_recipes
+    elif recipes:
+        usual = [name for name, stage in stages.items() if not stage.optional]
+        targets = [*(usual if targets is None else targets), *over_recipes]
     elif any(name in over_recipes for name in targets or []):
         recipes = [ALL]
     return survey(project, wish.dataset, targets, wish.settings, wish.force, recipes)
 
 
-def _looked_at(project: Project, wish: Wish) -> Survey:
-    """The survey of what is wanted, without running it: where recipes are named and no stage, of the recipes alone."""
-    targets = [RENDER] if wish.recipes and wish.targets is None else wish.targets
-    return surveyed(project, msgspec.structs.replace(wish, targets=targets))
-
-
 def check_stage(project: Project, name: str, verbs: list[str]) -> None:
     """Raise InputError for a word of the command line that is neither a verb nor the name of a stage."""
-    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
+    stages = _pipeline(project).stages
     if name not in stages:
         raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
+
+
+def _pipeline(project: Project) -> Pipeline:
+    return read_pipeline(project.pipeline_file, project.provider.slices)
+
+
+def _say(seen: Survey, text: str) -> None:
+    print(f"{seen.data.folder.name}: {text}")
 
 
 # ── running ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -83,15 +89,14 @@ def check_stage(project: Project, name: str, verbs: list[str]) -> None:
 def make(project: Project, wish: Wish) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
     with heed_stops():
-        started = time.perf_counter()
-        seen = surveyed(project, wish)
+        started, seen = time.perf_counter(), surveyed(project, wish)
         planned = seen.planned()
         todo = [p.step for p in planned if p.status != "current"]
         if not todo:
             remember(seen, planned=planned)
-            words.say(seen, f"nothing to do, all {len(seen.records)} steps are current")
-        elif found := faults(seen, [step for step in todo if _reads_what_is_new(seen, step)]):
-            return _refused(seen, found)
+            _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
+        elif faults := seen.faults(todo, new=True):
+            return _refused(seen, faults)
         elif code := _run(seen, started):
             return code
         _name_results(seen, wish.targets is None)
@@ -113,12 +118,12 @@ def _run(seen: Survey, started: float) -> int:
     finally:
         display.close()
     if failed := list(tally.failed):
-        words.say(seen, f"{words.count(failed)} failed: {words.listed(failed)}")
+        _say(seen, f"{words.count(failed)} failed: {words.listed(failed)}")
         if tally.held_up:
             print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
         return 1
     current, seconds = len(seen.records) - len(tally.ran), time.perf_counter() - started
-    words.say(seen, f"{words.count(tally.ran)} run, {current} current, {seconds:.1f} s")
+    _say(seen, f"{words.count(tally.ran)} run, {current} current, {seconds:.1f} s")
     return 0
 
 
@@ -135,52 +140,11 @@ def _name_results(seen: Survey, whole: bool) -> None:
             print(f"  {name}: {seen.project.shown(home / name / one)}")
 
 
-def faults(seen: Survey, steps: Iterable[Step]) -> list[InputError]:
-    """What is wrong with the files that steps read, those of their recipes too, each fault once.
-
-    Where several stages take a slice, it is looked at by the parameters of the first.
-    """
-    found, done = {}, set()
-    for step in steps:
-        stage = seen.spec.pipeline.stages[step.stage]
-        errors = seen.data.recipe_faults(seen.recipes[step.recipe].files) if step.recipe is not None else []
-        for slice_ in stage.slices:
-            if (slice_, step.photo) not in done:
-                done.add((slice_, step.photo))
-                errors = [*errors, *seen.data.faults(slice_, step.photo, stage.values, seen.project.pipeline_file)]
-        found |= {str(fault): fault for fault in errors if str(fault) not in found}
-    return list(found.values())
-
-
-def _reads_what_is_new(seen: Survey, step: Step) -> bool:
-    """Whether the step's part of the dataset, or a file of its recipe, is another than that of its last result."""
-
-    def read(record: dict) -> dict:
-        """The part of a record that is read."""
-        return {k: v for k, v in record.items() if k.startswith(("file:", "recipe file:", f"facts:{DATASET}"))}
-
-    before = seen.previous.get(str(step))
-    return before is None or read(before) != read(seen.records[step])
-
-
-def wrong_values(seen: Survey, planned: list[Planned]) -> list[InputError]:
-    """Of the parameters that steps would run with: one out of its range, or of another kind.
-
-    Only a stage that is given any is imported, which takes seconds where it computes.
-    """
-    found, project, stages = [], seen.project, seen.spec.pipeline.stages
-    for name in dict.fromkeys(p.step.stage for p in planned if p.status != "current" and stages[p.step.stage].values):
-        code = Code(project.root, project.package, name, stages[name].values, project.pipeline_file, words=seen.words)
-        found.append(value_fault(code))
-    return [fault for fault in found if fault]
-
-
-def _refused(seen: Survey, found: list[InputError], where: str = "files") -> int:
+def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     """Print every fault at once, before anything has run."""
-    for fault in found:
+    for fault in faults:
         print(f"error: {fault}", file=sys.stderr)
-    count = f"{len(found)} {'fault' if len(found) == 1 else 'faults'}"
-    print(f"{seen.data.folder.name}: {count} in its {where}; nothing was run", file=sys.stderr)
+    print(f"{seen.data.folder.name}: {words.count(faults, 'fault')} in its {where}; nothing was run", file=sys.stderr)
     return 1
 
 
@@ -198,13 +162,13 @@ def show_why(project: Project, wish: Wish) -> int:
 
 
 def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]]) -> int:
-    seen = _looked_at(project, wish)
+    seen = surveyed(project, wish, look=True)
     planned = seen.planned()
-    if found := wrong_values(seen, planned):
-        return _refused(seen, found, "parameters")
-    keys = Store(folder).keys if (folder := shared_store(seen.store.root)) else None
-    for number, p in enumerate(planned if keys else []):
-        if p.status != "current" and "forced" not in p.reasons and p.key and (keys / f"{p.key}.json").is_file():
+    if faults := seen.wrong_values(planned):
+        return _refused(seen, faults, "parameters")
+    shared = Store(folder) if (folder := shared_store(seen.store.root)) else None
+    for number, p in enumerate(planned if shared else []):
+        if p.status != "current" and "forced" not in p.reasons and p.key and (shared.keys / f"{p.key}.json").is_file():
             planned[number] = msgspec.structs.replace(p, reasons=[*p.reasons, "the shared store has it"])
     print("\n".join(lines(planned)))
     return 0
@@ -212,17 +176,17 @@ def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[s
 
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = _looked_at(project, wish)
+    seen = surveyed(project, wish, look=True)
 
     def warned(planned: Planned) -> list[str]:
         """What a step said when its present result was made."""
-        return [event["text"] for event in events_of(seen, planned) if event["event"] == "warning"]
+        return [event["text"] for event in _events(seen, planned) if event["event"] == "warning"]
 
-    print("\n".join(words.status_lines(seen.planned(), lambda p: is_running(seen, p), warned)))
+    print("\n".join(words.status_lines(seen.planned(), lambda p: _is_running(seen, p), warned)))
     return 0
 
 
-def is_running(seen: Survey, planned: Planned) -> bool:
+def _is_running(seen: Survey, planned: Planned) -> bool:
     """Whether a run holds the lock on a step's key."""
     try:
         descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
@@ -237,46 +201,38 @@ def is_running(seen: Survey, planned: Planned) -> bool:
         os.close(descriptor)
 
 
-def events_of(seen: Survey, planned: Planned) -> list[dict]:
+def _events(seen: Survey, planned: Planned) -> list[dict]:
     """The log of a step's current result."""
-    current = planned.status == "current"
-    return (
-        [{"text": "", **msgspec.json.decode(line)} for line in sound_lines(seen.store.log(planned.key))]
-        if current
-        else []
-    )
+    lines = sound_lines(seen.store.log(planned.key)) if planned.status == "current" else []
+    return [{"text": "", **msgspec.json.decode(line)} for line in lines]
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
     """Print the stages and what each takes, as text or as a Mermaid diagram."""
-    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    print("\n".join(words.mermaid_lines(pipeline) if mermaid else words.graph_lines(pipeline)))
+    print("\n".join(words.graph_lines(_pipeline(project), mermaid)))
     return 0
 
 
 def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
     """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
-    seen = _looked_at(project, wish)
-    chosen = [
-        p for p in seen.planned() if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of)
-    ]
-    if not chosen:
-        raise InputError(
-            f"no step is of {photo!r}", key="PHOTO", cure=did_you_mean(str(photo), [*seen.data.photos, *seen.recipes])
-        )
-    errors = {p.step: path for p in chosen if (path := seen.home.errors / f"{label(p.step)}.txt").is_file()}
-    shown = {step: seen.project.shown(path) for step, path in errors.items()}
-    print("\n".join(words.log_lines([(p, events_of(seen, p), shown.get(p.step)) for p in chosen])))
+    seen, logged = surveyed(project, wish, look=True), []
+    for p in seen.planned():
+        if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of):
+            error = seen.home.errors / f"{label(p.step)}.txt"
+            logged.append((p, _events(seen, p), project.shown(error) if error.is_file() else None))
+    if not logged:
+        cure = did_you_mean(str(photo), [*seen.data.photos, *seen.recipes])
+        raise InputError(f"no step is of {photo!r}", key="PHOTO", cure=cure)
+    print("\n".join(words.log_lines(logged)))
     return 0
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
     """Print every parameter of the stages, or of all, with default, range and meaning."""
-    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    for number, name in enumerate(stages or pipeline.order()):
+    for number, name in enumerate(stages or _pipeline(project).order()):
         check_stage(project, name, [])
         params = load_stage(Code(project.root, project.package, name, {}, project.pipeline_file)).Params
-        print("\n".join([""] * (number > 0) + words.parameter_lines(name, parameters(params))))
+        print("\n".join([""] * (number > 0) + words.parameter_lines(name, params)))
     return 0
 
 
@@ -286,12 +242,12 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes
     """
     seen = survey(project, dataset, None, settings)
-    if found := wrong_values(seen, seen.planned()):
-        return _refused(seen, found, "parameters")
-    if found := faults(seen, seen.records):
-        return _refused(seen, found)
+    if faults := seen.wrong_values(seen.planned()):
+        return _refused(seen, faults, "parameters")
+    if faults := seen.faults(seen.records):
+        return _refused(seen, faults)
     counts = f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
-    words.say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
+    _say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
     if sheet:
         from factorlib.runner.display import shown_if_long
 
@@ -319,9 +275,8 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if is_path(dataset) else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = _science("newset").new_dataset(folder, photos, masks, meshes)
-    print(
-        f"{project.shown(folder)}/dataset.yaml is written" + (", with `?` where you must say more:" if missing else "")
-    )
+    where = ", with `?` where you must say more:" if missing else ""
+    print(f"{project.shown(folder)}/dataset.yaml is written{where}")
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
     return 0
 
@@ -334,7 +289,7 @@ def compare(project: Project, first: Path, second: Path) -> int:
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    changes = _changes(Store(project.build / "store"), *map(Home, folders))
+    changes = _changes(Store(project.build / "store"), *(Home(folder).keys() for folder in folders))
     page = _science("report.comparison").comparison(*folders, changes)
     path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -343,34 +298,33 @@ def compare(project: Project, first: Path, second: Path) -> int:
     return 0
 
 
-def _changes(store: Store, first: Home, second: Home) -> list[str] | None:
+def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> list[str] | None:
     """What differs between the records of the steps that both have, results of other steps left out; None where one is gone."""
-    keys = [home.keys() for home in (first, second)]
-    found: set[str] = set()
-    for step in keys[0].keys() & keys[1].keys():
-        entries = [store.entry(each[step]) for each in keys]
+    changes: set[str] = set()
+    for step in first.keys() & second.keys():
+        entries = [store.entry(keys[step]) for keys in (first, second)]
         if None in entries:
             return None
         records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in entries]
-        found |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
-    return sorted(found)
+        changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
+    return sorted(changes)
 
 
-def _home(project: Project, dataset: str | None, otherwise: str) -> tuple[bool, Home | None]:
-    """Whether there is anything to do for a dataset (None: for all), and its home."""
+def _homes(project: Project, dataset: str | None, otherwise: str) -> list[Home]:
+    """The home of a dataset, or all; none, which is said, where a dataset has no results."""
     home = None if dataset is None else made_home(project, dataset)
     if dataset is not None and home is None:
         print(f"nothing to {otherwise}: {dataset} has no results")
-    return dataset is None or home is not None, home
+    return made_homes(project) if dataset is None else [home] if home else []
 
 
 def clean(project: Project, dataset: str | None) -> int:
     """Forget the results of one dataset, or of all, and say what was deleted."""
     from factorlib.runner.gc import forget, forget_all
 
-    there, home = _home(project, dataset, "delete")
-    if there:
-        deleted, left = forget_all(project) if home is None else forget(project, home)
+    homes = _homes(project, dataset, "delete")
+    if homes or dataset is None:
+        deleted, left = forget_all(project) if dataset is None else forget(project, homes[0])
         print("\n".join([f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]))
         for path in left:
             print(f"left    {project.shown(path)}")
@@ -381,54 +335,42 @@ def collect(project: Project, agreed: Callable[[], bool]) -> int:
     """Show which results in the store no data set names, and delete them where that is `agreed`, which is asked after they are shown."""
     from factorlib.runner import gc
 
-    found = gc.unneeded(project)
-    for line in words.unneeded_lines(found, time.time()):
+    groups = gc.unneeded(project)
+    for line in words.unneeded_lines(groups):
         print(line)
-    if found and not agreed():
+    if groups and not agreed():
         print("nothing was deleted")
         return 0
-    freed = gc.collect(project)
-    print(f"deleted {freed.results} results that nothing names any more, {freed.bytes / 1e6:.1f} MB")
+    results, freed = gc.collect(project)
+    print(f"deleted {results} results that nothing names any more, {freed / 1e6:.1f} MB")
     return 0
 
 
 def verify(project: Project, dataset: str | None) -> int:
     """Read every result, of a dataset or of all; 1 where any is not as it was kept."""
-    from factorlib.runner.verify import verify as read_all
+    from factorlib.runner.gc import verify as read_all
 
-    there, home = _home(project, dataset, "read")
-    if not there:
+    homes = _homes(project, dataset, "read")
+    if dataset is not None and not homes:
         return 0
-    pipeline = read_pipeline(project.pipeline_file, project.provider.slices)
-    count, damaged = read_all(
-        Store(project.build / "store"), [home] if home else made_homes(project), pipeline, home is None
-    )
-    for where, what, steps in damaged:
-        print(
-            "\n".join([f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {line}" for line in what)])
-        )
-    more = (
-        f"{len(damaged)} damaged; the next run that needs one makes it again"
-        if damaged
-        else "all are as they were kept"
-    )
-    print(f"{count} results read: {more}")
+    results, damaged = read_all(Store(project.build / "store"), homes, _pipeline(project), dataset is None)
+    for where, faults, steps in damaged:
+        lines = [f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {fault}" for fault in faults)]
+        print("\n".join(lines))
+    more = f"{len(damaged)} damaged; the next run that needs one makes it again"
+    print(f"{results} results read: {more if damaged else 'all are as they were kept'}")
     return 1 if damaged else 0
 
 
 def ship(project: Project, stage: str, dataset: str) -> int:
     """Put the current result of a stage into the package, where pipeline.yaml says that it ships with the source."""
-    from factorlib.runner.shared import ship as put
-
-    stages = read_pipeline(project.pipeline_file, project.provider.slices).stages
-    known = [name for name, found in stages.items() if found.shipped]
+    known = {name: found.shipped for name, found in _pipeline(project).stages.items() if found.shipped}
     if stage not in known:
         raise InputError(f"no result of {stage!r} ships with the source", key="ship", cure=did_you_mean(stage, known))
     seen = survey(project, dataset, [stage], [])
     planned = next(p for p in seen.planned() if p.step.stage == stage)
     if planned.status != "current":
         raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
-    print(
-        f"{stage}: {project.shown(put(seen.store.tree(planned.output), planned.record, project.root, stages[stage].shipped))}"
-    )
+    folder = put_into_package(seen.store.tree(planned.output), planned.record, project.root, known[stage])
+    print(f"{stage}: {project.shown(folder)}")
     return 0

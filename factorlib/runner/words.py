@@ -1,17 +1,19 @@
-"""A plan in words: what each verb prints of it."""
+"""A plan, and what else there is to tell, in words: what each verb prints."""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import textwrap
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from msgspec import structs
+import msgspec
+from msgspec import inspect as types
 
-from factorlib.runner.params import Parameter
 from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.survey import Survey
 
 if TYPE_CHECKING:
     from factorlib.runner.gc import Unneeded
@@ -20,128 +22,36 @@ SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
 
 
-def say(seen: Survey, text: str) -> None:
-    """Print a line that begins with the dataset's name."""
-    print(f"{seen.data.folder.name}: {text}")
+# ── plans ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
-    lines = []
-    for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(
-            f"{group[0].step.stage:<10} {group[0].status:<7} {_items(group):<24} {_short(group[0].reasons)}".rstrip()
-        )
-    current = sum(p.status == "current" for p in planned)
-    return lines + [
-        f"{current} of {len(planned)} steps are current" if lines else f"all {len(planned)} steps are current"
+    lines = [
+        f"{stage:<10} {status:<7} {items:<24} {_short(reasons)}".rstrip()
+        for stage, status, reasons, items in _alike(planned)
     ]
+    current = sum(p.status == "current" for p in planned)
+    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
 
 
 def why_lines(planned: list[Planned]) -> list[str]:
     """Every reason of every step that is not current."""
-    lines = []
-    for group in _alike([p for p in planned if p.status != "current"]):
-        lines.append(f"{group[0].step.stage} {_items(group)}".rstrip() + f": {group[0].status}")
-        lines += [f"    {reason}" for reason in group[0].reasons]
-    return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
-
-
-def status_lines(
-    planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]
-) -> list[str]:
-    """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
-    lines = []
-    for stage in dict.fromkeys(p.step.stage for p in planned):
-        steps = [p for p in planned if p.step.stage == stage]
-        states = ["running" if p.key and p.status != "current" and running(p) else p.status for p in steps]
-        counts = ", ".join(f"{states.count(s)} {s}" for s in ("current", "running", "to run", "maybe") if s in states)
-        lines.append(f"{stage:<10} {counts}")
-    said = dict.fromkeys(f"warning: {p.step}: {text}" for p in planned if p.status == "current" for text in warnings(p))
-    return lines + list(said)
-
-
-def graph_lines(pipeline: Pipeline) -> list[str]:
-    """Each stage under what it takes, in the order they run."""
-    lines = []
-    for name in pipeline.order():
-        stage = pipeline.stages[name]
-        taken = ", ".join(stage.inputs) or "(parameters only)"
-        asked = "   (only when asked for)" if stage.optional else ""
-        lines.append(f"{name:<10} {f'per {stage.over}' if stage.over else 'whole set':<10} <- {taken}{asked}")
-    return lines
-
-
-def parameter_lines(stage: str, found: list[Parameter]) -> list[str]:
-    """A stage's parameters, each with its default, what it may be and what it means."""
-    if not found:
-        return [f"{stage} has no parameters"]
-    lines = []
-    for one in found:
-        lines += [
-            f"{stage}.{one.name} = {one.default}    ({one.allowed})",
-            *textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    "),
-        ]
-    return lines
-
-
-def mermaid_lines(pipeline: Pipeline) -> list[str]:
-    """The graph of stages in Mermaid's language; stages over photos or recipes have double frames."""
-    edges = [f"  {above} --> {name}" for name in pipeline.order() for above in pipeline.stages[name].upstream]
-    nodes = [f"  {name}[[{name}]]" if pipeline.stages[name].over else f"  {name}[{name}]" for name in pipeline.order()]
-    return ["graph TD", *nodes, *edges]
-
-
-def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
-    """What each step cost, what it was made with where that is not as for the step above, and what it warned of.
-
-    logged: steps with the events of their results' logs, and the file that says by which defect one failed
-    """
-    lines, last = [], ""
-    for planned, events, failed in logged:
-        lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
-        if planned.status == "current" and (made_with := _made_with(planned.record or {}, events)) != last:
-            for part in textwrap.wrap(made_with, 110, initial_indent="    ", subsequent_indent="    "):
-                lines.append(part.replace("\N{NO-BREAK SPACE}", " "))
-            last = made_with
-        lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
-        lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
-    return lines
-
-
-def _cost(planned: Planned, events: list[dict]) -> str:
-    done = next((event for event in reversed(events) if event["event"] == "done"), None)
-    if planned.status != "current":
-        return f"{planned.status}: {_short(planned.reasons)}"
-    if done is None:
-        return "its log is not there"
-    if done.get("shared"):
-        return "from the shared store, without its log"
-    cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
-    cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
-    return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
-
-
-def _made_with(record: dict, events: list[dict]) -> str:
-    """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
-    machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    packages = [
-        f"{name.removeprefix('package:')} {version}"
-        for name, version in sorted(record.items())
-        if name.startswith("package:")
+    groups = [
+        [f"{stage} {items}".rstrip() + f": {status}", *(f"    {reason}" for reason in reasons)]
+        for stage, status, reasons, items in _alike(planned)
     ]
-    kind = [f"{machine['system']} {machine['processor']}"] if machine else []
-    parts = [f"Python {machine.get('python', record.get('python', ''))}", *kind, *packages]
-    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
+    nothing = "everything is current: sources, parameters, files and versions are those of the last results"
+    return [line for group in groups for line in group] or [nothing]
 
 
-def _alike(planned: list[Planned]) -> list[list[Planned]]:
-    """Steps of a stage with the same status and reasons, the photo's own name aside."""
-    groups: dict[tuple, list[Planned]] = {}
-    for p in planned:
-        reasons = [_of_any_photo(reason, p.step) for reason in p.reasons]
-        groups.setdefault((p.step.stage, p.status, tuple(reasons)), []).append(structs.replace(p, reasons=reasons))
-    return list(groups.values())
+def _alike(planned: list[Planned]) -> list[tuple[str, str, list[str], str]]:
+    """Stage, status, reasons and items of steps that are not current and share these, the photo's own name aside."""
+    groups: dict[tuple, list[Step]] = {}
+    for p in (p for p in planned if p.status != "current"):
+        reasons = tuple(_of_any_photo(reason, p.step) for reason in p.reasons)
+        groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step)
+    return [(stage, status, list(reasons), _items(steps)) for (stage, status, reasons), steps in groups.items()]
 
 
 def _of_any_photo(reason: str, step: Step) -> str:
@@ -157,9 +67,9 @@ def _of_any_photo(reason: str, step: Step) -> str:
     return reason.replace(f" photos.{step.photo}.", " photos.*.", 1) if reason.startswith("dataset.yaml:") else reason
 
 
-def _items(group: list[Planned]) -> str:
-    names = [p.step.of for p in group if p.step.of]
-    return ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if group[0].step.recipe else 'photos'}"
+def _items(steps: list[Step]) -> str:
+    names = [step.of for step in steps if step.of]
+    return ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
 
 
 def _short(reasons: list[str]) -> str:
@@ -167,12 +77,39 @@ def _short(reasons: list[str]) -> str:
     return "; ".join(reasons[:SHOWN]) + more
 
 
-def count(steps: list[Step]) -> str:
+def status_lines(
+    planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]
+) -> list[str]:
+    """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
+    lines = []
+    for stage in dict.fromkeys(p.step.stage for p in planned):
+        steps = [p for p in planned if p.step.stage == stage]
+        states = ["running" if p.key and p.status != "current" and running(p) else p.status for p in steps]
+        counts = ", ".join(f"{states.count(s)} {s}" for s in ("current", "running", "to run", "maybe") if s in states)
+        lines.append(f"{stage:<10} {counts}")
+    return lines + list(dict.fromkeys(f"warning: {p.step}: {text}" for p in planned for text in warnings(p)))
+
+
+def graph_lines(pipeline: Pipeline, mermaid: bool = False) -> list[str]:
+    """Each stage under what it takes, in the order they run; or a Mermaid diagram, where stages over photos or recipes have
+    double frames."""
+    stages = {name: pipeline.stages[name] for name in pipeline.order()}
+    if mermaid:
+        nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
+        return ["graph TD", *nodes, *(f"  {above} --> {name}" for name in stages for above in stages[name].upstream)]
+    return [
+        f"{name:<10} {f'per {stage.over}' if stage.over else 'whole set':<10} <- {', '.join(stage.inputs) or '(parameters only)'}"
+        + ("   (only when asked for)" if stage.optional else "")
+        for name, stage in stages.items()
+    ]
+
+
+def count(items: list, one: str = "step") -> str:
     """
-    >>> count([Step("train")])
-    '1 step'
+    >>> count(["a"]), count(["a", "b"], "fault")
+    ('1 step', '2 faults')
     """
-    return "1 step" if len(steps) == 1 else f"{len(steps)} steps"
+    return f"{len(items)} {one}{'' if len(items) == 1 else 's'}"
 
 
 def listed(steps: list[Step]) -> str:
@@ -185,14 +122,56 @@ def listed(steps: list[Step]) -> str:
     return ", ".join([*map(str, steps[:NAMED]), *more])
 
 
-def unneeded_lines(found: list[Unneeded], now: float) -> list[str]:
+# ── logs ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
+    """What each step cost, what it was made with where that is not as for the step above, and what it warned of.
+
+    logged: steps with the events of their results' logs, and the file that says by which defect one failed
+    """
+    lines, last = [], ""
+    for planned, events, failed in logged:
+        lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
+        if planned.status == "current" and (made_with := _made_with(planned.record or {}, events)) != last:
+            parts = textwrap.wrap(made_with, 110, initial_indent="    ", subsequent_indent="    ")
+            lines += [part.replace("\N{NO-BREAK SPACE}", " ") for part in parts]
+            last = made_with
+        lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
+        lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
+    return lines
+
+
+def _cost(planned: Planned, events: list[dict]) -> str:
+    done = next((event for event in reversed(events) if event["event"] == "done"), None)
+    if planned.status != "current":
+        return f"{planned.status}: {_short(planned.reasons)}"
+    if done is None or done.get("shared"):
+        return "its log is not there" if done is None else "from the shared store, without its log"
+    cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
+    cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
+    return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
+
+
+def _made_with(record: dict, events: list[dict]) -> str:
+    """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
+    machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
+    packages = sorted(item for item in record.items() if item[0].startswith("package:"))
+    parts = [f"Python {machine.get('python', record.get('python', ''))}"]
+    parts += [f"{machine['system']} {machine['processor']}"] if machine else []
+    parts += [f"{name.removeprefix('package:')} {version}" for name, version in packages]
+    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
+
+
+def unneeded_lines(groups: list[Unneeded]) -> list[str]:
     """A line a stage: how many results nothing names, what they take, and how old they are."""
-    ages = [(_age(now - group.oldest), _age(now - group.newest)) for group in found]
-    return [
-        f"{group.stage:<10} {group.results:>5} {'result ' if group.results == 1 else 'results'} {group.bytes / 1e6:>9.1f} MB   "
-        + (f"{newest} old" if oldest == newest else f"{newest} to {oldest} old")
-        for group, (oldest, newest) in zip(found, ages, strict=True)
-    ]
+    now, lines = time.time(), []
+    for group in groups:
+        oldest, newest = _age(now - group.oldest), _age(now - group.newest)
+        what = f"{group.stage:<10} {group.results:>5} {'result ' if group.results == 1 else 'results'}"
+        age = newest if oldest == newest else f"{newest} to {oldest}"
+        lines.append(f"{what} {group.bytes / 1e6:>9.1f} MB   {age} old")
+    return lines
 
 
 def _age(seconds: float) -> str:
@@ -202,3 +181,74 @@ def _age(seconds: float) -> str:
     """
     hours = int(max(0.0, seconds) // 3600)
     return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
+
+
+# ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Parameter(msgspec.Struct, frozen=True):
+    """Its name, dotted where it is a field of a field; what is allowed, in words; its default as YAML has it; what it means."""
+
+    name: str
+    allowed: str
+    default: str
+    text: str
+
+
+def parameter_lines(stage: str, params: type) -> list[str]:
+    """A stage's parameters, each with its default, what it may be and what it means."""
+    lines = []
+    for one in parameters(params):
+        lines.append(f"{stage}.{one.name} = {one.default}    ({one.allowed})")
+        lines += textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    ")
+    return lines or [f"{stage} has no parameters"]
+
+
+def parameters(params: type) -> list[Parameter]:
+    """The fields of a stage's `Params`, in its order, each explained by the string that follows it; a field that is a struct
+    stands for its own fields."""
+    texts, table = _texts_of(params), []
+    for field in types.type_info(params).fields:
+        if isinstance(field.type, types.StructType):
+            inner = parameters(field.type.cls)
+            table += [msgspec.structs.replace(one, name=f"{field.name}.{one.name}") for one in inner]
+        else:
+            made = field.default is msgspec.NODEFAULT and callable(field.default_factory)
+            value = field.default_factory() if made else field.default
+            text = "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
+            table.append(Parameter(field.name, allowed(field.type), text, texts.get(field.name, "")))
+    return table
+
+
+def _texts_of(struct: type) -> dict[str, str]:
+    """The strings that follow the fields of a class and of those it is derived from."""
+    texts: dict[str, str] = {}
+    for cls in reversed(struct.__mro__):
+        if issubclass(cls, msgspec.Struct) and cls is not msgspec.Struct:
+            body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+            for field, text in zip(body, body[1:]):
+                if isinstance(field, ast.AnnAssign) and isinstance(getattr(text, "value", None), ast.Constant):
+                    texts[field.target.id] = " ".join(str(text.value.value).split())
+    return texts
+
+
+def allowed(of: Any) -> str:
+    """What a value of a type, as `msgspec.inspect` has it, may be.
+
+    >>> allowed(types.type_info(int)), allowed(types.IntType(ge=1, le=1024)), allowed(types.FloatType(gt=0))
+    ('whole number', '1 … 1,024', 'number > 0')
+    """
+    if isinstance(of, types.IntType | types.FloatType):
+        if of.ge is not None and of.le is not None:
+            return f"{of.ge:,} … {of.le:,}"
+        bounds = ((">", of.gt), ("≥", of.ge), ("<", of.lt), ("≤", of.le))
+        words = " and ".join(f"{sign} {bound:,}" for sign, bound in bounds if bound is not None)
+        return f"{'whole number' if isinstance(of, types.IntType) else 'number'} {words}".strip()
+    if isinstance(of, types.LiteralType):
+        return ", ".join(str(value) for value in sorted(of.values, key=str))
+    if isinstance(of, types.UnionType):
+        return " or ".join(map(allowed, of.types))
+    if items := getattr(of, "item_types", None):
+        return f"{len(items)} of: {allowed(items[0])}"
+    words = {types.BoolType: "true, false", types.StrType: "text", types.NoneType: "null"}
+    return words.get(type(of), type(of).__name__)

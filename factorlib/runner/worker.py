@@ -21,34 +21,29 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
-from factorlib.runner.closure import Sources
+from factorlib.runner.closure import CODE, Sources
 from factorlib.runner.cost import Meter
-from factorlib.runner.filehash import FileHashes, hash_of_file
+from factorlib.runner.filehash import FileHashes, is_file_of
 from factorlib.runner.home import sound_lines
-from factorlib.runner.integrity import Stamp, stamps_of
 from factorlib.runner.pipeline import Shipping, said_of_settings
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import copy_shipped, fetch, offer, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
-from factorlib.runner.store import Entry, Store
+from factorlib.runner.store import Entry, Stamp, Store, stamps_of
 from factorlib.stage import Inputs
 from factorlib.wholefile import replace_file
 from factorlib.yamlfile import convert
 
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
+LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
+THREAD_VARIABLES = (*(f"{name}_NUM_THREADS" for name in LIBRARIES), "VECLIB_MAXIMUM_THREADS")
+LOGGERS = ("factorlib", "py.warnings")
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -78,7 +73,7 @@ class Task(msgspec.Struct, frozen=True):
     """All that a worker knows of a step.
 
     hashes:  of the dataset's files, as they were when the key was made
-    shipped: where the package may have the result already; None where it is to be made in any case
+    shipped: where the package may have the result already
     shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
     """
 
@@ -102,9 +97,12 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """output: hash of what was made;  damaged: where that lies now which stood in its place and was not as it had been kept;
-    error: what went wrong;  traceback: of a defect, None where a user can mend it;  code_changed: whether the stage's code is
-    another than that of the key, so that further steps of it would fail alike."""
+    """How a step ended.
+
+    output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
+    damaged: where a result lies now that stood in the place of this one, and was not as it had been kept
+    code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
+    """
 
     output: str | None = None
     damaged: Path | None = None
@@ -118,40 +116,31 @@ class CodeChanged(InputError):
     """The code of a stage was edited while the run went on."""
 
 
-class Spread(Protocol):
-    """An ordered map over independent work, and what of it was spent outside this process: `cpu_seconds`, and whatever else is worth a log."""
-
-    spent: dict[str, float]
-
-    def __call__(self, function: Callable, items: Iterable) -> list: ...
-
-
-def run_step(task: Task, spread_over: Spread | None = None) -> Outcome:
+def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
     """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome.
 
-    spread_over: where its independent work goes; without, over threads of this process
+    spread_over: an ordered map to which its independent work goes, with what it `spent` outside this process: `cpu_seconds`,
+                 and whatever else is worth a log; without, threads of this process
     """
-    meter = Meter()
+    meter, code, store = Meter(), task.code, Store(task.store)
     with Events(task) as events:
         try:
-            if found := _fetched(task, events):
-                _keep(task, found[0])
-                return Outcome(output=found[0].output, damaged=found[1], seconds=meter.read(0, 0)["seconds"])
-            entry, damaged = _made(task, events, spread_over or partial(spread, task.code.cores))
-            cost = meter.read(task.code.threads, task.code.cores)
-            if spread_over is not None:
-                cost |= {
-                    "cpu_seconds": round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3),
-                    "spread": spread_over.spent,
-                }
-            _write_log(task, events, cost)
-            _keep(task, entry)
-            if task.shared:
-                offer(Store(task.store), Store(task.shared), task.key, entry, events.say)
+            taken, from_shared = _made_elsewhere(task, store, events)
+            entry, damaged = taken or _made(task, store, events, spread_over or partial(spread, code.cores))
+            cost = meter.read(code.threads, code.cores)
+            if spread_over is not None and not taken:
+                cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
+                cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
+            if not from_shared:
+                _write_log(task, events, cost)
+            store.keep(task.key, entry)
+            shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
+            if task.shared and not from_shared:
+                offer(store, Store(task.shared), task.key, entry, events.say)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
-            return _failed(error, task.temporary.parent, meter.read(task.code.threads, task.code.cores)["seconds"])
+            return _failed(error, task.temporary.parent, meter.read(code.threads, code.cores)["seconds"])
 
 
 def check_params(code: Code) -> Outcome:
@@ -159,18 +148,8 @@ def check_params(code: Code) -> Outcome:
     try:
         params_of(load_stage(code), code)
         return Outcome()
-    except BaseException as error:
+    except Exception as error:
         return _failed(error, code.root)
-
-
-def value_fault(code: Code) -> InputError | None:
-    """What is wrong with the parameters, in this process; a stage that cannot be loaded says so when it is run."""
-    with contextlib.suppress(ImportError):
-        try:
-            params_of(load_stage(code), code)
-        except InputError as error:
-            return error
-    return None
 
 
 def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
@@ -208,107 +187,81 @@ def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
 
 def limit_threads(threads: int) -> None:
     """The same number for every library; those not loaded yet read the environment."""
-    for name in THREAD_VARIABLES:
-        os.environ[name] = str(threads)
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(threads)
     if "OpenImageIO" in sys.modules:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
+def _made_elsewhere(task: Task, store: Store, events: Events) -> tuple[tuple[Entry, Path | None] | None, bool]:
+    """The result as others have made it, and what they were warned of; None where it is to be made here.
+
+    Second comes whether it is of the shared store, with a log of its own.
+    """
+    if task.forced:
+        return None, False
+    if task.shared and (taken := fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)):
+        for event in map(json.loads, sound_lines(store.log(task.key))):
+            if event["event"] == "warning":
+                events.say(str(event.get("text", "")))
+        if not store.log(task.key).exists():
+            _write_log(task, events, {"seconds": 0.0, "shared": True})
+        return taken, True
+    if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
+        copy_shipped(folder, task.temporary)
+        return store.take_in(task.record, task.temporary), False
+    return None, False
+
+
+def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
     """Run the step; its tree is in the store afterwards, its key is not."""
-    shipped = shipped_folder([task.code.root, LIBRARY], task.shipped, task.record) if task.shipped else None
-    module = None if shipped else load_stage(task.code)  # which takes seconds
-    params = params_of(module, task.code) if module else None
+    module = load_stage(task.code)  # which takes seconds
+    params = params_of(module, task.code)
     task.temporary.mkdir(parents=True)
-    store = Store(task.store)
     hashes = FileHashes(store.cache / "files.json")
-    _check_code_still(task, hashes)
+    _check_code(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
     inputs = Inputs(task.folders, task.facts, task.files, task.photo, map_, task.log, unfinished)
-    if shipped:
-        copy_shipped(shipped, task.temporary)
-    else:
-        _run_main(module, params, inputs, task, results, events)
-    _check_files_still(task)
-    _check_results_still(results)
-    _check_code_still(task, hashes)
+    try:
+        module.main(params, inputs, task.temporary, events.progress)
+    except Exception:
+        _check_inputs(task, results)  # of a file that was taken away or edited meanwhile: no defect of the stage
+        raise
+    _check_inputs(task, results)
+    _check_code(task, hashes)
     _check_made(task)
     return store.take_in(task.record, task.temporary)
 
 
-def _run_main(
-    module: ModuleType,
-    params: msgspec.Struct,
-    inputs: Inputs,
-    task: Task,
-    results: dict[Path, dict[str, Stamp]],
-    events: Events,
-) -> None:
-    """Where the stage fails because a file was taken away or edited while it ran, that is what is said: it is no defect of the stage."""
-    try:
-        module.main(params, inputs, task.temporary, events.progress)
-    except Exception:
-        _check_files_still(task)
-        _check_results_still(results)
-        raise
-
-
-def _fetched(task: Task, events: Events) -> tuple[Entry, Path | None] | None:
-    """The result as others have made it, and what they were warned of; None where it is to be made here."""
-    if task.shared is None or task.forced:
-        return None
-    store = Store(task.store)
-    found = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
-    for line in sound_lines(store.log(task.key)) if found else ():
-        if (event := json.loads(line))["event"] == "warning":
-            events.say(str(event.get("text", "")))
-    if found and not store.log(task.key).exists():
-        _write_log(task, events, {"seconds": 0.0, "shared": True})
-    return found
-
-
-def _keep(task: Task, entry: Entry) -> None:
-    store = Store(task.store)
-    store.keep(task.key, entry)
-    shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-
-
-def _check_files_still(task: Task) -> None:
-    for name, before in task.hashes.items():
-        if not task.files[name].is_file() or hash_of_file(task.files[name]) != before:
-            raise InputError("the file changed while it was being read", file=task.files[name], cure="run again")
-
-
-def _check_results_still(results: dict[Path, dict[str, Stamp]]) -> None:
-    """Somebody may open a file of build/<dataset>/ in an editor while it is read."""
+def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
+    """Somebody may replace a photo, or open a file of build/<dataset>/ in an editor, while it is read."""
+    changed = [task.files[name] for name, before in task.hashes.items() if not is_file_of(before, task.files[name])]
     for folder, before in results.items():
         now = stamps_of(folder)
-        for name in sorted(before.keys() | now.keys()):
-            if before.get(name) != now.get(name):
-                raise InputError(
-                    "the file changed while it was being read", file=folder / name, cure="run again: it is made again"
-                )
+        changed += [folder / name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+    for path in changed[:1]:
+        raise InputError(
+            "the file changed while it was being read", file=path, cure="run again: what is needed is made again"
+        )
 
 
-def _check_code_still(task: Task, hashes: FileHashes) -> None:
+def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
-    if changes := closure.changes(task.record):
-        before, now = (
-            {name: record[name] for name in changes if name in record} for record in (task.record, closure.record())
-        )
-        files = [str(closure.files[name]) for name in changes if name in closure.files]
-        found = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
-        raise CodeChanged(found, file=", ".join(files) or None, cure="run again")
+    now, before = closure.record(), {n: value for n, value in task.record.items() if n.startswith(CODE)}
+    if now != before:
+        changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+        files = [str(closure.files[name]) for name in changed if name in closure.files]
+        words = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
+        raise CodeChanged(words, file=", ".join(files) or None, cure="run again")
 
 
 def _check_made(task: Task) -> None:
     """A stage that does not keep its word is a defect."""
-    promised = list(task.makes) + (["{photo}.json"] if task.gather else [])
+    promised = [*task.makes, *(["{photo}.json"] if task.gather else [])]
     for pattern in (text.replace("{photo}", task.photo or "") for text in promised):
         if not any(task.temporary.glob(pattern)):
             raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
@@ -320,12 +273,10 @@ def _write_log(task: Task, events: Events, cost: dict) -> None:
     """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
     where = {"stage": task.code.stage, "photo": task.photo, "key": task.key}
     where |= {"recipe": task.record["recipe"]} if "recipe" in task.record else {}
-    lines = [{"event": "warning", **where, "text": text} for text in events.warnings] + [
-        {"event": "done", **where, **cost}
-    ]
+    lines = [*({"event": "warning", "text": text} for text in events.warnings), {"event": "done", **cost}]
     path = Store(task.store).log(task.key)
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines).encode())
+    replace_file(path, "".join(json.dumps(where | line, sort_keys=True) + "\n" for line in lines).encode())
 
 
 class Events(logging.Handler):
@@ -337,40 +288,38 @@ class Events(logging.Handler):
 
     def __enter__(self) -> Events:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._stream = open(self.path, "a", encoding="utf-8")
+        self._stream = open(self.path, "a", encoding="utf-8")  # of events
         logging.captureWarnings(True)
         warnings.simplefilter("ignore", DeprecationWarning)
-        for name in ("factorlib", "py.warnings"):
-            logging.getLogger(name).addHandler(self)
-            logging.getLogger(name).propagate = False
+        for logger in map(logging.getLogger, LOGGERS):
+            logger.addHandler(self)
+            logger.propagate = False
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for name in ("factorlib", "py.warnings"):
-            logging.getLogger(name).removeHandler(self)
-        with contextlib.suppress(OSError):  # what could not be said, see `_say`
+        for logger in map(logging.getLogger, LOGGERS):
+            logger.removeHandler(self)
+        with contextlib.suppress(OSError):  # what could not be said, see `_write`
             self._stream.close()
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
-        now = time.monotonic()
-        if now - self._last >= EVERY:
+        if (now := time.monotonic()) - self._last >= EVERY:
             self._last = now
-            self._say({"done": float(done), "total": float(total), "text": text})
+            self._write({"done": float(done), "total": float(total), "text": text})
 
     def emit(self, record: logging.LogRecord) -> None:
         """Report a warning of the log, each text once (as a `logging.Handler`)."""
         text = record.getMessage().strip()
         if text not in self.warnings:
             self.warnings.append(text)
-            self._say({"warning": text})
+            self.say(text)
 
     def say(self, text: str) -> None:
-        """A warning that is no part of the result's log."""
-        self._say({"warning": text})
+        """Report a warning that is no part of the result's log."""
+        self._write({"warning": text})
 
-    def _say(self, event: dict) -> None:
-        """On a full disk nothing more is said: the step itself fails there, or finds room again."""
-        with contextlib.suppress(OSError):
+    def _write(self, event: dict) -> None:
+        with contextlib.suppress(OSError):  # on a full disk: the step itself fails there, or finds room again
             self._stream.write(json.dumps(event) + "\n")
             self._stream.flush()

@@ -9,24 +9,21 @@ from factorlib.runner.closure import Sources, source_of
 from factorlib.runner.filehash import FileHashes
 from tests.runner import toy
 
-
-def digest(text):
-    return source_of(text, "m", False).digest
+FUNCTION = "def f(x):\n    return x + 1\n"
 
 
 @pytest.mark.parametrize(
-    "other", ['def f(x):\n    "What it does."\n    return x + 1\n', "# why\ndef f(x):  # here\n\n    return (x+1)\n"]
+    "text, counts",
+    [
+        ('def f(x):\n    "What it does."\n    return x + 1\n', False),
+        ("# why\ndef f(x):  # here\n\n    return (x+1)\n", False),
+        ("def f(x):\n    return x + 2\n", True),
+        ("def f(y):\n    return y + 1\n", True),
+        (FUNCTION + 'Y = "a string"\n', True),
+    ],
 )
-def test_comments_docstrings_and_layout_do_not_count(other):
-    assert digest("def f(x):\n    return x + 1\n") == digest(other)
-
-
-@pytest.mark.parametrize(
-    "other",
-    ["def f(x):\n    return x + 2\n", "def f(y):\n    return y + 1\n", 'def f(x):\n    return x + 1\nY = "a string"\n'],
-)
-def test_anything_else_counts(other):
-    assert digest("def f(x):\n    return x + 1\n") != digest(other)
+def test_comments_docstrings_and_layout_do_not_count_and_anything_else_does(text, counts):
+    assert (source_of(text, "m", False).digest != source_of(FUNCTION, "m", False).digest) == counts
 
 
 def test_every_form_of_import_is_followed(tmp_path):
@@ -44,22 +41,30 @@ def test_every_form_of_import_is_followed(tmp_path):
     assert closure.external == ["numpy"]
 
 
+def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
+    files = {
+        "stages/s.py": "from p.a import NOISE, Base\nLOW, HIGH = 1, (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
+        "    high: tuple = HIGH\n    noise: float = NOISE.absolute\n    sum: int = LOW + 1\n    none: int\n",
+        "p/__init__.py": "",
+        "p/a.py": "class Noise:\n    absolute: float = 1e-3\nNOISE = Noise()\nclass Base:\n    limits: Noise = Noise()\n    low: int = 7\n",
+    }
+    for name, text in files.items():
+        toy.write(tmp_path / name, text)
+    found = Sources([tmp_path], FileHashes(None)).stage_params("stages", "s", Path("pipeline.yaml"))
+    expected = {
+        "limits": {"absolute": 0.001},
+        "low": 1,
+        "high": [2, 3],
+        "noise": 0.001,
+        "sum": "LOW + 1",
+        "none": "none",
+    }
+    assert found == expected
+
+
 def test_a_stage_without_a_module_is_refused(tmp_path):
     project = toy.make_project(tmp_path)
     toy.write(tmp_path / "pipeline.yaml", toy.PIPELINE.replace("upper:", "uper:").replace("[upper]", "[uper]"))
     with pytest.raises(InputError, match="uper") as caught:
         toy.state(project)
     assert "did you mean 'upper'" in caught.value.cure
-
-
-def test_what_is_remembered_of_a_file_ends_with_any_change(tmp_path):
-    file = tmp_path / "f"
-    file.write_text("one")
-    import os
-
-    os.utime(file, ns=(1, 1))
-    hashes = FileHashes(tmp_path / "cache.json")
-    first = hashes.content(file)
-    file.write_text("two")
-    os.utime(file, ns=(1, 1))  # same size, same time
-    assert hashes.content(file) != first

@@ -1,9 +1,11 @@
-"""`plan` as what it is, a pure function: tables in, steps with reasons out."""
+"""`plan` as what it is, a pure function: tables in, steps with reasons out; and pipeline.yaml, which it is a plan of."""
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import given
 
-from factorlib.runner.pipeline import Pipeline, Stage
+from factorlib.errors import InputError
+from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline, with_settings
 from factorlib.runner.plan import Listing, Spec, Step, difference, key_of, plan
 
 PIPELINE = Pipeline(
@@ -19,27 +21,20 @@ PIPELINE = Pipeline(
 
 def hashes(spec, **changed):
     """Each step's own record; `changed` is {stage or stage_photo: new value of its source}."""
-    return {
-        s: {
-            "stage": s.stage,
-            "photo": s.photo,
-            "source:m": changed.get(str(s).replace("/", "_"), changed.get(s.stage, 1)),
-        }
-        for s in spec.steps()
-    }
+    source = lambda s: changed.get(str(s).replace("/", "_"), changed.get(s.stage, 1))  # noqa: E731
+    return {s: {"stage": s.stage, "photo": s.photo, "source:m": source(s)} for s in spec.steps()}
 
 
 def run(spec, own, listing, same=()):
     """Carry a plan out on paper: every output is its key, or its step's old output for the steps in `same`. -> steps run"""
     outputs, previous, ran, forced = dict(listing.outputs), dict(listing.previous), [], set(spec.forced)
     while True:
-        now = Spec(spec.pipeline, spec.photos, spec.targets, frozenset(forced))
-        todo = [p for p in plan(now, own, Listing(outputs, previous)) if p.status == "to run" and p.key]
+        planned = plan(
+            Spec(spec.pipeline, spec.photos, spec.targets, frozenset(forced)), own, Listing(outputs, previous)
+        )
+        todo = [p for p in planned if p.status == "to run" and p.key]
         if not todo:
-            return ran, Listing(
-                outputs,
-                {**previous, **{str(p.step): p.record for p in plan(now, own, Listing(outputs, previous)) if p.record}},
-            )
+            return ran, Listing(outputs, previous | {str(p.step): p.record for p in planned if p.record})
         for p in todo:
             old = outputs.get(key_of(previous[str(p.step)])) if str(p.step) in previous else None
             outputs[p.key] = old if str(p.step) in same and old else f"out-{p.key}"
@@ -53,77 +48,46 @@ def done(photos=("a", "b")):
     return spec, run(spec, hashes(spec), Listing({}, {}))[1]
 
 
-def statuses(spec, own, listing):
-    return {str(p.step): p.status for p in plan(spec, own, listing)}
+def open_steps(spec, own, listing):
+    """Status and reasons of the steps that are not current."""
+    return {str(p.step): (p.status, p.reasons) for p in plan(spec, own, listing) if p.status != "current"}
 
 
-def test_at_first_everything_runs_once_and_then_nothing():
-    spec = Spec(PIPELINE, ["a", "b"])
-    ran, listing = run(spec, hashes(spec), Listing({}, {}))
-    assert sorted(ran) == ["align/a", "align/b", "masks/a", "masks/b", "solve", "train"] and ran[-1] == "solve"
-    assert set(statuses(spec, hashes(spec), listing).values()) == {"current"}
-
-
-def test_a_new_photo_costs_that_photo_and_the_set():
+@pytest.mark.parametrize(
+    "photos, forced, changed, expected, same, ran",
+    [
+        ("ab", [], {}, {}, (), []),
+        ("abc", [], {}, {"masks/c": "to run", "align/c": "to run", "solve": "maybe"}, (), ["masks/c", "align/c", "solve"]),
+        ("a", [], {}, {"solve": "to run"}, (), ["solve"]),
+        ("ab", [], {"masks_a": 2}, {"masks/a": "to run", "align/a": "maybe", "solve": "maybe"}, (), ["masks/a", "align/a", "solve"]),
+        ("ab", [], {"masks_a": 2}, {"masks/a": "to run", "align/a": "maybe", "solve": "maybe"}, ["masks/a"], ["masks/a"]),
+        ("ab", [], {"masks_a": 2, "solve": 2}, {"masks/a": "to run", "align/a": "maybe", "solve": "to run"}, (), None),
+        ("ab", [Step("masks", "a")], {}, {"masks/a": "to run", "align/a": "maybe", "solve": "maybe"}, (), ["masks/a"]),
+    ],
+    ids=["nothing", "a new photo", "one taken away", "a change", "the same output", "two changes", "forced"],
+)  # fmt: skip
+def test_what_runs_after_a_change_and_what_then_does(photos, forced, changed, expected, same, ran):
     _, listing = done()
-    spec = Spec(PIPELINE, ["a", "b", "c"])
-    assert run(spec, hashes(spec), listing)[0] == ["masks/c", "align/c", "solve"]
+    spec = Spec(PIPELINE, list(photos), None, frozenset(forced))
+    own = hashes(spec, **changed)
+    assert {step: status for step, (status, _) in open_steps(spec, own, listing).items()} == expected
+    assert ran is None or run(spec, own, listing, same)[0] == ran
 
 
-def test_a_photo_taken_away_costs_the_set_only():
-    _, listing = done()
-    spec = Spec(PIPELINE, ["a"])
-    planned = {str(p.step): p for p in plan(spec, hashes(spec), listing)}
-    assert [s for s, p in planned.items() if p.status != "current"] == ["solve"]
-    assert planned["solve"].reasons == ["result of align/b: gone"]
-
-
-def test_a_change_runs_its_step_and_what_follows_is_maybe():
+def test_the_reasons_are_what_differs_from_the_last_result():
     spec, listing = done()
-    own = hashes(spec, masks_a=2)
-    assert statuses(spec, own, listing) == {
-        "masks/a": "to run", "masks/b": "current", "train": "current", "align/a": "maybe", "align/b": "current", "solve": "maybe",
-    }  # fmt: skip
-    assert plan(spec, own, listing)[0].reasons == ["source of m: changed"]
+    assert open_steps(spec, hashes(spec, masks_a=2), listing)["masks/a"][1] == ["source of m: changed"]
+    without_b = Spec(PIPELINE, ["a"])
+    assert open_steps(without_b, hashes(without_b), listing)["solve"][1] == ["result of align/b: gone"]
+    outputs = {k: v for k, v in listing.outputs.items() if k != key_of(listing.previous["train"])}
+    gone = open_steps(spec, hashes(spec), Listing(outputs, listing.previous))
+    assert gone["train"] == ("to run", ["its result is gone"]) and gone["solve"][0] == "maybe"
 
 
-def test_an_output_that_comes_out_the_same_stops_there():
+def test_going_back_finds_the_old_result_and_only_what_a_target_needs_is_planned():
     spec, listing = done()
-    assert run(spec, hashes(spec, masks_a=2), listing, same=("masks/a",))[0] == ["masks/a"]
-    assert run(spec, hashes(spec, masks_a=2), listing)[0] == ["masks/a", "align/a", "solve"]
-
-
-def test_what_has_changed_itself_is_no_maybe():
-    spec, listing = done()
-    assert statuses(spec, hashes(spec, masks_a=2, solve=2), listing)["solve"] == "to run"
-
-
-def test_going_back_finds_the_old_result():
-    spec, listing = done()
-    _, later = run(spec, hashes(spec, masks=2), listing)
-    assert set(statuses(spec, hashes(spec), later).values()) == {"current"}
-
-
-def test_forced_steps_run_and_others_only_if_that_changes_something():
-    spec, listing = done()
-    forced = Spec(PIPELINE, ["a", "b"], None, frozenset([Step("masks", "a")]))
-    found = statuses(forced, hashes(forced), listing)
-    assert found["masks/a"] == "to run" and found["align/a"] == "maybe" and found["masks/b"] == "current"
-    assert run(forced, hashes(forced), listing)[0] == ["masks/a"]
-
-
-def test_only_what_a_target_needs_is_planned():
-    spec = Spec(PIPELINE, ["a"], ["align"])
-    assert [str(s) for s in spec.steps()] == ["masks/a", "align/a"]
-
-
-def test_a_result_that_was_deleted_is_made_again():
-    spec, listing = done()
-    key = key_of(listing.previous["train"])
-    found = plan(spec, hashes(spec), Listing({k: v for k, v in listing.outputs.items() if k != key}, listing.previous))
-    assert [(str(p.step), p.status, p.reasons) for p in found if p.status == "to run"] == [
-        ("train", "to run", ["its result is gone"])
-    ]
+    assert not open_steps(spec, hashes(spec), run(spec, hashes(spec, masks=2), listing)[1])
+    assert [str(s) for s in Spec(PIPELINE, ["a"], ["align"]).steps()] == ["masks/a", "align/a"]
 
 
 records = st.dictionaries(st.sampled_from(["param:a", "param:b", "source:m", "file:f", "threads"]), st.integers(0, 2))
@@ -141,11 +105,59 @@ def test_two_keys_are_equal_just_where_there_is_no_difference(one, other):
     st.sets(st.sampled_from(["masks/a", "train"])),
 )
 def test_whatever_changes_a_run_leaves_everything_current_and_runs_nothing_in_vain(photos, changed, same):
-    spec, listing = done(("a", "b", "c"))
+    _, listing = done(("a", "b", "c"))
     spec = Spec(PIPELINE, photos)  # the order of photos is no reason
     own = hashes(spec, **dict.fromkeys(changed, 2))
-    planned = statuses(spec, own, listing)
+    planned = open_steps(spec, own, listing)
     ran, after = run(spec, own, listing, same)
-    assert set(statuses(spec, own, after).values()) == {"current"}
-    assert len(ran) == len(set(ran)) and all(planned[step] != "current" for step in ran)
-    assert {step for step, status in planned.items() if status == "to run"} <= set(ran)
+    assert not open_steps(spec, own, after)
+    assert len(ran) == len(set(ran)) and set(ran) <= planned.keys()
+    assert {step for step, (status, _) in planned.items() if status == "to run"} <= set(ran)
+
+
+# ── pipeline.yaml ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+GOOD = """format: 1
+stages:
+  one: {inputs: [dataset.photo], over: photo, gather: all.json}
+  two: {inputs: [one], threads: 2, params: {a: 1e-3}}
+"""
+
+
+def read(tmp_path, text):
+    (tmp_path / "pipeline.yaml").write_text(text)
+    return read_pipeline(tmp_path / "pipeline.yaml", ("photo", "set"))
+
+
+def test_a_stage_runs_after_what_it_takes_and_an_optional_one_only_where_it_is_asked_for_or_taken(tmp_path):
+    pipeline = read(tmp_path, GOOD + "  three: {inputs: [two], optional: true}\n")
+    assert pipeline.stages["two"].params == {"a": 0.001} and pipeline.order() == ["one", "two", "three"]
+    assert pipeline.needed(["one"]) == ["one"] and pipeline.needed(None) == ["one", "two"]
+    assert pipeline.needed(["three"]) == ["one", "two", "three"]
+    taken = read(tmp_path, GOOD + "  three: {inputs: [one], optional: true}\n  four: {inputs: [three]}\n")
+    assert set(taken.needed(None)) == {"one", "two", "three", "four"}
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("[one]", "[oen]", ["stages.two.inputs", "did you mean 'one'"]),
+        ("dataset.photo", "dataset.foto", ["stages.one.inputs", "did you mean 'dataset.photo'"]),
+        ("threads", "thread", ["pipeline.yaml:4", "stages.two.thread", "did you mean 'threads'"]),
+        ("threads: 2", "threads: 0", ["pipeline.yaml:4", "stages.two.threads", ">= 1"]),
+        ("over: photo, ", "", ["stages.one.gather", "over: photo"]),
+        ("over: photo", "over: mesh", ["stages.one.over"]),
+        ("[dataset.photo]", "[two]", ["need each other", "one"]),
+        ("format: 1", "format: 2", ["format 2"]),
+    ],
+)
+def test_what_is_refused(tmp_path, old, new, words):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, GOOD.replace(old, new))
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_settings_reach_into_nested_parameters_and_leave_the_rest():
+    stage = Stage(params={"a": 1, "search": {"x": 1, "y": 2}})
+    pipeline = with_settings(Pipeline(1, {"s": stage}), ["s.search.x=3", "s.b=no s.c=1e2"])
+    assert pipeline.stages["s"].params == {"a": 1, "search": {"x": 3, "y": 2}, "b": "no", "c": 100.0}

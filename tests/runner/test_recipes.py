@@ -70,24 +70,20 @@ def make(project, *recipes, targets=("render",), **more):
     return verbs.make(project, verbs.Wish("set", targets and list(targets), recipes=list(recipes), **more))
 
 
-def test_every_recipe_is_a_step_with_a_folder_of_its_own(project):
-    assert make(project, "all") == 0
-    assert said(project, "hello") == "hello!ab" and said(project, "bye") == "bye!…ab"
+def test_every_recipe_is_a_step_with_a_folder_of_its_own_all_of_them_where_none_is_named(project):
+    assert make(project, "hello") == 0 and said(project, "hello") == "hello!ab"
     assert not (project.build / "set" / "total").exists()  # what no recipe takes did not run
+    assert make(project, targets=["shout"]) == 0 and said(project, "bye") == "bye!…ab"
 
 
-def test_a_stage_over_recipes_makes_all_of_them_where_none_is_named(project):
-    assert make(project, targets=["shout"]) == 0
-    assert said(project, "hello") and said(project, "bye")
-
-
-def test_what_was_asked_for_before_stays(project):
+def test_what_was_asked_for_before_stays_until_it_is_cleaned(project):
     assert make(project, "hello") == 0 and make(project, "bye") == 0
-    assert said(project, "hello") and said(project, "bye")
-    assert to_run(project, "all") == []
+    assert said(project, "hello") and said(project, "bye") and to_run(project, "all") == []
     assert verbs.make(project, verbs.Wish("set")) == 0  # without recipes
     collect(project)
     assert said(project, "hello") and to_run(project, "all") == []
+    verbs.clean(project, "set")
+    assert made_homes(project) == [] and not (project.build / "set").exists()
 
 
 def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
@@ -97,12 +93,8 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     write(project.root / "recipes" / "hello.yaml", '{"word": "hi"}')
     assert to_run(project, "all") == ["shout/hello"]
     write(project.root / "recipes" / "set" / "more.txt", "and more")
-    assert to_run(project, "all") == ["shout/hello", "shout/bye"]
-    seen = survey(project, "set", ["shout"], [], recipes=["all"])
-    assert [p.reasons for p in seen.planned()[-2:]] == [
-        ['recipe: word: "hello" -> "hi"'],
-        ["file more.txt of the recipe: changed"],
-    ]
+    reasons = [p.reasons for p in survey(project, "set", ["shout"], [], recipes=["all"]).planned()[-2:]]
+    assert reasons == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
 
 
 def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_they_are_new(project, capsys):
@@ -126,41 +118,23 @@ def test_a_path_is_a_recipe_as_well(project, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "word, wrong",
-    [("helo", "did you mean 'hello'"), ("recipes/helo.yaml", "did you mean 'hello'"), ("not", "known are")],
+    "words, wrong",
+    [
+        (["helo"], "did you mean 'hello'"),
+        (["recipes/helo.yaml"], "did you mean 'hello'"),
+        (["not"], "known are"),
+        (["hello", "{}/hello.yaml"], "two recipes are called 'hello'"),
+        (["{}/" + "x" * 240 + ".yaml"], "give it another name"),
+        (["{}/two\nlines.yaml"], "give it another name"),
+    ],
+    ids=["a name", "a path", "of another set", "two of one name", "a long name", "two lines"],
 )
-def test_a_recipe_that_is_not_there_names_those_that_are(project, word, wrong):
-    data = project.provider.read(project.root / "data" / "set")
+def test_a_recipe_that_is_not_there_or_can_have_no_folder_is_refused(project, tmp_path, words, wrong):
+    for name in ("hello", "x" * 240, "two\nlines"):
+        write(tmp_path / f"{name}.yaml", '{"word": "own"}')
     with pytest.raises(InputError) as error:
-        project.recipes(data, [word])
+        project.recipes(project.provider.read(project.root / "data" / "set"), [w.format(tmp_path) for w in words])
     assert wrong in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["x" * 240, "two\nlines"], ids=["long", "two lines"])
-def test_a_recipe_whose_name_can_be_no_folder_is_refused(project, tmp_path, name):
-    write(tmp_path / f"{name}.yaml", json.dumps({"word": "a"}))
-    data = project.provider.read(project.root / "data" / "set")
-    with pytest.raises(InputError) as refused:
-        project.recipes(data, [str(tmp_path / f"{name}.yaml")])
-    assert refused.value.cure == "give it another name"
-
-
-def test_two_recipes_of_one_name_are_refused(project):
-    write(project.root / "mine" / "hello.yaml", '{"word": "own"}')
-    data = project.provider.read(project.root / "data" / "set")
-    with pytest.raises(InputError, match="two recipes are called 'hello'"):
-        project.recipes(data, ["hello", str(project.root / "mine" / "hello.yaml")])
-
-
-def test_clean_forgets_the_pictures_too(project):
-    assert make(project, "all") == 0
-    verbs.clean(project, "set")
-    assert made_homes(project) == [] and not (project.build / "set").exists()
-
-
-def test_plan_and_why_name_recipes(project, capsys):
-    verbs.show_plan(project, verbs.Wish("set", ["render"], recipes=["all"]))
-    assert "hello, bye" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("show", [verbs.show_plan, verbs.show_why, verbs.show_status])
@@ -178,6 +152,4 @@ def test_the_whole_pipeline_and_recipes_where_both_are_asked_for(project, capsys
     assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
     assert not (project.build / "set" / "shout" / "bye").exists()
     named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    assert named == [
-        f"shout: {project.build / 'set' / 'shout' / 'hello'}"
-    ]  # the toy has none of the results that are named otherwise
+    assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has no other results to name

@@ -1,4 +1,7 @@
-"""A store that checkouts share: made once, copied by the others, and nobody's loss when it is damaged, read-only or gone."""
+"""Results of others: a store that checkouts share, and results that ship with the source.
+
+Made once, copied by the others, and nobody's loss when it is damaged, read-only or gone.
+"""
 
 import json
 import os
@@ -10,9 +13,12 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
+from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.gc import collect, forget_all
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.store import Store
+from factorlib.runner.shared import MADE_FROM
+from factorlib.runner.store import Store, output_of
+from factorlib.runner.survey import survey
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, state, write
 
@@ -28,21 +34,25 @@ def shared(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.fixture
+def one(tmp_path, shared):
+    """A checkout that has made everything, and so has the shared store."""
+    made = checkout(tmp_path / "one")
+    assert make(made) == 0 and computed(made) == 6 and trees(shared) == trees(made.build / "store")
+    return made
+
+
 def checkout(folder, **texts):
     """A toy that counts how often it computes, in a file that is no part of it."""
     project = make_project(folder, **texts)
-    for name, text in {"upper": toy.UPPER, "count": toy.COUNT, "table": toy.TABLE, "total": toy.TOTAL}.items():
-        write(
-            folder / "stages" / f"{name}.py",
-            text.replace("import msgspec", "import msgspec\nfrom pathlib import Path", 1).replace(
-                "    (out", COUNTED, 1
-            ),
-        )
+    for name in ("upper", "count", "table", "total"):
+        text = (folder / "stages" / f"{name}.py").read_text().replace("    (out", COUNTED, 1)
+        write(folder / "stages" / f"{name}.py", "from pathlib import Path\n" + text)
     return project
 
 
-def make(project, *settings, force=False):
-    return verbs.make(project, verbs.Wish("set", None, list(settings), force))
+def make(project, *settings, force=False, targets=None):
+    return verbs.make(project, verbs.Wish("set", targets, list(settings), force))
 
 
 def computed(project):
@@ -55,10 +65,8 @@ def trees(store):
     return files_of(store / "trees")
 
 
-def test_what_one_checkout_makes_the_other_copies(tmp_path, shared, capsys):
-    one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
-    assert make(one) == 0 and computed(one) == 6
-    assert trees(shared) == trees(one.build / "store") and trees(shared)
+def test_what_one_checkout_makes_the_other_copies_with_its_log(tmp_path, one, capsys):
+    other = checkout(tmp_path / "other")
     verbs.show_plan(other, verbs.Wish("set"))
     assert "not made yet; the shared store has it" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
@@ -67,40 +75,28 @@ def test_what_one_checkout_makes_the_other_copies(tmp_path, shared, capsys):
     assert len((other.build / "set" / "log.jsonl").read_text().splitlines()) == 6, "what it cost is known here too"
 
 
-def test_both_give_and_take(tmp_path, shared):
-    one, other = checkout(tmp_path / "one", a="Alpha", b="Beta"), checkout(tmp_path / "other", a="Alpha", c="Gamma")
-    assert make(one) == 0 and make(other) == 0 and computed(other) == 3  # upper/c, count/c, total
-    write(one.root / "data" / "set" / "c.txt", "Gamma")
-    assert make(one) == 0 and computed(one) == 6 + 1  # total alone
-
-
-def test_warnings_come_with_a_result(tmp_path, shared, capsys):
-    assert make(checkout(tmp_path / "one", a="odd")) == 0
-    capsys.readouterr()
-    other = checkout(tmp_path / "other", a="odd")
-    assert make(other) == 0 and computed(other) == 0 and "a is odd" in capsys.readouterr().err
+def test_both_give_and_take_warnings_too(tmp_path, shared, capsys):
+    first, other = checkout(tmp_path / "first", a="odd", b="Beta"), checkout(tmp_path / "other", a="odd", c="Gamma")
+    assert make(first) == 0 and "a is odd" in capsys.readouterr().err
+    assert make(other) == 0 and computed(other) == 3  # upper/c, count/c, total
+    assert "a is odd" in capsys.readouterr().err
     verbs.show_status(other, verbs.Wish("set"))
     assert "a is odd" in capsys.readouterr().out
+    write(first.root / "data" / "set" / "c.txt", "Gamma")
+    assert make(first) == 0 and computed(first) == 6 + 1  # total alone
 
 
-def test_force_computes(tmp_path, shared):
-    assert make(checkout(tmp_path / "one")) == 0
+@pytest.mark.parametrize("force", [True, False], ids=["forced", "without the variable"])
+def test_nothing_is_copied_where_it_is_forced_or_no_store_is_named(tmp_path, one, monkeypatch, force):
+    if not force:
+        monkeypatch.delenv("FACTORLIB_STORE")
     other = checkout(tmp_path / "other")
-    assert make(other, force=True) == 0 and computed(other) == 6
-
-
-def test_without_the_variable_it_is_not_looked_at(tmp_path, shared, monkeypatch):
-    assert make(checkout(tmp_path / "one")) == 0
-    monkeypatch.delenv("FACTORLIB_STORE")
-    other = checkout(tmp_path / "other")
-    assert make(other) == 0 and computed(other) == 6
+    assert make(other, force=force) == 0 and computed(other) == 6
 
 
 @pytest.mark.parametrize("damage", ["other content", "missing", "a link", "no tree"])
-def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, shared, capsys, damage):
-    one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
-    assert make(one) == 0
-    sound = trees(shared)
+def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, one, shared, capsys, damage):
+    sound, other = trees(shared), checkout(tmp_path / "other")
     file = next((shared / "trees").glob("*/table.json"))
     file.parent.chmod(0o755)
     file.unlink()
@@ -110,56 +106,37 @@ def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, shared, capsys
         file.symlink_to(next((one.build / "store" / "trees").glob("*/table.json")))
     elif damage == "no tree":
         file.parent.rmdir()
-    capsys.readouterr()
-    assert (
-        make(other) == 0
-        and computed(other) == 1
-        and "the shared store's result is not as it was kept" in capsys.readouterr().err
-    )
-    assert files_of(other.build / "set") == files_of(other.build / "set") and trees(other.build / "store") == sound
-    assert trees(shared) == sound
+    assert make(other) == 0 and computed(other) == 1
+    assert "the shared store's result is not as it was kept" in capsys.readouterr().err
+    assert trees(other.build / "store") == trees(shared) == sound
 
 
 @pytest.mark.parametrize("name", ["../../../../escaped", "/tmp/escaped", "a/../../../../../escaped"])
-def test_a_forged_result_writes_nothing_outside(tmp_path, shared, name):
-    one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
-    assert make(one) == 0
+def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared, name):
+    other, files = checkout(tmp_path / "other"), {name: "0" * 32}
     for path in (shared / "keys").iterdir():
         entry = json.loads(path.read_text())
-        files = {name: "0" * 32}
         path.chmod(0o644)
-        path.write_text(json.dumps({**entry, "files": files, "output": _output(files)}))
-    before = set(tmp_path.rglob("*escaped*"))
+        path.write_text(json.dumps({**entry, "files": files, "output": output_of(files)}))
     assert make(other) == 0 and computed(other) == 6
-    assert set(tmp_path.rglob("*escaped*")) == before and not os.path.exists("/tmp/escaped")
+    assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
 
 
-def _output(files):
-    from factorlib.runner.store import output_of
-
-    return output_of(files)
-
-
-def test_a_record_of_another_key_is_not_taken(tmp_path, shared):
-    one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
+def test_a_record_of_another_key_is_not_taken(tmp_path, one, shared):
     assert make(one, "table.scale=3") == 0
-    of_stage = {json.loads(path.read_text())["record"]["stage"]: path for path in (shared / "keys").iterdir()}
-    forged = next(
-        p.key
-        for p in __import__("factorlib.runner.survey", fromlist=["survey"]).survey(other, "set", None, []).planned()
-        if p.step.stage == "table"
-    )
-    shutil.copyfile(of_stage["table"], shared / "keys" / f"{forged}.json")
+    other = checkout(tmp_path / "other")
+    key = next(p.key for p in survey(other, "set", None, []).planned() if p.step.stage == "table")
+    records = {path: json.loads(path.read_text())["record"] for path in (shared / "keys").iterdir()}
+    forged = next(path for path, record in records.items() if record.get("param:scale") == 3)
+    shutil.copyfile(forged, shared / "keys" / f"{key}.json")
     assert make(other) == 0 and (other.build / "set" / "table" / "table.json").read_text() == "2"
 
 
 def test_one_that_vanishes_costs_nothing(tmp_path, shared, capsys):
     project = checkout(tmp_path / "one")
-    text = (project.root / "stages" / "table.py").read_text()
-    write(
-        project.root / "stages" / "table.py",
-        text.replace("    (out", "    import shutil, os; shutil.rmtree(os.environ['FACTORLIB_STORE'])\n    (out", 1),
-    )
+    path = project.root / "stages" / "table.py"
+    vanishes = "    import shutil, os; shutil.rmtree(os.environ['FACTORLIB_STORE'])\n    (out"
+    write(path, path.read_text().replace("    (out", vanishes, 1))
     assert make(project, "upper.sleep=0.5") == 0
     assert not shared.exists() and "the shared store took nothing (it is gone)" in capsys.readouterr().err
     assert (project.build / "set" / "total" / "total.txt").read_text() == "total: 18"
@@ -179,36 +156,67 @@ def test_one_that_is_not_there_is_said_before_anything_runs(tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(os.geteuid() == 0 and shutil.which("setpriv") is None, reason="root writes everywhere")
-def test_one_that_may_only_be_read_is_read(tmp_path, shared):
-    one, other = checkout(tmp_path / "one", a="Alpha"), checkout(tmp_path / "other", a="Alpha", b="Beta")
-    assert make(one) == 0
-    for folder in [shared, *(path for path in shared.rglob("*") if path.is_dir())]:
+def test_one_that_may_only_be_read_is_read(tmp_path, one, shared):
+    other = checkout(tmp_path / "other", a="Alpha", c="Gamma")
+    folders = [shared, *(path for path in shared.rglob("*") if path.is_dir())]
+    for folder in folders:
         folder.chmod(0o555)
-    before = files_of(shared)
+    before, environment = files_of(shared), {**os.environ, "PYTHONPATH": str(LIBRARY)}
     drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
     command = [*drop, sys.executable, toy.__file__, str(other.root), "set"]
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(LIBRARY)}, capture_output=True, text=True, timeout=120
-    )
-    for folder in [shared, *(path for path in shared.rglob("*") if path.is_dir())]:
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    for folder in folders:
         folder.chmod(0o755)
     assert done.returncode == 0 and "warning" not in done.stderr, done.stderr
-    assert computed(other) == 3 and files_of(shared) == before  # upper/b, count/b, total
+    assert computed(other) == 3 and files_of(shared) == before  # upper/c, count/c, total
 
 
-def test_gc_and_clean_leave_it_alone(tmp_path, shared):
-    one, other = checkout(tmp_path / "one"), checkout(tmp_path / "other")
-    assert make(one) == 0 and make(one, "table.scale=3") == 0
+def test_gc_and_clean_leave_it_alone_and_a_store_of_ones_own_is_no_other(tmp_path, one, shared, monkeypatch):
+    assert make(one, "table.scale=3") == 0
     before = files_of(shared)
     collect(one)
     forget_all(one)
     assert files_of(shared) == before
-    assert make(other) == 0 and computed(other) == 0
+    assert make(one) == 0 and computed(one) == 6 + 2
+    monkeypatch.setenv("FACTORLIB_STORE", str(one.build / "store"))
+    assert make(one, "table.scale=4") == 0 and verbs.verify(one, None) == 0
+    assert len(list(Store(one.build / "store").keys.iterdir())) == 8
 
 
-def test_a_store_of_ones_own_is_no_other(tmp_path, monkeypatch):
-    project = checkout(tmp_path / "one")
-    assert make(project) == 0
-    monkeypatch.setenv("FACTORLIB_STORE", str(project.build / "store"))
-    assert make(project, "table.scale=3") == 0 and verbs.verify(project, None) == 0
-    assert len(list(Store(project.build / "store").keys.iterdir())) == 8
+# ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def shipping(tmp_path):
+    """The toy, whose stage `table` has shipped a result that no stage would make: 2 by itself, 7 as shipped."""
+    project = make_project(tmp_path / "root")
+    shipped = "table: {shipped: {folder: stages/tables, made_by: [stages.table]}}"
+    write(project.pipeline_file, toy.PIPELINE.replace("table: {}", shipped))
+    assert make(project, targets=["table"]) == 0 and verbs.ship(project, "table", "set") == 0
+    folder = project.root / "stages" / "tables"
+    (folder / "table.json").write_text("7")
+    stored = json.loads((folder / MADE_FROM).read_text())
+    stored["files"]["table.json"] = hash_of_file(folder / "table.json")
+    (folder / MADE_FROM).write_text(json.dumps(stored))
+    return project
+
+
+@pytest.mark.parametrize(
+    "settings, force, plus, expected",
+    [([], False, 0, 7), ([], True, 0, 2), (["table.scale=3"], False, 0, 3), ([], False, 10, 12)],
+    ids=["as shipped", "forced", "another parameter", "another source"],
+)
+def test_a_shipped_result_is_taken_where_sources_and_parameters_are_its_own(shipping, settings, force, plus, expected):
+    if plus:
+        text = toy.TABLE.replace("dumps(params.scale)", f"dumps(params.scale + {plus})")
+        write(shipping.root / "stages" / "table.py", text)
+    assert make(shipping, *settings, targets=["table"], force=force) == 0
+    assert json.loads((shipping.build / "set" / "table" / "table.json").read_text()) == expected
+
+
+def test_a_shipped_file_that_was_changed_is_an_error_and_what_does_not_ship_is_not_shipped(shipping, capsys):
+    (shipping.root / "stages" / "tables" / "table.json").write_text("8")
+    assert make(shipping, targets=["table"]) == 1
+    assert "is not the file that was shipped" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no result of 'total' ships"):
+        verbs.ship(shipping, "total", "set")
