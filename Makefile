@@ -42,7 +42,7 @@ test-long: .venv/ready
 
 # reads ONLY, LIGHTS and REAL from the environment
 results: .venv/ready
-	@OMP_NUM_THREADS=1 $(PY) -m benchmarks.results
+	@OMP_NUM_THREADS=1 $(PY) -m studies.measured.results
 
 # each reads STUDY, QUICK and FORCE from the environment
 study: .venv/ready

@@ -5,7 +5,7 @@ One rounding error can lead a solve into another local minimum of its loss.  So 
 has had since 2013 (Haswell, Zen; x86-64-v3), and MKL to the code that it runs on processors of any maker.  On other architectures the
 variables mean nothing, and results agree to rounding alone.
 
-They are read when a library is loaded: the runner sets them before its workers start, the tests and benchmarks before they import.
+They are read when a library is loaded: the runner sets them before its workers start, tests and studies before they import.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from scipy.stats import t as student
 
-from benchmarks.tools import exact
+from studies.measured.tools import exact
 from studies.study import Claim, Guess, Rise, Scale, Score, Side, Study, case_name, settings_of
 
 # ── measures ─────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -30,9 +30,9 @@ from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
+from studies.scenes import shapes
 from studies.spheres import GRAZING, NOISE, table_of
 from studies.study import Case, Objects, light_name
-from tests.scenes import shapes
 
 BODIES = ("blob", "jug", "hook")
 SIDE, FILL, FAR = (

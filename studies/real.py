@@ -14,10 +14,10 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.tools import exact, refresh, table
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
+from studies.measured.tools import exact, refresh, table
 
 DOCS, PLACE = LIBRARY / "docs" / "studies.md", "real sets"
 PSNR, FLAT = "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"

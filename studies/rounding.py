@@ -17,12 +17,12 @@ import msgspec
 import numpy as np
 import typer
 
-from benchmarks.tools import exact, refresh, table
 from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from studies.conclusion import MEASURES
+from studies.measured.tools import exact, refresh, table
 from studies.spheres import light_map, materials_of, observations_of
 from studies.steps.score import scored
 from studies.steps.solve import solved

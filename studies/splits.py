@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from benchmarks.tools import threaded
 from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -24,6 +23,7 @@ from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate
+from studies.measured.tools import threaded
 
 CELL, SHARE, MERGE_DEGREES = 0.1, 0.15, 2.0
 DEFAULT = FewLobes(tolerance=1e-3)

@@ -30,7 +30,7 @@ import hashlib, msgspec, torch
 torch.set_num_threads(1)
 from factorlib.reflection import fused
 fused.FLAGS = fused.FLAGS.replace("-march=native", "-march=x86-64-v3")  # an emulated processor's compiler is this one's
-from tests.scenes.hard_cases import CASES, QUICK, answered
+from studies.scenes.hard_cases import CASES, QUICK, answered
 brief = msgspec.structs.replace(QUICK, rounds=1, iterations=3, polish=2, lobes=4, insert=4)
 solution = answered(CASES["1 material × 1 light"](0), brief).solution
 point = solution.point

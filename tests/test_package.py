@@ -18,7 +18,7 @@ from factorlib.lock import lock_text
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-OURS = {"factorlib", "stages", "tests", "benchmarks"}
+OURS = {"factorlib", "stages", "tests", "studies"}
 
 
 def names(requirements):

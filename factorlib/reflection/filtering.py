@@ -28,7 +28,7 @@ from torch.nn.functional import softplus
 from factorlib.reflection.brdf import LEAST_ALPHA, LEAST_COSINE, smith
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 
-# (τ, w) of 1/(1 + x)² ≈ Σ w e^{−τx}: benchmarks/operator_fit.py of version 0.1.0 fitted these
+# (τ, w) of 1/(1 + x)² ≈ Σ w e^{−τx}: studies/measured/operator_fit.py of version 0.1.0 fitted these
 GAUSSIANS = (
     (0.00526739272, 6.63308013e-06),
     (0.0161784582, 0.000251757547),

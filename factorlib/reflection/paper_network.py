@@ -27,7 +27,7 @@ Frame         normals and lobes of every azimuth about the camera's axis, as in 
               would more than halve the specular error (in runs half as long, a median of 1.9 % fell to 0.8 %): the price
               of the symmetry.
 
-`python -m benchmarks.paper_weights` makes the weights again; paper_accuracy.json beside them says what they reach.
+`python -m studies.measured.paper_weights` makes the weights again; paper_accuracy.json beside them says what they reach.
 """
 
 from __future__ import annotations

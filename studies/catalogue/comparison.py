@@ -70,8 +70,8 @@ def try_rates(rates: list[float] = RATES, seed: int = 100, side: int = FULL.side
     import msgspec
     import numpy as np
 
-    from benchmarks.tools import table
     from studies.body import photographed
+    from studies.measured.tools import table
     from studies.spheres import light_map, materials_of
     from studies.steps.optimise import FLAT, optimised
 

@@ -1,6 +1,6 @@
 """Cost: how do time and memory grow with the entries of the matrix?
 
-Varied     the full matrix of n materials in n lights, n = 3 … 40 (9 to 1,600 entries), of small spheres (`tests.scenes.problems.square`), so
+Varied     the full matrix of n materials in n lights, n = 3 … 40 (9 to 1,600 entries), of small spheres (`studies.scenes.problems.square`), so
            that the largest fits in memory and time; with the 6 lobes a light that they are made of, in one round, and as the solver of few
            lobes is by default for the first of them.
 Measured   seconds   of the processor, of all threads between the start of the solve and its end, which other work hardly lengthens
@@ -133,7 +133,7 @@ def measured(seed: int, side: int, solve: dict[str, Any]) -> dict[str, float]:
     from factorlib.solve.few_lobes.history import Run
     from factorlib.solve.few_lobes.options import FewLobes
     from factorlib.solve.few_lobes.solve import few_lobes
-    from tests.scenes.problems import square
+    from studies.scenes.problems import square
 
     operator = reflection_operator("network")
     joint = JointProblem(square(side, operator, seed), operator)

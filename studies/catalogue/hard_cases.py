@@ -1,7 +1,7 @@
 """Hard cases: what becomes of the operator, the solve and alignment where each is hardest?
 
 Varied     the cases of docs/operator.md, docs/solve.md and docs/align.md; seeds are of noise and of poses, the operator's cases have none.
-Measured   by the benchmarks' own measurements; the worst are named below the figure:
+Measured   by the measurements of `studies.measured`; the worst are named below the figure:
            operator   error of the network's values against quadrature, and rounding of its derivatives in float32
            solve      errors of reflectance, of roughness and of re-synthesis, and the largest of these over its bound in the tests
            align      of a photo of each shape, the share of wrong poses and the median error of normals, where a pose can be
@@ -18,7 +18,7 @@ from factorlib.stage import Inputs, Progress
 from studies.steps import Params
 from studies.study import Scale, Score, Setting, Study
 
-CASES = {  # as the benchmarks call them, which a test compares: a plan must not import them
+CASES = {  # as those modules call them, which a test compares: a plan must not import them
     "operator": (
         "none: ordinary", "lobe behind the surface", "lobe on the horizon", "view at n·o = 10⁻⁴", "view along n", "roughness .03", "roughness 1",
         "sharpness 10⁻⁴", "sharpness 10⁶", "lobe along n", "lobe along −n", "lobe along the mirror direction", "lobe along o", "lobe along −o",
@@ -85,8 +85,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def operator(case: dict[str, Any]) -> dict[str, float]:
     """The network in float32."""
-    from benchmarks.operator import made, measures
-    from tests.scenes.operators import case as pairs_of
+    from studies.measured.operator import made, measures
+    from studies.scenes.operators import case as pairs_of
 
     float32, float64 = ({f"network {d}": made("network", d)} for d in ("float32", "float64"))
     of = measures(pairs_of(case["name"]), float32 | float64)["network float32"]
@@ -97,7 +97,7 @@ def solve(case: dict[str, Any]) -> dict[str, float]:
     """With the noise of the seed."""
     import math
 
-    from tests.scenes.hard_cases import BOUNDS, CASES, answered
+    from studies.scenes.hard_cases import BOUNDS, CASES, answered
 
     answer, bound = answered(CASES[case["name"]](case["seed"])), BOUNDS[case["name"]]
     bounds = {e: b for e in ("k", "roughness", "radiance") if (b := getattr(bound, e)) is not None}
@@ -110,8 +110,8 @@ def align(case: dict[str, Any]) -> dict[str, float]:
     """A photo of each shape."""
     from statistics import median
 
-    from benchmarks.align import RIGHT, measured
-    from tests.scenes.shapes import SHAPES
+    from studies.measured.align import RIGHT, measured
+    from studies.scenes.shapes import SHAPES
 
     rows = [measured((case["name"], shape, case["seed"], 0)) for shape in list(SHAPES)[: case["shapes"]]]
     can_be_right = case["name"] in RIGHT

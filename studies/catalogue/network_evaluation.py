@@ -81,13 +81,13 @@ def score_of(seed: int, operator: str, low: float, high: float, samples: int) ->
     import numpy as np
     import torch
 
-    from benchmarks.operator import LOBES as TIMED
-    from benchmarks.operator import point, specular_errors, values_and_gradients
     from factorlib.evaluate.ball import VIEW, ball_normals
     from factorlib.evaluate.picture import picture_error, white_of
     from factorlib.reflection import reflection_operator
     from factorlib.reflection.reference import Reference
     from factorlib.reflection.samples import specular_samples
+    from studies.measured.operator import LOBES as TIMED
+    from studies.measured.operator import point, specular_errors, values_and_gradients
 
     torch.set_num_threads(1)
     network = reflection_operator(operator, dtype="float32")

@@ -4,7 +4,7 @@ Varied     seeds of the solve, ten of them; and the instructions that numerical 
            fixed   what every run has (`factorlib.arithmetic`): AVX2, the same on processors of any maker
            all     what this processor has
            least   kernels for processors without AVX2 in NumPy, OpenBLAS and PyTorch; the compiled network stays as it is
-Measured   the numbers of `benchmarks.reference`, of the whole pipeline on data/synthetic.
+Measured   the numbers of `studies.measured.reference`, of the whole pipeline on data/synthetic.
 
 `python -m studies.catalogue.seeds_and_machines <case as JSON>` measures one case.  Libraries read which instructions they may use when
 they are loaded, so that each case needs a process.
@@ -115,10 +115,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def measured(case: dict[str, Any]) -> dict[str, float]:
     """The numbers by their path in metrics.json, in this process."""
-    from benchmarks.reference import NUMBERS
     from factorlib.evaluate.table import value_at
     from factorlib.jsonfile import read_json
     from stages import align, evaluate, export, masks, render, solve, urm
+    from studies.measured.reference import NUMBERS
     from studies.steps.photos import run_stages
 
     stages = (masks, align, urm, solve, export, render, evaluate)

@@ -11,10 +11,10 @@ from typing import Any
 import jinja2
 import msgspec
 
-from benchmarks.tools import refresh, table
 from factorlib.jsonfile import read_json
 from factorlib.runner.project import LIBRARY
 from studies.conclusion import MEASURES, Conclusion
+from studies.measured.tools import refresh, table
 from studies.run import STUDIES, studies
 from studies.study import FULL, QUICK
 

@@ -6,7 +6,7 @@ import pytest
 
 from factorlib.diagnose.identifiability import tinted_alike
 from factorlib.reflection import reflection_operator
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 NAMES = ("a", "b", "c")
 

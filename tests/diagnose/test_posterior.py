@@ -9,7 +9,7 @@ from factorlib.diagnose.posterior import MODEL_ERROR, Posterior, in_gauge_of
 from factorlib.model.materials import Materials
 from factorlib.model.point import Point
 from factorlib.solve.fit import Schedule, fitted
-from tests.scenes.problems import MATERIALS, factor_between
+from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import FREE, PRIOR, begun, photographed
 
 

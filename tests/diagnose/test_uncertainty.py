@@ -17,7 +17,7 @@ from factorlib.solve.few_lobes.descent import Descent, descend, evaluate
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.solve import few_lobes
-from tests.scenes.problems import MATERIALS, block, factor_between, random_light
+from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
 FEW_LOBES = FewLobes(lobes=16, insert=8, rounds=4, specular="on")

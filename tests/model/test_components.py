@@ -4,7 +4,7 @@ import numpy as np
 
 from factorlib.model.components import connected_components
 from factorlib.reflection import reflection_operator
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 

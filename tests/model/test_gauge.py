@@ -7,7 +7,7 @@ from factorlib.model.gauge import BRIGHTEST, in_gauge
 from factorlib.model.lights import Light
 from factorlib.model.point import Point
 from factorlib.reflection import reflection_operator
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 
 def test_a_lobe_made_sharper_at_its_energy_moves_no_tint():

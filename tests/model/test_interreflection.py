@@ -14,8 +14,8 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.urm.observations import Observations, concatenate
+from studies.scenes.problems import MATERIALS
 from tests.model.made import OPERATOR, bounced_photos
-from tests.scenes.problems import MATERIALS
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])

@@ -7,7 +7,7 @@ from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, even_cells, tangents
 from factorlib.solve.solve import SMALLEST, SPLIT, brightest, on_cells
-from tests.scenes.problems import MATERIALS, block
+from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
 DIRECTIONS = np.random.default_rng(1).normal(size=(2000, 3))

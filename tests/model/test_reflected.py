@@ -13,7 +13,7 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
 from factorlib.model.reflected import NODES, Reflections, lagrange
 from factorlib.model.responses import diffuse_response, specular_response
-from tests.scenes.problems import MATERIALS, block
+from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
 CELLS, ALL = 60, Loss(1e6)  # no outliers

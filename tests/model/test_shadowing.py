@@ -12,7 +12,7 @@ from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.urm.observations import Observations
-from tests.scenes.problems import MATERIALS, random_light, sphere_normals
+from studies.scenes.problems import MATERIALS, random_light, sphere_normals
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 NAMES = ("red", "green", "blue")

@@ -12,7 +12,7 @@ from factorlib.refine import descent
 from factorlib.refine.light import Surfaces, pursued_light
 from factorlib.refine.pixels import View, pixels_of
 from factorlib.reflection import reflection_operator
-from tests.scenes.posed import KINDS, TRUE, normal_error, photographed
+from studies.scenes.posed import KINDS, TRUE, normal_error, photographed
 
 OPERATOR = reflection_operator("network")
 

@@ -8,7 +8,7 @@ import numpy as np
 from factorlib.refine.descent import projected_equations
 from factorlib.refine.light import Surfaces, pursued_light, together, with_weights
 from factorlib.reflection import reflection_operator
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 SURFACES = Surfaces(MATERIALS, OPERATOR)

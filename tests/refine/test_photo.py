@@ -12,7 +12,7 @@ from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Scene, refined_photo
 from factorlib.refine.pixels import View, pixels_of
 from factorlib.reflection import reflection_operator
-from tests.scenes.posed import KINDS, TRUE, normal_error, photographed, refined_of
+from studies.scenes.posed import KINDS, TRUE, normal_error, photographed, refined_of
 
 OPERATOR = reflection_operator("network")
 

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.operator import made
 from factorlib.reflection import reflection_operator
-from tests.scenes import operators as laws
-from tests.scenes.operators import ALL, CASES, answers, case, gradient_error, reference_values, value_error
+from studies.measured.operator import made
+from studies.scenes import operators as laws
+from studies.scenes.operators import ALL, CASES, answers, case, gradient_error, reference_values, value_error
 
 COMPILED, TORCH = (
     reflection_operator("network"),

@@ -1,6 +1,6 @@
 """The whole pipeline on data/synthetic, by the runner as a user runs it.
 
-Its numbers are compared with those stored of the last run and what seeds change of them (`benchmarks.reference`), and with the
+Its numbers are compared with those stored of the last run and what seeds change of them (`studies.measured.reference`), and with the
 bounds of `evaluate.table`, which are how good it must be at worst.  The run uses the project's own build/, so that what is
 current there is not made again: keys are by content.
 """
@@ -11,10 +11,10 @@ import os
 import subprocess
 import sys
 
-from benchmarks.reference import complaint, differences, read_stored
 from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
 from factorlib.jsonfile import read_json
 from factorlib.runner.project import LIBRARY
+from studies.measured.reference import complaint, differences, read_stored
 
 
 def test_every_number_is_as_stored_and_every_bound_holds():

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.viewer import CHROMIUM, opened
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.stage import Inputs, silent
 from stages import evaluate, report
+from studies.measured.viewer import CHROMIUM, opened
 from tests.evaluate.made_artifacts import Made, make_artifacts
 
 CONTENTS = {

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.viewer import CHROMIUM, ball_seen, error, opened, rendered, shown
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.gltf import write_glb
@@ -24,6 +23,7 @@ from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import forms
 from factorlib.report.pictures import light_row
+from studies.measured.viewer import CHROMIUM, ball_seen, error, opened, rendered, shown
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
 from tests.report.test_page import page_of, run
 

@@ -14,7 +14,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve.fit import Fit, Hyperparameters, field_of, start_of
 from factorlib.solve.marginal import Field
 from factorlib.solve.start import constant_light
-from tests.scenes.problems import MATERIALS, block
+from studies.scenes.problems import MATERIALS, block
 
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()

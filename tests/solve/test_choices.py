@@ -18,8 +18,8 @@ from factorlib.solve.evidence import AGAINST, FOR
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.urm.observations import Observations
+from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.model.test_shadowing import bowls, rough_light
-from tests.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)

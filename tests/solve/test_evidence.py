@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from factorlib.model.point import Point
 from factorlib.solve.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
-from tests.scenes.problems import MATERIALS
+from studies.scenes.problems import MATERIALS
 from tests.solve.made import photographed
 
 

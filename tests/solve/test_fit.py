@@ -13,7 +13,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
 from factorlib.solve.marginal import marginal
 from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS, DIFFUSE, LEVEL, TINT, MaterialPrior, unknowns_of
-from tests.scenes.problems import MATERIALS, factor_between
+from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import FEW, FREE, OPERATOR, PRIOR, START, begun, field, photographed, spheres
 
 WHOLE, QUICK, LIGHTS = Schedule(4, (14, 10)), Schedule(4, (8, 6)), Schedule(together=(0, 10, 10))

@@ -6,7 +6,7 @@ import pytest
 from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Materials
 from factorlib.solve.fit import Fit, Schedule, fitted
-from tests.scenes.problems import MATERIALS, factor_between
+from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import FEW, FREE, PRIOR, START, begun, light_of, on_even_cells, spheres
 
 WHOLE = Schedule(4, (14, 10))

@@ -8,7 +8,7 @@ from factorlib.model.clusters import clusters_of
 from factorlib.model.problem import JointProblem
 from factorlib.solve.marginal import EXPOSURE, TONE, marginal
 from factorlib.solve.material_prior import materials_of, unknowns_of
-from tests.scenes.problems import MATERIALS
+from studies.scenes.problems import MATERIALS
 from tests.solve.made import OPERATOR, PRIOR, at, drawn, field, on_even_cells, photographed, spheres
 
 CELLS = 50

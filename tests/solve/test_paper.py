@@ -6,7 +6,7 @@ import torch
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.paper import Paper, PaperObjective, drawn, inverse_hessian_times, solve
-from tests.scenes.problems import MATERIALS, block, factor_between, random_light
+from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 EXACT = reflection_operator("closed_form", dtype="float64")

@@ -14,7 +14,7 @@ from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.stage import serial_map
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 from tests.solve.made import OPERATOR, PRIOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)

@@ -7,7 +7,7 @@ from factorlib.solve.evidence import FINER
 from factorlib.solve.fit import Schedule, fitted
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import SPLIT, Run, Told, split_while_gaining
-from tests.scenes.problems import MATERIALS
+from studies.scenes.problems import MATERIALS
 from tests.solve.made import FREE, PRIOR, begun, light_of, spheres
 
 CELLS, SHOWN = 60, [1, 2]

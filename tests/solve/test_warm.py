@@ -16,7 +16,7 @@ from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, from_nothing, solve
 from factorlib.solve.warm import from_earlier, known_point, with_decided
-from tests.scenes.problems import MATERIALS, factor_between
+from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40

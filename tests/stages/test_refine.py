@@ -17,7 +17,7 @@ from factorlib.reflection.network import SHIPPED
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, silent
 from stages import align, refine
-from tests.scenes.posed import TRUE, photographed
+from studies.scenes.posed import TRUE, photographed
 from tests.stages.made import chair_facts, entry_of, write_masks
 
 NAMES = ["red", "green", "blue"]

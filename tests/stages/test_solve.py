@@ -20,7 +20,7 @@ from factorlib.solve.evidence import FOR
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
-from tests.scenes.problems import MATERIALS, random_light, sphere_normals
+from studies.scenes.problems import MATERIALS, random_light, sphere_normals
 
 NAMES = ("red", "green", "blue")
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.align import RIGHT, WRONG
 from factorlib.arithmetic import VARIABLES
 from factorlib.evaluate.gauge import connected_components
 from factorlib.runner.closure import Sources
@@ -19,11 +18,12 @@ from studies.catalogue import comparison, cost, hard_cases, leave_one_out, netwo
 from studies.catalogue.paper_sets import patterns
 from studies.catalogue.structure import PATTERNS, random
 from studies.conclusion import MEASURES
+from studies.measured.align import RIGHT, WRONG
 from studies.run import STUDIES, sets_of, studies
+from studies.scenes import hard_cases as solve_cases
+from studies.scenes import operators as operator_cases
 from studies.splits import CHANGES
 from studies.study import FULL, QUICK, Case, Objects, light_name
-from tests.scenes import hard_cases as solve_cases
-from tests.scenes import operators as operator_cases
 
 SCALES = pytest.mark.parametrize("scale", [FULL, QUICK], ids=["full", "quick"])
 EVERY = pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))

@@ -13,11 +13,11 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.viewer import CHROMIUM, opened
 from factorlib.errors import InputError
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.runner.project import LIBRARY
+from studies.measured.viewer import CHROMIUM, opened
 from studies.steps.compare import Asked, ScoredShot
 from studies.study import QUICK
 from studies.user_study.__main__ import digest, trials

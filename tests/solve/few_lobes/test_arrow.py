@@ -20,7 +20,7 @@ from factorlib.solve.few_lobes.unknowns import (
     moved_point,
     unknowns,
 )
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 DAMPING = 1e-2

@@ -14,7 +14,7 @@ from factorlib.solve.few_lobes.descent import descend
 from factorlib.solve.few_lobes.history import Run
 from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.solve import few_lobes
-from tests.scenes.problems import block, random_light
+from studies.scenes.problems import block, random_light
 
 OPERATOR = reflection_operator("network")
 MIXED = Materials(

@@ -17,7 +17,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import write_observations
 from stages import solve as stage
-from tests.scenes.hard_cases import (
+from studies.scenes.hard_cases import (
     BOUNDS,
     CASES,
     FLAT,

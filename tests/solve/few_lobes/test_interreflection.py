@@ -10,8 +10,8 @@ from factorlib.model.materials import Materials
 from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.jacobian import fit_loss, responses, with_light
 from factorlib.solve.few_lobes.normal_equations import energy_equations, normal_equations, with_weights_fitted
+from studies.scenes.problems import MATERIALS
 from tests.model.made import OPERATOR, bounced_photos
-from tests.scenes.problems import MATERIALS
 
 LOSS = Loss(robust_scale=3.0, prior=0.0)
 

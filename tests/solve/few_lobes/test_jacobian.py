@@ -9,8 +9,8 @@ from factorlib.model.materials import Materials
 from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.jacobian import fit_loss, linearise, with_light
 from factorlib.solve.few_lobes.normal_equations import normal_equations
+from studies.scenes.problems import MATERIALS
 from tests.model.made import clipped_photos
-from tests.scenes.problems import MATERIALS
 
 LOSS = Loss(robust_scale=3.0, prior=0.05)
 UNTINTED = Loss(robust_scale=3.0, prior=0.0)  # the tint prior takes Ē to be constant, so it is no part of a difference

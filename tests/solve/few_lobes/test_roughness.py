@@ -10,7 +10,7 @@ from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.roughness import materials_of_best_roughness, reflectances
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("network")
 

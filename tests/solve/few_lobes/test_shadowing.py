@@ -16,8 +16,8 @@ from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
 from factorlib.solve.few_lobes.jacobian import fit_loss
 from factorlib.solve.few_lobes.normal_equations import normal_equations
 from factorlib.solve.few_lobes.unknowns import moved_light
+from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.test_shadowing import bowls, rough_light
-from tests.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=3.0, prior=0.0)

@@ -15,7 +15,7 @@ from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.rounds import answer_of, chosen_round, gained
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.stage import serial_map
-from tests.scenes.problems import MATERIALS, block, factor_between, random_light
+from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 QUICK = FewLobes(lobes=12, insert=6, rounds=3, iterations=20, polish=60, tolerance=1e-5)

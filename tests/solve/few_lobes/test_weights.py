@@ -15,7 +15,7 @@ from factorlib.solve.few_lobes.normal_equations import (
     normal_equations,
     with_weights_fitted,
 )
-from tests.scenes.problems import MATERIALS, block, random_light
+from studies.scenes.problems import MATERIALS, block, random_light
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 LOSS = Loss(robust_scale=1e6, prior=0.0)

@@ -29,7 +29,7 @@ from factorlib.solve.few_lobes.options import FewLobes
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations
-from tests.scenes.problems import sphere_normals
+from studies.scenes.problems import sphere_normals
 
 OPERATOR = reflection_operator("network")
 QUICK = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)

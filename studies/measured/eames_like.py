@@ -6,7 +6,7 @@ captured    with LIGHTS, folders of captured lat-long maps: the same of the next
             by its seed.  The prior on lights of such a set is fitted to the other maps alone, in a copy of the project
 
 Each set runs through the pipeline once with the default seed of the solve; what is current is not run again.  Sets lie in
-build/bench/eames-like, results in build/ (of captured ones in the copies).  `python -m benchmarks.eames_like [seed …]` prints the table of
+build/bench/eames-like, results in build/ (of captured ones in the copies).  `python -m studies.measured.eames_like [seed …]` prints the table of
 data/eames and of sets of these seeds, in made light or, with LIGHTS, in captured light.
 """
 
@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.standard_errors import light_deviations, material_deviations
-from benchmarks.tools import ROOT, Tables, evaluated, table
 from factorlib.errors import InputError
 from factorlib.evaluate.table import value_at
 from factorlib.jsonfile import write_json
 from factorlib.light_prior import maps_in, prior_of
+from studies.measured.standard_errors import light_deviations, material_deviations
+from studies.measured.tools import ROOT, Tables, evaluated, table
 
 PLACE = ROOT / "build/bench/eames-like"
 SEEDS, CAPTURED_SEEDS = (101, 102, 103, 104, 105), (106, 107, 108, 109, 110)
@@ -93,7 +93,9 @@ class Set(NamedTuple):
         """A number of the results.  InputError where it is missing."""
         if (value := value_at(self.metrics, path)) is None:
             file = self.results / "evaluate/metrics.json"
-            raise InputError("there is no such number", file=file, key=path, cure="correct benchmarks/eames_like.py")
+            raise InputError(
+                "there is no such number", file=file, key=path, cure="correct studies/measured/eames_like.py"
+            )
         return value
 
 

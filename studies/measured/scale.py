@@ -1,10 +1,10 @@
-"""How runs grow on a cluster: `make results ONLY=scale` sends the sets of `tests/scenes/balls.py` through masks, align, urm and solve.
+"""How runs grow on a cluster: `make results ONLY=scale` sends the sets of `studies/scenes/balls.py` through masks, align, urm and solve.
 
 A Dask scheduler and two workers of one core are started on this machine, each a process of its own over TCP.  Measured are processor
 seconds and peak memory of steps, workers, scheduler and the run itself, how many tasks there were and what travelled.  The first size runs
 in this machine's processes too, and every byte is compared.  Processor seconds do not depend on what else the machine does.
 
-`python -m benchmarks.scale FOLDER BUILD [setting …]` runs the stages up to `solve` on the data set in FOLDER with a store of its own in BUILD, so
+`python -m studies.measured.scale FOLDER BUILD [setting …]` runs the stages up to `solve` on the data set in FOLDER with a store of its own in BUILD, so
 that all is made anew and no user's result is touched.
 """
 
@@ -26,12 +26,12 @@ from typing import Any
 import msgspec
 import psutil
 
-from benchmarks.tools import ROOT, Tables, exact
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.cluster import QUIET
 from factorlib.runner.project import Project, photo_sets
-from tests.scenes.balls import write_set
+from studies.measured.tools import ROOT, Tables, exact
+from studies.scenes.balls import write_set
 
 FOLDER = ROOT / "build" / "bench" / "scale"
 SIZES, MANY, MATERIALS, WORKERS = (50, 1000), 100_000, 100, 2
@@ -46,7 +46,7 @@ ROLES = {  # word of the command line -> what the process is for; the first that
     "dask_worker": "workers",
     "spawn_main": "workers",
     "resource_tracker": "workers",
-    "benchmarks.scale": "run",
+    "studies.measured.scale": "run",
 }
 
 
@@ -104,7 +104,7 @@ def measured(folder: Path, build: Path, settings: list[str]) -> Measured:
     """A run from nothing, and what it cost.  InputError where it fails."""
     shutil.rmtree(build, ignore_errors=True)
     watch = Watch()
-    command = [sys.executable, "-m", "benchmarks.scale", str(folder), str(build), SETTINGS, *settings]
+    command = [sys.executable, "-m", "studies.measured.scale", str(folder), str(build), SETTINGS, *settings]
     code, costs = subprocess.run(command, cwd=ROOT, check=False).returncode, watch.close()
     if code:
         raise InputError("the run failed: see above", file=folder)

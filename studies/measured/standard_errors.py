@@ -1,4 +1,4 @@
-"""Whether standard errors say how wrong results are: `python -m benchmarks.standard_errors build/eames [build/…] [--other FOLDER]`.
+"""Whether standard errors say how wrong results are: `python -m studies.measured.standard_errors build/eames [build/…] [--other FOLDER]`.
 
 For each folder of results, which `make evaluate` made of a data set with a truth: the share of k_d, k_s, roughnesses and of the light
 maps' log radiances, in `CELLS` cells and after the factor per channel that is free, that lie within one standard error of the truth.

@@ -1,4 +1,4 @@
-"""Special cases of the reflection operators and laws of theirs, which tests hold them to and `benchmarks.operator` measures.
+"""Special cases of the reflection operators and laws of theirs, which tests hold them to and `studies.measured.operator` measures.
 
 Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), as lobe, view and normal turn.  Formulas break at
 grazing views, mirrors, lobes of no width or of all, and lobes along every special direction: a case differs from the ordinary in one

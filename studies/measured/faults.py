@@ -15,8 +15,8 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.tools import ROOT, Tables
 from factorlib.errors import InputError
+from studies.measured.tools import ROOT, Tables
 
 TESTS = ("test_nothing_lost", "test_no_room", "test_real_kills", "test_reruns", "test_fuzz")
 COLUMNS = {  # table in the log -> its title, and the head of the first column with those of the numbers, by field

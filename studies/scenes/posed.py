@@ -31,7 +31,7 @@ from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection.operator import Operator
-from tests.scenes import shapes
+from studies.scenes import shapes
 
 WIDTH, HEIGHT = 320, 240
 NOISE = 0.01

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from factorlib.runner.project import LIBRARY
+from studies.scenes.balls import write_set
 from tests.runner.toy import files_of
-from tests.scenes.balls import write_set
 
 SMALL = (
     "urm.directions=0 solve.solver=few_lobes solve.lobes=4 solve.insert=4 solve.rounds=1 solve.iterations=3 solve.polish=1 solve.settle=1 solve.sample=200 "
@@ -21,7 +21,7 @@ SMALL = (
 
 
 def run(folder, build, *settings):
-    command = [sys.executable, "-m", "benchmarks.scale", str(folder), str(build), SMALL, *settings]
+    command = [sys.executable, "-m", "studies.measured.scale", str(folder), str(build), SMALL, *settings]
     return subprocess.run(
         command, cwd=LIBRARY, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False
     )

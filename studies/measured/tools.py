@@ -17,7 +17,7 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.results.metrics import read_metrics
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
 
 

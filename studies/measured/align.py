@@ -1,6 +1,6 @@
 """Poses against rendered truth: success, doubts, time.  `make results ONLY=align`.
 
-Photographed are the shapes of `tests/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal lengths
+Photographed are the shapes of `studies/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal lengths
 log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without any of these.
 
     exact      the mesh that was photographed                   rough          500 triangles, warped by 3 %
@@ -21,15 +21,15 @@ from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks.tools import Clock, Tables, exacts
 from factorlib.align.place import KnownFocal, ObjectToPlace, placed
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
 from factorlib.align.trust import doubts, trust_in
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.meshes.mesh import Mesh
-from tests.scenes import shapes
-from tests.scenes.shapes import SHAPES
+from studies.measured.tools import Clock, Tables, exacts
+from studies.scenes import shapes
+from studies.scenes.shapes import SHAPES
 
 WIDTH, HEIGHT = 640, 480
 FOCALS = (0.8, 2.5)  # of the width

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
-from benchmarks.tools import ROOT, Tables
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
@@ -27,6 +26,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance, read_materials, reflectances
+from studies.measured.tools import ROOT, Tables
 
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 FLAGS = [

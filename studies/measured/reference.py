@@ -1,4 +1,4 @@
-"""The numbers of data/synthetic that a run must reproduce: `python -m benchmarks.reference "why they changed"` writes them anew.
+"""The numbers of data/synthetic that a run must reproduce: `python -m studies.measured.reference "why they changed"` writes them anew.
 
 It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again) and writes
 tests/regression/synthetic.json: of each number its value with the default seed, its range and deviation over seeds, the tolerance that
@@ -20,14 +20,14 @@ import msgspec
 import numpy as np
 from scipy.stats import t as student
 
-from benchmarks.tools import ROOT, Tables, evaluated
 from factorlib.errors import InputError
 from factorlib.evaluate.table import SYNTHETIC, value_at
 from factorlib.jsonfile import read_json, write_json
+from studies.measured.tools import ROOT, Tables, evaluated
 
 DATASET, SEEDS, DOUBT = "synthetic", 5, 0.01
 STORED = ROOT / "tests" / "regression" / "synthetic.json"
-COMMAND = '.venv/bin/python -m benchmarks.reference "why the numbers changed"'
+COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 NUMBERS = {  # dotted path in metrics.json -> meaning
     **{bound.path: bound.meaning for bound in SYNTHETIC},
     "materials.mean_roughness": "roughness, mean over materials",
@@ -100,7 +100,7 @@ def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored
     values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
     if missing := [path for path, of in values.items() if None in of]:
         raise InputError(
-            "there is no such number", file=Path("metrics.json"), key=missing[0], cure="correct NUMBERS in benchmarks/reference.py"
+            "there is no such number", file=Path("metrics.json"), key=missing[0], cure="correct NUMBERS in studies/measured/reference.py"
         )  # fmt: skip
     numbers = {
         p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()

@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import results
-from benchmarks.eames_like import MAPS, drawn, folder_of
-from benchmarks.standard_errors import light_deviations, material_deviations
-from benchmarks.tools import refresh
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from studies.measured import results
+from studies.measured.eames_like import MAPS, drawn, folder_of
+from studies.measured.standard_errors import light_deviations, material_deviations
+from studies.measured.tools import refresh
 
 
 def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
     page = tmp_path / "results.md"
     page.write_text(before := results.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
     for name in results.SECTIONS:
-        assert find_spec(f"benchmarks.{name}")
+        assert find_spec(f"studies.measured.{name}")
         inner = before.partition(f"<!-- begin {name} -->\n")[2].partition(f"\n<!-- end {name} -->")[0]
         refresh(page, {name: inner})
         assert page.read_text(encoding="utf-8") == before

@@ -1,6 +1,6 @@
 """All measured tables, as docs/results.md: `make results`, or `make results ONLY="operator align"` for some of its sections.
 
-A section is the function `rows()` of one module of `benchmarks`, which gives its tables.  On top of it stand the version, the commit, the
+A section is the function `rows()` of one module of `studies.measured`, which gives its tables.  On top of it stand the version, the commit, the
 date and the kind of machine that it was measured on.  A section that needs what is not here (LIGHTS, REAL: see its module)
 is left as it was, and named at the end.  All of it takes many hours.
 """
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.tools import ROOT, Tables, refresh, table
 from factorlib.errors import InputError, did_you_mean
+from studies.measured.tools import ROOT, Tables, refresh, table
 
 PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
@@ -62,7 +62,7 @@ def main() -> int:
     for name in wanted:
         start = time.perf_counter()
         try:
-            tables = import_module(f"benchmarks.{name}").rows()
+            tables = import_module(f"studies.measured.{name}").rows()
         except (InputError, SystemExit) as error:
             left[name] = error
             continue

@@ -1,6 +1,6 @@
 """Whether shading mends poses and leaves right ones alone, and whether contours mend proportions: `make results ONLY=refine`.
 
-Poses: sets of four photos of `tests/scenes/posed.py`, refined as `refine` does, with materials that were solved with the wrong poses.
+Poses: sets of four photos of `studies/scenes/posed.py`, refined as `refine` does, with materials that were solved with the wrong poses.
 Proportions: photos of a shape with a mesh of it, one axis of which is too long.  Poses and focal lengths are searched with the wrong
 mesh, as `align` does; then factors of the axes are fitted, as `fit_mesh` does.
 """
@@ -13,8 +13,6 @@ import zlib
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.align import FILLS, normal_error_deg, photographed
-from benchmarks.tools import Tables, exacts
 from factorlib.align.proportions import Sighting, proportions
 from factorlib.align.search import find, focal_prior
 from factorlib.align.silhouette import Silhouette
@@ -33,7 +31,9 @@ from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
-from tests.scenes import posed, shapes
+from studies.measured.align import FILLS, normal_error_deg, photographed
+from studies.measured.tools import Tables, exacts
+from studies.scenes import posed, shapes
 
 SETS = 3
 PHOTOS, OFF, ROUGH_OFF = 4, (1.0, 1.1, 1.15), (1.0, 1.12)

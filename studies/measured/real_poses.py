@@ -20,8 +20,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from benchmarks.align import normal_error_deg, share
-from benchmarks.tools import Clock, Tables, needed
 from factorlib.align.coarse import toward
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
@@ -35,6 +33,8 @@ from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.stage import Inputs, silent
 from stages import align, masks
+from studies.measured.align import normal_error_deg, share
+from studies.measured.tools import Clock, Tables, needed
 
 REFERENCE = "reference_poses.json"
 CURE = "name a dataset whose poses are known, as align's poses.json has them"

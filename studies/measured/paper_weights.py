@@ -1,4 +1,4 @@
-"""Make the weights of the paper's operator again: `python -m benchmarks.paper_weights`.
+"""Make the weights of the paper's operator again: `python -m studies.measured.paper_weights`.
 
 200,000 pixels of 4000 spheres rendered by Mitsuba, two networks, a few minutes of one core.  The errors against the reference over
 `factorlib.reflection.samples` are written beside the weights, in paper_accuracy.json.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from benchmarks.operator import diffuse_errors, specular_errors
 from factorlib.conventions import FRONT, half_of_normal_and_view
 from factorlib.generate.lobe_spheres import random_spheres, rendered
 from factorlib.jsonfile import write_json
@@ -19,6 +18,7 @@ from factorlib.reflection.paper_network import diffuse_inputs, specular_inputs
 from factorlib.reflection.paper_training import Examples, trained
 from factorlib.reflection.samples import diffuse_samples, specular_samples
 from factorlib.reflection.training import Schedule
+from studies.measured.operator import diffuse_errors, specular_errors
 
 SPHERES, PIXELS = 4000, 50
 SCHEDULES = {

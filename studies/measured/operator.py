@@ -17,7 +17,6 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from benchmarks.tools import Tables, exact
 from factorlib.errors import InputError
 from factorlib.reflection import Operator, reflection_operator
 from factorlib.reflection.accuracy import QUANTILES, diffuse_table, quantiles, specular_table
@@ -25,7 +24,8 @@ from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.operator import NAMES
 from factorlib.reflection.reference import Reference
 from factorlib.reflection.samples import DiffuseSamples, Samples, diffuse_samples, specular_inputs, specular_samples
-from tests.scenes import operators as laws
+from studies.measured.tools import Tables, exact
+from studies.scenes import operators as laws
 
 REFERENCE, FAST = "reference", [name for name in NAMES if name != "reference"]
 TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, REFERENCE: 1e-7}
@@ -161,7 +161,7 @@ def microseconds(operators: dict[str, Operator]) -> dict[str, list[tuple[float, 
     return {k: [(min(t), statistics.median(t)) for t in pair] for k, pair in zip(operators, pairs, strict=True)}
 
 
-# ── Special cases and laws of `tests/scenes/operators.py`, which `tests/reflection/test_stability.py` has bounds for ─────────────────────
+# ── Special cases and laws of `studies/scenes/operators.py`, which `tests/reflection/test_stability.py` has bounds for ─────────────────────
 
 
 def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool = True) -> dict[str, dict[str, float]]:
