@@ -25,6 +25,7 @@ PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
+    "exact_sets": "Exact sets: cells and few lobes",
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
