@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long results study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long size results study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph logs params new compare validate verify $(STAGES): .venv/ready
@@ -41,6 +41,9 @@ test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
 # reads ONLY, LIGHTS and REAL from the environment
+size: .venv/ready
+	@$(PY) -m studies.measured.size
+
 results: .venv/ready
 	@OMP_NUM_THREADS=1 $(PY) -m studies.measured.results
 
@@ -74,6 +77,7 @@ help:
 	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
+	@echo 'make size                            how long each part is, beside its budget'
 	@echo 'make results [ONLY=operator]          measure what docs/results.md shows, all of it (hours) or one section, and write it there'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
 	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
