@@ -350,6 +350,17 @@ def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, An
     return others
 
 
+def recorded(default: Any) -> Any:
+    """A default as a key's record has it: what is unknown is told from a text that is known.
+
+    >>> recorded({"size": Unknown("3"), "name": "3"})
+    {'size': {'text': '3'}, 'name': '3'}
+    """
+    if isinstance(default, dict):
+        return {name: recorded(value) for name, value in default.items()}
+    return {"text": str(default)} if isinstance(default, Unknown) else default
+
+
 def _same(value: Any, default: Any) -> bool:
     """Whether they are one value to a field with that default: a whole number will do for any number, 1 is not true, -0.0 not 0.0."""
     if isinstance(value, list) and isinstance(default, list):

@@ -13,7 +13,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain
-from factorlib.runner.closure import Packages, Sources, other_than
+from factorlib.runner.closure import Packages, Sources, other_than, recorded
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import (
@@ -172,7 +172,7 @@ def _records(
         record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record()
         record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
         record |= {f"param:{param}": value for param, value in values.items()}
-        record |= {f"default:{param}": value for param, value in defaults[name].items()}
+        record |= {f"default:{param}": recorded(value) for param, value in defaults[name].items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
                 words = f"name a folder with {', '.join(stage.given[param])}, such as the result of an earlier run of the stage"

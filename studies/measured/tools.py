@@ -16,6 +16,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.results.metrics import read_metrics
+from factorlib.wholefile import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
@@ -62,7 +63,7 @@ def refresh(path: Path, parts: dict[str, str]) -> None:
         if begin not in text or end not in text:
             raise InputError(f"no place for the table '{name}'", file=path, cure=f"add {begin.strip()} and {end}")
         text = text.partition(begin)[0] + begin + inner + "\n" + end + text.partition(end)[2]
-    path.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def needed(name: str, what: str) -> list[str]:

@@ -35,7 +35,7 @@ from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.lights import compare_lights
 from factorlib.evaluate.materials import GREY
 from factorlib.evaluate.picture import picture_error, white_of
-from factorlib.evaluate.relighting import Appearances
+from factorlib.evaluate.relighting import INSIDE, Appearances
 from factorlib.images.picture import picture, png_bytes, read_png, write_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import Reflectance, Solved, read_materials
@@ -128,7 +128,7 @@ class Spheres:
         self.case, self.answer, self.truths = case, answer, truths
         self.true = {li: Appearances(light) for li, light in lights.items()}
         self.recovered = {li: Appearances(light) for li, light in answer.lights.items()}
-        self.inside = next(iter(self.true.values())).inside
+        self.inside = INSIDE
 
     def truth(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
         """Radiance of a true material in a true light, a row for each pixel inside the disc."""
