@@ -13,12 +13,13 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from factorlib.dataset.schema import LightSlice
+from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.ball import ball, ball_normals, observed_cells
+from factorlib.render.ball import ball, observed_cells
 from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised

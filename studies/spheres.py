@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import Light, ball, ball_normals, light_of_lat_long
+from factorlib.evaluate.ball import Light, ball, light_of_lat_long
 from factorlib.generate.lights import random_light, random_materials
+from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import Material, look

@@ -20,7 +20,7 @@ from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from factorlib.conventions import alpha_of_roughness, lat_long_directions, lat_long_solid_angles
 
@@ -100,15 +100,6 @@ def radiance_toward(
 ) -> Float[np.ndarray, "*n 3"]:
     """Radiance averaged over about `solid_angle` steradians around unit `direction`."""
     return lookup_toward(direction, solid_angle).of(light)
-
-
-def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
-    """Normals, in the light's frame, of the pixels whose centre is on the ball that fills the picture, and those pixels."""
-    at = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(at, -at)
-    inside = x * x + y * y < 1
-    x, y = x[inside], y[inside]
-    return np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1), inside
 
 
 def diffuse_ball(light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -22,7 +22,6 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_of_direction
 from factorlib.evaluate.ball import (
     WIDE_SIDE,
     Light,
-    ball_normals,
     constant_light,
     diffuse_ball,
     glossy_ball,
@@ -30,7 +29,7 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
 )
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.geometry.sphere import mirror_directions
+from factorlib.geometry.sphere import ball_normals, mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4

@@ -29,9 +29,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, NarrowLobe, WideLobe, ball_normals, diffuse_ball, glossy_lobe
+from factorlib.evaluate.ball import Light, NarrowLobe, WideLobe, diffuse_ball, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
+from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance, Vec3
 from factorlib.results.metrics import Kinds, Relighting, RelitBall, RelitSet
 

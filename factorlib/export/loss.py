@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import ball_normals
 from factorlib.export.viewers import MODELS, Angles, Model, distribution, filed, mirrored, solved, spread
+from factorlib.geometry.sphere import ball_normals
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 

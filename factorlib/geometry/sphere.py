@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
@@ -51,3 +51,16 @@ def direction_cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.
     v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
     step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
     return np.floor(np.column_stack([u, v, fold]) / np.array([step, step, 1.0])).astype(np.int64)
+
+
+def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
+    """Normals of the pixels whose centre is on the ball that fills the picture, and those pixels; +y is up, +z toward the viewer.
+
+    >>> ball_normals(1)[0].tolist()
+    [[0.0, -0.0, 1.0]]
+    """
+    at = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(at, -at)
+    inside = x * x + y * y < 1
+    x, y = x[inside], y[inside]
+    return np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1), inside

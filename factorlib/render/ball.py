@@ -10,28 +10,17 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_closing
 
 from factorlib.conventions import FRONT
+from factorlib.geometry.sphere import ball_normals
 from factorlib.reflection.operator import MaterialLike
 from factorlib.render.reflect import Reflector
 
 GAP = 6  # cells: the widest gap between observed normals that counts as observed
 
 
-def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
-    """Normals of the pixels whose centres lie on a ball that fills the picture, and those pixels.
-
-    >>> ball_normals(1)[0].tolist()
-    [[0.0, 0.0, -1.0]]
-    """
-    at = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(at, at)
-    inside = x * x + y * y < 1
-    x, y = x[inside], y[inside]
-    return np.stack([x, y, -np.sqrt(1 - x * x - y * y)], axis=-1), inside
-
-
 def ball(reflector: Reflector, material: MaterialLike, size: int) -> Float[np.ndarray, "size size 3"]:
     """Radiance; zero beside the ball."""
     normals, inside = ball_normals(size)
+    normals = normals * (1, -1, -1)  # in the camera's frame
     picture = np.zeros((size, size, 3))
     picture[inside] = reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
     return picture

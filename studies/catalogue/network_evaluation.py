@@ -81,8 +81,9 @@ def score_of(seed: int, operator: str, low: float, high: float, samples: int) ->
     import numpy as np
     import torch
 
-    from factorlib.evaluate.ball import VIEW, ball_normals
+    from factorlib.evaluate.ball import VIEW
     from factorlib.evaluate.picture import picture_error, white_of
+    from factorlib.geometry.sphere import ball_normals
     from factorlib.reflection import reflection_operator
     from factorlib.reflection.reference import Reference
     from factorlib.reflection.samples import specular_samples

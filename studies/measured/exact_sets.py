@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorlib.conventions import FRONT
+from factorlib.evaluate.ball import ball, light_of_lat_long
 from factorlib.evaluate.materials import common_factor
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -23,7 +24,7 @@ from factorlib.solve.solve import from_nothing, solve
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate
 from studies.measured.tools import Clock, Tables, exact, threaded
-from studies.spheres import in_camera, light, light_map, materials_of, sphere_normals, spheres
+from studies.spheres import in_camera, light_map, materials_of, sphere_normals
 
 SEED, SIZE, NOISE, MERGE_DEGREES = 31, 72, 0.002, 2.0
 MISSING = np.random.default_rng(SEED).random((5, 5)) < 0.4  # [material, light]
@@ -68,7 +69,8 @@ def rows() -> Tables:
 
 def _photo(number: int, materials: list[Reflectance], labels: list[int]) -> Observations:
     normals, photo = sphere_normals(SIZE), (f"light_{number}",)
-    radiance = spheres(materials, light(light_map(SEED, number, 128, 64)), normals).reshape(-1, 3)
+    light = light_of_lat_long(light_map(SEED, number, 128, 64))
+    radiance = np.concatenate([ball(light, material, normals) for material in materials])
     radiance *= 1 + NOISE * np.random.default_rng([SEED, number]).standard_normal(radiance.shape)
     n = len(radiance)
     zero = np.zeros(n, int)

@@ -6,7 +6,6 @@ import pytest
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.evaluate.ball import (
     VIEW,
-    ball_normals,
     constant_light,
     diffuse_ball,
     glossy_ball,
@@ -15,6 +14,7 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
     radiance_toward,
 )
+from factorlib.geometry.sphere import ball_normals
 
 NORMALS, INSIDE = ball_normals(16)
 

@@ -40,8 +40,13 @@ def chosen(materials, shown, **options):
     return few_lobes(JointProblem(rooms(materials, shown), OPERATOR), 3, Run(options))
 
 
-def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it():
-    found = chosen(MIXED, [0, 1, 2])
+@pytest.fixture(scope="module")
+def mixed():
+    return chosen(MIXED, [0, 1, 2])
+
+
+def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it(mixed):
+    found = mixed
     assert found.lambertian.tolist() == [True, True, False]
     assert (found.point.materials.specular[:2] == 0).all()
     assert found.specular[2].held_out_loss_without > 1.05 * found.specular[2].held_out_loss_with
@@ -55,8 +60,8 @@ def test_few_lights_that_show_a_material_decide_as_all_do(monkeypatch):
     assert len(found.point.lights) == 2
 
 
-def test_a_lambertian_scene_ends_without_specular_and_with_few_lobes():
-    lambertian, glossy = chosen(MIXED, [0, 1]), chosen(MIXED, [0, 1, 2])
+def test_a_lambertian_scene_ends_without_specular_and_with_few_lobes(mixed):
+    lambertian, glossy = chosen(MIXED, [0, 1]), mixed
     assert lambertian.lambertian[:2].all()
     assert sum(map(len, lambertian.point.lights)) <= 1.2 * sum(map(len, glossy.point.lights))
 
