@@ -9,9 +9,8 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
-from factorlib.results.exposures import read_exposures
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Channels, MaterialTable, read_materials
+from factorlib.results.materials import Channels, MaterialTable, read_exposures, read_materials
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")
 CURE = "name the folder of a result of `solve`, as it was written"

@@ -8,10 +8,11 @@ import pytest
 
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
+from factorlib.jsonfile import write_json
 from factorlib.recipe.read import files_of, read_recipe
 from factorlib.recipe.schema import KINDS, Insert, recipe_of
 from factorlib.recipe.table import read_table
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
 
@@ -90,7 +91,7 @@ def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
 def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tmp_path):
     (tmp_path / "bunny.obj").write_text("")
     one = solved(Reflectance((0.1,) * 3, (0.5,) * 3, 0.2), StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0))
-    write_materials(tmp_path / "own.json", MaterialTable({"gold": one}))
+    write_json(tmp_path / "own.json", MaterialTable({"gold": one}))
     path = written(tmp_path, "kind: insert\nmesh: bunny.obj\nmaterial: gold\ntable: own.json")
     recipe = read_recipe(path, dataset)
     assert isinstance(recipe, Insert) and recipe.material == "gold"
