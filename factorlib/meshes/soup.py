@@ -124,14 +124,9 @@ def lines_of(content: bytes) -> Iterator[str]:
         encoding = "latin-1"
     with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line: a list of them is far larger
         for line in text:
-            check_length(len(line))
+            if len(line) > LONGEST:
+                raise ValueError(f"a line of more than {LONGEST:,} letters")
             yield line.rstrip("\n")
-
-
-def check_length(letters: int) -> None:
-    """ValueError for more letters than the line of any polygon has."""
-    if letters > LONGEST:
-        raise ValueError(f"a line of more than {LONGEST:,} letters")
 
 
 def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
