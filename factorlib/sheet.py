@@ -26,12 +26,8 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
 from factorlib.wholefile import write_bytes
 
-SIDE, MESH_SIDE, MARGIN, HEAD = (
-    320,
-    240,
-    12,
-    18,
-)  # pixels: a photo's longer side, a mesh, between pictures, a line of text
+# pixels: a photo's longer side, a mesh, between pictures, a line of text
+SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 DISTANCE = 6.0  # of the camera from a mesh, in its radii
 HATCH = 8  # pixels from line to line
@@ -68,8 +64,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
     stored = open_photo(path, f"{key}.image")
     factor, materials = max(1, -(-max(stored.size) // SIDE)), dataset.spec.materials
     image = picture(decoded(stored, photo.encoding, factor, path).radiance, 1.0)
-    file = lambda name: dataset.folder / name  # noqa: E731
-    labels = read_labels(photo.masks, file, materials, stored.size, photo.image, f"{key}.masks")
+    labels = read_labels(photo.masks, dataset.folder.joinpath, materials, stored.size, photo.image, f"{key}.masks")
     height, width = image.shape[:2]
     fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
     return image, Labels(labels.label[fewer], labels.left_out[fewer])
