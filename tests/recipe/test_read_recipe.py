@@ -18,9 +18,7 @@ from factorlib.yamlfile import load_yaml, read_yaml
 
 EAMES = LIBRARY / "data" / "eames"
 RECIPES = sorted((LIBRARY / "recipes").glob("*.yaml")) + sorted((LIBRARY / "recipes" / "eames").glob("*.yaml"))
-OF_OTHER_SETS = sorted(
-    set((LIBRARY / "recipes").rglob("*.yaml")) - set(RECIPES)
-)  # sets that do not come with the project
+OF_OTHER_SETS = set((LIBRARY / "recipes").rglob("*.yaml")) - set(RECIPES)  # sets that do not come with the project
 
 
 @pytest.fixture(scope="module")
@@ -34,54 +32,40 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
-def test_recipes_that_come_with_the_project_are_good_and_survive_the_way_to_a_stage(path, dataset):
-    recipe = read_recipe(path, dataset)
-    assert recipe_of(msgspec.to_builtins(recipe)) == recipe
+def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survive_the_way_to_a_stage(dataset):
+    recipes = [read_recipe(path, dataset) for path in RECIPES]
+    assert [recipe_of(msgspec.to_builtins(recipe)) for recipe in recipes] == recipes
+    assert {type(recipe) for recipe in recipes} == set(KINDS.values())
+    assert all(read_yaml(path, KINDS[load_yaml(path)["kind"]]) for path in OF_OTHER_SETS)
 
 
-@pytest.mark.parametrize("path", OF_OTHER_SETS, ids=lambda path: path.stem)
-def test_recipes_of_other_sets_are_of_a_kind_and_its_fields(path):
-    assert read_yaml(path, KINDS[load_yaml(path)["kind"]])
-
-
-def test_every_kind_has_a_recipe_that_comes_with_the_project(dataset):
-    assert {type(read_recipe(path, dataset)) for path in RECIPES} == set(KINDS.values())
-
-
-@pytest.mark.parametrize(
-    "text, words",
-    [
-        ("kind: relight\nphotos: [kitchn]", ["photos", "no photo 'kitchn'", "did you mean 'kitchen'"]),
-        ("kind: relight\nlights: [hal]", ["lights", "did you mean 'hall'"]),
-        ("kind: relight\nlights: [studio.hdr]", ["there is no file 'studio.hdr'", "relative to the recipe"]),
-        ("kind: relightt", ["there is no kind 'relightt'", "did you mean 'relight'"]),
-        ("samples: 3", ["does not say what kind", "turntable"]),
-        ("[1, 2]", ["does not say what kind"]),
-        ("kind: [insert]", ["there is no kind"]),
-        ("kind: insert\nsiz: 3", ["one.yaml:2: siz", "did you mean 'size'"]),
-        ("kind: insert\nmesh: char", ["there is no mesh 'char'", "did you mean 'chair'"]),
-        ("kind: insert\nmesh: x.obj", ["there is no file 'x.obj'"]),
-        ("kind: insert\nmaterial: redd", ["did you mean 'red'"]),
-        (
-            "kind: insert\nphotos: [kitchen]\nbeside: red_chair",
-            ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos that have it"],
-        ),
-        ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
-        ("kind: insert\nmesh: read.py", ["there is no file", "read.py"]),
-        ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh", ".obj"]),
-        ("kind: relight\nphotos: [kitchen, kitchen]", ["photos", "'kitchen' is named twice"]),
-        ("kind: relight\nlights: [hall, hall]", ["lights", "'hall' is named twice"]),
-        ("kind: turntable\nseconds: .inf", ["one.yaml:2: seconds"]),
-        ("kind: turntable\nseconds: 3600", ["one.yaml:2: seconds", "<= 1200"]),
-        ("kind: view\nzoom: 1e-300", ["one.yaml:2: zoom", ">= 0.01"]),
-        ("kind: insert\ntable: one.yaml", ["one.yaml", "a table of materials"]),
-        ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
-        ("kind: transfer\nmaterials: {yellow: gold}", ["there is no material 'gold'"]),
-        ("kind: transfer", ["materials"]),
-        ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
-    ],
-)
+@pytest.mark.parametrize("text, words", [
+    ("kind: relight\nphotos: [kitchn]", ["photos", "no photo 'kitchn'", "did you mean 'kitchen'"]),
+    ("kind: relight\nlights: [hal]", ["lights", "did you mean 'hall'"]),
+    ("kind: relight\nlights: [studio.hdr]", ["there is no file 'studio.hdr'", "relative to the recipe"]),
+    ("kind: relightt", ["there is no kind 'relightt'", "did you mean 'relight'"]),
+    ("samples: 3", ["does not say what kind", "turntable"]),
+    ("[1, 2]", ["does not say what kind"]),
+    ("kind: [insert]", ["there is no kind"]),
+    ("kind: insert\nsiz: 3", ["one.yaml:2: siz", "did you mean 'size'"]),
+    ("kind: insert\nmesh: char", ["there is no mesh 'char'", "did you mean 'chair'"]),
+    ("kind: insert\nmesh: x.obj", ["there is no file 'x.obj'"]),
+    ("kind: insert\nmaterial: redd", ["did you mean 'red'"]),
+    ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos"]),
+    ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
+    ("kind: insert\nmesh: read.py", ["there is no file", "read.py"]),
+    ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh", ".obj"]),
+    ("kind: relight\nphotos: [kitchen, kitchen]", ["photos", "'kitchen' is named twice"]),
+    ("kind: relight\nlights: [hall, hall]", ["lights", "'hall' is named twice"]),
+    ("kind: turntable\nseconds: .inf", ["one.yaml:2: seconds"]),
+    ("kind: turntable\nseconds: 3600", ["one.yaml:2: seconds", "<= 1200"]),
+    ("kind: view\nzoom: 1e-300", ["one.yaml:2: zoom", ">= 0.01"]),
+    ("kind: insert\ntable: one.yaml", ["one.yaml", "a table of materials"]),
+    ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
+    ("kind: transfer\nmaterials: {yellow: gold}", ["there is no material 'gold'"]),
+    ("kind: transfer", ["materials"]),
+    ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
+])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
     with pytest.raises(InputError) as error:
         read_recipe(written(tmp_path, text), dataset)
