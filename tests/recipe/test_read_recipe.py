@@ -10,8 +10,7 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
 from factorlib.recipe.read import files_of, read_recipe
-from factorlib.recipe.schema import KINDS, Insert, recipe_of
-from factorlib.recipe.table import read_table
+from factorlib.recipe.schema import KINDS, Insert, read_table, recipe_of
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
@@ -40,7 +39,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
 
 
 @pytest.mark.parametrize("text, words", [
-    ("kind: relight\nphotos: [kitchn]", ["photos", "no photo 'kitchn'", "did you mean 'kitchen'"]),
+    ("kind: relight\nphotos: [kitchn]", ["photos", "unknown photo 'kitchn'", "did you mean 'kitchen'"]),
     ("kind: relight\nlights: [hal]", ["lights", "did you mean 'hall'"]),
     ("kind: relight\nlights: [studio.hdr]", ["there is no file 'studio.hdr'", "relative to the recipe"]),
     ("kind: relightt", ["there is no kind 'relightt'", "did you mean 'relight'"]),
@@ -48,7 +47,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("[1, 2]", ["does not say what kind"]),
     ("kind: [insert]", ["there is no kind"]),
     ("kind: insert\nsiz: 3", ["one.yaml:2: siz", "did you mean 'size'"]),
-    ("kind: insert\nmesh: char", ["there is no mesh 'char'", "did you mean 'chair'"]),
+    ("kind: insert\nmesh: char", ["unknown mesh 'char'", "did you mean 'chair'"]),
     ("kind: insert\nmesh: x.obj", ["there is no file 'x.obj'"]),
     ("kind: insert\nmaterial: redd", ["did you mean 'red'"]),
     ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos"]),
@@ -62,7 +61,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: view\nzoom: 1e-300", ["one.yaml:2: zoom", ">= 0.01"]),
     ("kind: insert\ntable: one.yaml", ["one.yaml", "a table of materials"]),
     ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
-    ("kind: transfer\nmaterials: {yellow: gold}", ["there is no material 'gold'"]),
+    ("kind: transfer\nmaterials: {yellow: gold}", ["unknown material 'gold'"]),
     ("kind: transfer", ["materials"]),
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
 ])  # fmt: skip
