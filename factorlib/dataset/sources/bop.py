@@ -10,8 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.dataset.check import check_rotation
-from factorlib.dataset.paths import Refusal, file_of
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import Number, Pose, Vec3
 from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
 
@@ -38,7 +37,7 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The images of the scene in the dataset's folder `path`, by id; each is taken to be twice its principal point large."""
-    camera_file, pose_file = (file_of(KEY, path, name, refuse) for name in (CAMERAS, POSES))
+    camera_file, pose_file = (refuse.file_of(KEY, path, name) for name in (CAMERAS, POSES))
     if camera_file is None:
         refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
     cameras = read_source(camera_file, dict[ImageId, SceneCamera], KEY)
@@ -61,6 +60,6 @@ def _poses(image: str, objects: list[SceneObject], refuse: Refusal) -> dict[int,
     result: dict[int, list[Pose]] = {}
     for index, obj in enumerate(objects):
         rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
-        check_rotation(f"{image}[{index}].cam_R_m2c", rows, refuse)
+        refuse.rotation(f"{image}[{index}].cam_R_m2c", rows)
         result.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
     return result

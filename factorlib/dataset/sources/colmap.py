@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pycolmap
 
-from factorlib.dataset.paths import Refusal, check_folder, file_of
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import LARGEST
 from factorlib.dataset.sources.shot import DAMAGED, Shot, colmap_camera
 from factorlib.reading import one_line, reading
@@ -33,8 +33,8 @@ ImageLine = tuple[
 
 def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The registered images of the model in the dataset's folder `path`, by name."""
-    check_folder(KEY, path, refuse)
-    models = {suffix: [file_of(KEY, path, f"{name}{suffix}", refuse) for name in ("cameras", "images")]
+    refuse.subfolder(KEY, path)
+    models = {suffix: [refuse.file_of(KEY, path, f"{name}{suffix}") for name in ("cameras", "images")]
               for suffix in (".bin", ".txt")}  # fmt: skip
     suffix = next((suffix for suffix, files in models.items() if all(files)), None)
     if suffix is None:

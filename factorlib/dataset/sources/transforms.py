@@ -11,7 +11,6 @@ from typing import Annotated
 import msgspec
 import pycolmap
 
-from factorlib.dataset.check import check_rotation
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import FOCAL_PX, Centre, Focal, Number
 from factorlib.dataset.sources.shot import SIDE_PX, Shot, colmap_camera, read_source, rigid
@@ -75,7 +74,7 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
 def _cam_from_world(key: str, rows: list[Row4], refuse: Refusal) -> pycolmap.Rigid3d:
     if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
         refuse(key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
-    check_rotation(key, tuple(row[:3] for row in rows[:3]), refuse)
+    refuse.rotation(key, tuple(row[:3] for row in rows[:3]))
     opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
     return rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
 
