@@ -50,7 +50,11 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             entry = dataset.spec.meshes[obj.mesh]
             mesh = read_mesh(dataset.folder / entry.file, materials, entry.made_of, obj.materials)
             named.append((obj.name, drawn(mesh, colours)))
-        titled = [np.concatenate([_text(title, each.shape[1]), each]) for title, each in named]
+        titled = []
+        for title, each in named:
+            head = Image.new("RGB", (each.shape[1], HEAD), PAPER)
+            ImageDraw.Draw(head).text((0, 2), title, fill=INK)
+            titled.append(np.concatenate([np.asarray(head), each]))
         tall = max(len(each) for each in titled) + MARGIN
         rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
     rows.insert(0, legend(materials, colours, max(row.shape[1] for row in rows)))
@@ -114,12 +118,6 @@ def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> 
         pen.rectangle((x, y, x + HEAD - 4, y + HEAD - 4), fill=tuple(colour), outline=INK)
         pen.text((x + HEAD, y), name, fill=INK)
     return np.asarray(sheet)
-
-
-def _text(title: str, width: int) -> Pixels:
-    head = Image.new("RGB", (width, HEAD), PAPER)
-    ImageDraw.Draw(head).text((0, 2), title, fill=INK)
-    return np.asarray(head)
 
 
 def _padded(pixels: Pixels, height: int, width: int) -> Pixels:

@@ -107,7 +107,11 @@ def decoded(
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
         log.warning("%s: its colour profile is %r; %s", path, profile, words)
-    radiance, clipped, finite = (_oriented(pixels, stored.orientation) for pixels in (radiance, clipped, finite))
+    swapped, back = stored.orientation >= 5, [-1 if flip else 1 for flip in _flipped(stored.orientation)]
+    radiance, clipped, finite = (
+        np.ascontiguousarray((pixels.swapaxes(0, 1) if swapped else pixels)[:: back[0], :: back[1]])
+        for pixels in (radiance, clipped, finite)
+    )
     focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
     return Photo(
         radiance, clipped, finite, focal_px and focal_px / factor, finite.shape[1], finite.shape[0], encoding, factor,
@@ -142,12 +146,6 @@ def _strips(
 def _flipped(orientation: int) -> tuple[bool, bool]:
     """Whether the order of rows, and of columns, is turned round, once 5-8 have them swapped."""
     return orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-
-
-def _oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Turned as EXIF says: 1 as is, 2-4 mirrored or half turned, 5-8 with rows and columns swapped."""
-    rows, columns = (-1 if flip else 1 for flip in _flipped(orientation))
-    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation >= 5 else pixels)[::rows, ::columns])
 
 
 def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:

@@ -38,7 +38,10 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
                     raise ValueError("three numbers expected")
                 table[key].extend([float(word) for word in words[:3]])
             elif key == "f":
-                corners = [_corner(word, len(table["v"]) // 3, len(table["vn"]) // 3) for word in words]
+                corners = []
+                for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
+                    own = _index(normal, len(table["vn"]) // 3) if normal else -1
+                    corners.append((_index(vertex, len(table["v"]) // 3), own))
                 if len(corners) < 3:
                     raise ValueError("a face has three corners at least")
                 if current is None:
@@ -63,12 +66,6 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
     vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
     return Soup(vertices, corners, np.array(part, dtype=np.int64), list(parts), normals[index])
-
-
-def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
-    """Index of the vertex and of the normal of `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 0; −1 where it has no normal."""
-    fields = word.split("/")
-    return _index(fields[0], vertices), _index(fields[2], normals) if len(fields) > 2 and fields[2] else -1
 
 
 def _index(word: str, count: int) -> int:

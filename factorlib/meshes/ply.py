@@ -49,17 +49,12 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
     if not whole or ((corners := values.astype(np.int64)) != values).any():
         raise InputError("a corner of a face is no whole number", file=path, cure=CURE)
-    points, normals = (_vectors(columns.get("vertex", {}), names) for names in ("xyz", ("nx", "ny", "nz")))
-    if points is None:
+    numbers = {name: floats(own) for name, (own, each) in columns.get("vertex", {}).items() if (each == 1).all()}
+    if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
+    points, normals = (np.stack([numbers[n] for n in names], axis=1) if set(names) <= numbers.keys() else None
+                       for names in ("xyz", ("nx", "ny", "nz")))  # fmt: skip
     return of_one_part(points, fans(sizes, corners), path.stem, normals)
-
-
-def _vectors(columns: dict[str, Column], names: tuple[str, ...] | str) -> np.ndarray | None:
-    """Three properties as vectors; None where one is missing, or a list."""
-    if not all(name in columns and (columns[name][1] == 1).all() for name in names):
-        return None
-    return np.stack([floats(columns[name][0]) for name in names], axis=1)
 
 
 def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:

@@ -12,7 +12,7 @@ Angles are in degrees, sizes in pixels, colours linear Rec. 709.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -192,16 +192,15 @@ def read_table(path: Path) -> dict[str, OwnMaterial]:
     materials = content.get("materials") if isinstance(content, dict) else None
     if not isinstance(materials, dict) or not materials:
         raise InputError("it holds no materials", file=path, key="materials", cure=CURE)
-    return {name: _material(name, entry, path) for name, entry in materials.items()}
-
-
-def _material(name: str, entry: Any, path: Path) -> OwnMaterial:
-    try:
-        material = msgspec.convert(entry, OwnMaterial)
-    except msgspec.ValidationError as error:
-        raise InputError(str(error), file=path, key=f"materials.{name}", cure=CURE) from None
-    total = max(material.diffuse) + max(material.specular)
-    if total > MOST_REFLECTED:
-        found = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
-        raise InputError(found, file=path, key=f"materials.{name}", cure=f"at most {MOST_REFLECTED}")
-    return material
+    table = {}
+    for name, entry in materials.items():
+        key = f"materials.{name}"
+        try:
+            table[name] = msgspec.convert(entry, OwnMaterial)
+        except msgspec.ValidationError as error:
+            raise InputError(str(error), file=path, key=key, cure=CURE) from None
+        total = max(table[name].diffuse) + max(table[name].specular)
+        if total > MOST_REFLECTED:
+            found = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
+            raise InputError(found, file=path, key=key, cure=f"at most {MOST_REFLECTED}")
+    return table

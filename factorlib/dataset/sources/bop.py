@@ -51,15 +51,10 @@ def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
             of_cameras(f"{image}.cam_K", "is not the camera of square axes", cure)
         size, params = (2 * cx + 1, 2 * cy + 1), [fx, fy, cx + 0.5, cy + 0.5]
         pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, of_cameras)
-        instances = _poses(image, poses.get(image, []), of_poses)
+        instances: dict[int, list[Pose]] = {}
+        for index, obj in enumerate(poses.get(image, [])):
+            rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
+            of_poses.rotation(f"{image}[{index}].cam_R_m2c", rows)
+            instances.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
         shots.append(Shot(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
     return shots
-
-
-def _poses(image: str, objects: list[SceneObject], refuse: Refusal) -> dict[int, list[Pose]]:
-    result: dict[int, list[Pose]] = {}
-    for index, obj in enumerate(objects):
-        rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
-        refuse.rotation(f"{image}[{index}].cam_R_m2c", rows)
-        result.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
-    return result

@@ -39,7 +39,13 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
             log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name "
                         "it: cameras.images: {%s: …}", file, kind, photo.name, photo.name)  # fmt: skip
         else:
-            external[photo.name] = _external(kind, photo, shot, source, refuse)
+            poses, given = _poses(photo, shot, source, refuse), photo.camera
+            if given is not None and given.focal_px is not None and given.principal_point is not None:
+                camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
+            else:
+                focal, centre = pinhole(shot.camera, shot.key, refuse)
+                camera = ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
+            external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
                 world_from_camera = as_rows(shot.cam_from_world.inverse().rotation)
                 photo = msgspec.structs.replace(photo, world_from_camera=world_from_camera)
@@ -78,14 +84,6 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
         cure = "say which is which: cameras.images: {photo: image, …}"
         refuse(f"cameras.{kind}", f"none of its {len(shots)} images ({some}) is named as a photo", cure)
     return result
-
-
-def _external(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> ExternalCamera:
-    poses, given = _poses(photo, shot, source, refuse), photo.camera
-    if given is not None and given.focal_px is not None and given.principal_point is not None:
-        return ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
-    focal, centre = pinhole(shot.camera, shot.key, refuse)
-    return ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
 
 
 def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> dict[str, Pose]:

@@ -66,17 +66,14 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
         lens = Lens(**{name: getattr(content, name) if own[name] is None else own[name] for name in names})
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
-        cam_from_world = _cam_from_world(f"{key}.transform_matrix", frame.transform_matrix, refuse)
+        of, rows = f"{key}.transform_matrix", frame.transform_matrix
+        if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
+            refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+        refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
+        opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
+        cam_from_world = rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
         shots.append(Shot(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
     return shots
-
-
-def _cam_from_world(key: str, rows: list[Row4], refuse: Refusal) -> pycolmap.Rigid3d:
-    if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
-        refuse(key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
-    refuse.rotation(key, tuple(row[:3] for row in rows[:3]))
-    opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
-    return rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
 
 
 def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
