@@ -45,10 +45,6 @@ def box_mean(
 
     radiance: 0 where not finite.  Sums are float64: the mean of equal values is that value.
     """
-    if finite.all():
-        return (box_sum(radiance, factor) / factor**2).astype(np.float32), np.ones(
-            [n // factor for n in finite.shape], bool
-        )
     count = box_sum(finite, factor, np.int64)
     return (box_sum(radiance, factor) / np.maximum(count, 1)[..., None]).astype(np.float32), count > 0
 

@@ -26,7 +26,6 @@ Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
-Backdrop = Literal["none", "light"]
 LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
 MOST_REFLECTED = 0.999  # max diffuse + max specular: a surface that reflects more than arrives never comes to rest with light between surfaces
 CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, numbers from 0 to 1'
@@ -53,11 +52,18 @@ class Sized(OfPhotos, frozen=True, kw_only=True):
     """Width of the pictures; without it that of the photo as the pipeline works on it."""
 
 
+class Backdropped(Sized, frozen=True, kw_only=True):
+    """Of kinds that show what is beside the objects."""
+
+    background: Literal["none", "light"] = "none"
+    """What is seen beside the objects: nothing (transparent), or the light."""
+
+
 class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
     """The photo with its objects replaced by path-traced ones."""
 
 
-class View(Sized, frozen=True, kw_only=True, tag="view"):
+class View(Backdropped, frozen=True, kw_only=True, tag="view"):
     """The objects from another side: the camera is moved about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
@@ -66,19 +72,15 @@ class View(Sized, frozen=True, kw_only=True, tag="view"):
     """Angle upward, added to the photo's own."""
     zoom: Factor = 1.0
     """Factor on the size in the picture."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
-class Turntable(Sized, frozen=True, kw_only=True, tag="turntable"):
+class Turntable(Backdropped, frozen=True, kw_only=True, tag="turntable"):
     """An animation once around the objects; the light stays."""
 
     frames: Frames = 24
     """Pictures of the whole turn."""
     seconds: Seconds = 4.0
     """Of the whole turn."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
 class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
@@ -90,15 +92,13 @@ class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
     """Of the whole turn."""
 
 
-class Relight(Sized, frozen=True, kw_only=True, tag="relight"):
+class Relight(Backdropped, frozen=True, kw_only=True, tag="relight"):
     """The photo's objects in other lights."""
 
     lights: list[str] = []
     """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); all other photos where none is named."""
     rotate: Degrees = 0.0
     """Turn of those lights about the camera's upright axis."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
 class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
