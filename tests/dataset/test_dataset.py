@@ -250,14 +250,14 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
 
 def test_photos_of_one_light_agree_on_its_frame(folder):
     spec = changed("photos[0].illumination", "studio")
-    spec["photos"][1]["illumination"] = "studio"
-    spec["photos"][0]["world_from_camera"] = TURN
+    spec["photos"][0] |= {"world_from_camera": TURN}
+    spec["photos"][1] |= {"illumination": "studio"}
     with pytest.raises(InputError, match="'studio'") as caught:
         read_dataset(write(folder, spec))
     assert caught.value.key == "photos[1].world_from_camera"
-    spec["photos"][1]["world_from_camera"] = TURN
-    dataset = read_dataset(write(folder, spec))
-    assert dataset_slice(dataset, "light", "garden").facts == {"illumination": "studio", "world_from_camera": TURN}
+    spec["photos"][1] |= {"world_from_camera": TURN}
+    facts = dataset_slice(read_dataset(write(folder, spec)), "light", "garden").facts
+    assert facts == {"illumination": "studio", "world_from_camera": TURN}
 
 
 def test_names_of_build_and_what_is_not_there_are_no_datasets(folder):
