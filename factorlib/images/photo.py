@@ -94,7 +94,13 @@ def decoded(
     radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(stored, factor, path):
-        linear = _decoded(codes, stored.white, encoding)
+        if (white := stored.white) is None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                linear = np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
+        elif white >= 2**16:
+            linear = decoder(encoding)(codes / white).astype(np.float32)
+        else:
+            linear = decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
         look(linear)
         numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
@@ -146,13 +152,3 @@ def _strips(
 def _flipped(orientation: int) -> tuple[bool, bool]:
     """Whether the order of rows, and of columns, is turned round, once 5-8 have them swapped."""
     return orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-
-
-def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
-    """Linear values, an array of their own."""
-    if white is None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
-    if white >= 2**16:
-        return decoder(encoding)(codes / white).astype(np.float32)
-    return decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]

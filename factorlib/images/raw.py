@@ -11,10 +11,8 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.ndimage import maximum_filter
 
 from factorlib.dataset.schema import RAW
@@ -72,7 +70,11 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
                 )  # fmt: skip
             except rawpy.LibRawError as error:
                 raise refused("cannot be developed", error) from None
-            return pixels[inner], _saturated(sensor)[inner]
+            # where a sensor pixel that a developed one is made of has reached the white level
+            levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
+            full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
+            full = full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
+            return pixels[inner], full[inner]
 
     return Stored(
         width=width,
@@ -84,10 +86,3 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
         rows=lambda begin, end: developed()[0][begin:end],
         saturated=lambda begin, end: np.repeat(developed()[1][begin:end, :, None], 3, axis=2),
     )
-
-
-def _saturated(sensor: Any) -> Bool[np.ndarray, "h w"]:
-    """Where a sensor pixel that a developed one is made of has reached the white level."""
-    levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
-    full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
-    return full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)

@@ -111,7 +111,8 @@ def _merged(
             both, also = inside[material] & (label == other), where[materials[other - 1]][0]
             fault = f"materials {materials[other - 1]!r} and {material!r} share {int(both.sum())} pixels"
             fault += f" with {also.name}" if also != path else ""
-            if _is_wider(both, edge):
+            square = (edge + 1, edge + 1)
+            if min(both.shape) > edge and sliding_window_view(both, square).all((2, 3)).any():
                 cure = "a pixel shows one material: erase it from the one behind"
                 raise InputError(fault, file=path, key=key, cure=cure)
             log.warning("%s: %s: %s along their outlines: these are left out", path, key, fault)
@@ -119,9 +120,3 @@ def _merged(
         label[inside[material]] = number
     label[left_out] = 0
     return Labels(label=label, left_out=left_out)
-
-
-def _is_wider(region: Bool[np.ndarray, "h w"], width: int) -> bool:
-    """Whether a square of width + 1 pixels fits into it somewhere."""
-    side = width + 1
-    return min(region.shape) >= side and bool(sliding_window_view(region, (side, side)).all((2, 3)).any())

@@ -34,7 +34,7 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
                 refuse(key, fault, "name it once")
 
     for name, file in files_of(recipe, path).items():
-        if not is_plain_file(file):
+        if not file.is_file():
             cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
     if isinstance(recipe, schema.OfPhotos):
@@ -64,14 +64,6 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
                 found = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {', '.join(objects) or 'none'}"
                 refuse("beside", found, "name the photos that have it: `photos: [...]`")
     return recipe
-
-
-def is_plain_file(path: Path) -> bool:
-    """Whether there is a file at a path; no path at all is none either."""
-    try:
-        return path.is_file()
-    except ValueError:  # a NUL
-        return False
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
