@@ -8,7 +8,7 @@ import math
 import struct
 import warnings
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,27 +34,23 @@ log = logging.getLogger("factorlib.images")
 def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
     """The tags of a block as HEIF keeps it ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does, as DNG and most raw
     files do; none where there are none, or where they are damaged.  `DNG` is True for a DNG."""
-    exif = Image.Exif()
-    try:
-        with (
-            warnings.catch_warnings(action="ignore"),  # of damaged tags, in lines of Pillow's source
-            nullcontext() if isinstance(source, bytes | None) else Path(source).open("rb") as stream,
-        ):
-            exif.load(source or b"") if stream is None else exif.load_from_fp(stream)
-            return _named(exif)
-    except DAMAGED:
-        return {}
-
-
-def _named(exif: Image.Exif) -> dict[str, float | int]:
-    tags, named = exif.get_ifd(EXIF_IFD), {"DNG": True} if DNG_VERSION in exif else {}
-    for tag in NAMES.keys() & tags.keys():
-        try:
-            number = float(tags[tag][0] if isinstance(tags[tag], tuple) else tags[tag])
-        except (TypeError, ValueError, IndexError, ZeroDivisionError):
-            continue
-        if math.isfinite(number):
-            named[NAMES[tag]] = round(number) if tag in WHOLE else number
+    exif, named, numbers = Image.Exif(), {}, {}
+    with (
+        suppress(*DAMAGED),
+        warnings.catch_warnings(action="ignore"),  # of damaged tags, in lines of Pillow's source
+        nullcontext() if isinstance(source, bytes | None) else Path(source).open("rb") as stream,
+    ):
+        exif.load(source or b"") if stream is None else exif.load_from_fp(stream)
+        named |= {"DNG": True} if DNG_VERSION in exif else {}
+        tags = exif.get_ifd(EXIF_IFD)
+        for tag in NAMES.keys() & tags.keys():
+            try:
+                number = float(tags[tag][0] if isinstance(tags[tag], tuple) else tags[tag])
+            except (TypeError, ValueError, IndexError, ZeroDivisionError):
+                continue
+            if math.isfinite(number):
+                numbers[NAMES[tag]] = round(number) if tag in WHOLE else number
+        named |= numbers
     return named
 
 
