@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import partial
 from os import PathLike
 
 MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
@@ -33,11 +34,7 @@ class InputError(ValueError):
         return f"{where}{self.found}{cure}"
 
     def __reduce__(self) -> tuple:  # survives the trip back from a worker process
-        return _rebuild, (self.found, self.file, self.key, self.cure)
-
-
-def _rebuild(found: str, file: str | PathLike | None, key: str | None, cure: str | None) -> InputError:
-    return InputError(found, file=file, key=key, cure=cure)
+        return partial(InputError, self.found, file=self.file, key=self.key, cure=self.cure), ()
 
 
 def did_you_mean(word: str, known: Iterable[object]) -> str:

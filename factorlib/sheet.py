@@ -26,12 +26,8 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
 from factorlib.wholefile import write_bytes
 
-SIDE, MESH_SIDE, MARGIN, HEAD = (
-    320,
-    240,
-    12,
-    18,
-)  # pixels: a photo's longer side, a mesh, between pictures, a line of text
+# pixels: a photo's longer side, a mesh, between pictures, a line of text
+SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 DISTANCE = 6.0  # of the camera from a mesh, in its radii
 HATCH = 8  # pixels from line to line
@@ -54,7 +50,11 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             entry = dataset.spec.meshes[obj.mesh]
             mesh = read_mesh(dataset.folder / entry.file, materials, entry.made_of, obj.materials)
             named.append((obj.name, drawn(mesh, colours)))
-        titled = [np.concatenate([_text(title, each.shape[1]), each]) for title, each in named]
+        titled = []
+        for title, each in named:
+            head = Image.new("RGB", (each.shape[1], HEAD), PAPER)
+            ImageDraw.Draw(head).text((0, 2), title, fill=INK)
+            titled.append(np.concatenate([np.asarray(head), each]))
         tall = max(len(each) for each in titled) + MARGIN
         rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
     rows.insert(0, legend(materials, colours, max(row.shape[1] for row in rows)))
@@ -68,8 +68,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
     stored = open_photo(path, f"{key}.image")
     factor, materials = max(1, -(-max(stored.size) // SIDE)), dataset.spec.materials
     image = picture(decoded(stored, photo.encoding, factor, path).radiance, 1.0)
-    file = lambda name: dataset.folder / name  # noqa: E731
-    labels = read_labels(photo.masks, file, materials, stored.size, photo.image, f"{key}.masks")
+    labels = read_labels(photo.masks, dataset.folder.joinpath, materials, stored.size, photo.image, f"{key}.masks")
     height, width = image.shape[:2]
     fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
     return image, Labels(labels.label[fewer], labels.left_out[fewer])
@@ -119,12 +118,6 @@ def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> 
         pen.rectangle((x, y, x + HEAD - 4, y + HEAD - 4), fill=tuple(colour), outline=INK)
         pen.text((x + HEAD, y), name, fill=INK)
     return np.asarray(sheet)
-
-
-def _text(title: str, width: int) -> Pixels:
-    head = Image.new("RGB", (width, HEAD), PAPER)
-    ImageDraw.Draw(head).text((0, 2), title, fill=INK)
-    return np.asarray(head)
 
 
 def _padded(pixels: Pixels, height: int, width: int) -> Pixels:

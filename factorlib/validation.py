@@ -32,7 +32,7 @@ class Validation:
     """The files of one dataset, each looked at once."""
 
     def __init__(self, dataset: Dataset):
-        self.dataset, self.spec = dataset, dataset.spec
+        self.dataset, self.spec, self.file = dataset, dataset.spec, dataset.folder.joinpath
         self._done: set[str] = set()
         self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
 
@@ -65,26 +65,26 @@ class Validation:
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, mesh, limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
-                yield f"light {path}", partial(read_true_light, self._file(path), name)
+                yield f"light {path}", partial(read_true_light, self.file(path), name)
             for name, path in self.dataset.truth.normals.items():
-                yield f"normals {name}", partial(self._normals, name, self._file(path))
+                yield f"normals {name}", partial(self._normals, name, self.file(path))
 
     def _normals(self, name: str, path: Path) -> None:
         check_values(path, key=f"normals.{name}")
-        size = open_photo(self._file(self.dataset.photo(name).image), f"photos[{name}].image").size
+        size = open_photo(self.file(self.dataset.photo(name).image), f"photos[{name}].image").size
         read_true_normals(path, name, size[::-1])
 
     def _photo(self, entry: PhotoEntry, most_megapixels: float) -> None:
-        key, path = f"photos[{entry.name}]", self._file(entry.image)
+        key, path = f"photos[{entry.name}]", self.file(entry.image)
         size = open_photo(path, f"{key}.image").size
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
-        read_labels(entry.masks, self._file, self.spec.materials, size, entry.image, f"{key}.masks")
-        read_objects([(obj.name, obj.mask) for obj in entry.objects], self._file, size, f"{key}.objects")
+        read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
+        read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
 
     def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
         """The parts of a mesh file are read once; if they cannot be, that is said again for every object."""
-        file = self._file(mesh.file)
+        file = self.file(mesh.file)
         if mesh.file not in self._parts:
             try:
                 self._parts[mesh.file] = read_parts(file, limits)
@@ -93,9 +93,6 @@ class Validation:
         if isinstance(parts := self._parts[mesh.file], InputError):
             raise parts
         part_labels(parts, self.spec.materials, mesh.made_of, obj.materials, file)
-
-    def _file(self, name: str) -> Path:
-        return self.dataset.folder / name
 
 
 def _faults(checks: Iterable[Check]) -> list[InputError]:

@@ -21,6 +21,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
+from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
@@ -34,7 +35,6 @@ from factorlib.results.poses import (
     RunnerUp,
     entry_of,
     read_poses,
-    write_photo_poses,
 )
 from factorlib.stage import Inputs, Progress
 
@@ -93,7 +93,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     centre = float(camera.centre[0]), float(camera.centre[1])
     of_camera = CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, facts.factor)
     poses = {each.name: of_each for each, of_each in zip(objects, entries, strict=True)}
-    write_photo_poses(out / f"{name}.json", PhotoPoses(of_camera, poses))
+    write_json(out / f"{name}.json", PhotoPoses(of_camera, poses))
 
 
 def objects_of(

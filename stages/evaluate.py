@@ -22,8 +22,9 @@ from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
 from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
+from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, write_metrics
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -62,7 +63,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     sections = _against_truth(inputs, out, truth, lights, shown, component) if truth else dict.fromkeys(SECTIONS)
     counts = Counts(len(lights), len(materials), len(shown), len(set(component.values())))
     reasons = reasons_of(sections, truth is not None)
-    write_metrics(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
+    write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     progress(3, 3)
 
 

@@ -27,13 +27,13 @@ from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT, Environment, Shape, Vi
 from factorlib.export.usd import SUFFIX, write_usd_mesh, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
 from factorlib.images.write import write_hdr
+from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
-from factorlib.results.exposures import read_exposures, write_exposures
 from factorlib.results.lobes import read_lobes, write_lobes
-from factorlib.results.materials import read_materials, reflectances, write_materials
+from factorlib.results.materials import read_exposures, read_materials, reflectances
 from factorlib.results.poses import ObjectEntry, read_poses
 from factorlib.stage import Inputs, Progress
 
@@ -64,8 +64,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials = reflectances(table)
     # the factor that leaves the materials enters the lights
     lobes = {n: light.scaled(1 / factor) for n, light in _solved_lights(solved / "lobes.parquet", lights).items()}
-    write_materials(out / "materials.json", table)
-    write_exposures(out / "exposures.json", exposures)
+    write_json(out / "materials.json", table)
+    write_json(out / "exposures.json", exposures)
     write_lobes(out / "lobes.parquet", lobes)
     write_materialx(out / "materials.mtlx", materials)
     write_losses(out / "losses.json", materials)

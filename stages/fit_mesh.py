@@ -22,7 +22,7 @@ from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
-from factorlib.results.poses import FILE, PhotoPoses, entry_of, read_poses, write_poses
+from factorlib.results.poses import FILE, PhotoPoses, entry_of, read_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -69,7 +69,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             for (photo, name), state in zip(each, verdict.fitted.states, strict=True):
                 poses[photo] = placed(poses[photo], name, *each[photo, name], state, factors)
     write_json(out / "meshes.json", report)
-    write_poses(out / FILE, poses)
+    write_json(out / FILE, poses)
 
 
 def placed(

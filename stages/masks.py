@@ -15,8 +15,9 @@ from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, check_bright, decoded, open_photo
+from factorlib.jsonfile import write_json
 from factorlib.labels import Labels, read_labels, read_objects
-from factorlib.results.photos import PhotoFacts, write_photo_facts
+from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")
@@ -72,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
         pixels={material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)},
         clipped_fraction=float(photo.clipped[valid].any(axis=-1).mean()),
     )
-    write_photo_facts(out / f"{name}.json", summary)
+    write_json(out / f"{name}.json", summary)
     progress(3, 3, name)
 
 

@@ -18,6 +18,7 @@ from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.camera import Camera, angle_between
 from factorlib.geometry.raster import rasterise
 from factorlib.images.tone import straightened
+from factorlib.jsonfile import write_json
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.refine.choice import Standards
 from factorlib.refine.light import Surfaces, known_materials
@@ -33,7 +34,6 @@ from factorlib.results.poses import (
     Refinement,
     entry_of,
     read_photo_poses,
-    write_photo_poses,
 )
 from factorlib.stage import Inputs, Progress
 
@@ -88,7 +88,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         if result.moved:
             log.warning("%s: shading moves %s by %.1f°", name, own, objects[own].refined.moved.rotation_deg)
             camera = msgspec.structs.replace(camera, focal_px=float(result.after.camera(scene.camera).focal))
-    write_photo_poses(out / f"{name}.json", PhotoPoses(camera, objects))
+    write_json(out / f"{name}.json", PhotoPoses(camera, objects))
 
 
 def decided(entry: ObjectEntry, own: PosedObject, result: Refined, camera: Camera) -> ObjectEntry:

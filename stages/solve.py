@@ -22,6 +22,7 @@ from factorlib.diagnose.uncertainty import StandardErrors, standard_errors
 from factorlib.diagnose.warnings import after_solving, before_solving, unusable_observations
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.jsonfile import write_json
 from factorlib.light.prior import read_light_prior
 from factorlib.model.gathered import gathered
 from factorlib.model.loss import Loss
@@ -30,11 +31,8 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
-from factorlib.results.exposures import write_exposures
 from factorlib.results.lobes import write_lobes
-from factorlib.results.materials import write_materials
 from factorlib.results.solution import Earlier, read_earlier
-from factorlib.results.uncertainty import write_uncertainty
 from factorlib.solve import options
 from factorlib.solve.few_lobes.history import Run as FewLobesRun
 from factorlib.solve.few_lobes.options import FewLobes, LobeChoices
@@ -100,10 +98,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     answer = Answer(names, problem, solution, relative, params.solver, earlier)
     errors, coverages = _uncertainty(answer, solution.shown(problem), params)
     _warn(after_solving(answer, errors))
-    write_materials(out / "materials.json", answer.material_table(errors))
-    write_uncertainty(out / "uncertainty.json", answer.uncertainty(errors))
+    write_json(out / "materials.json", answer.material_table(errors))
+    write_json(out / "uncertainty.json", answer.uncertainty(errors))
     write_lobes(out / "lobes.parquet", answer.lights())
-    write_exposures(out / "exposures.json", answer.exposures())
+    write_json(out / "exposures.json", answer.exposures())
     write_rows(out / "convergence.parquet", Event, solution.history)
     (out / "coverage").mkdir()
     for name, coverage in coverages.items():

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.reading import MOST_BYTES, check_plain, read_bytes, reading
+from factorlib.reading import MOST_BYTES, check_plain, reading
 
 Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
@@ -27,37 +27,33 @@ COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
-class Asset(msgspec.Struct, frozen=True):
-    """The version of glTF that the file says it follows."""
+class _Part(msgspec.Struct, frozen=True):
+    """A piece of the header, of which only the keys that geometry needs are read."""
 
+
+class Asset(_Part, frozen=True):
     version: str
 
 
-class Buffer(msgspec.Struct, frozen=True):
-    """Bytes in a file, or in `data:…`; uri is None for the chunk of a .glb."""
-
+class Buffer(_Part, frozen=True):
     byteLength: Count
-    uri: str | None = None
+    uri: str | None = None  # a file or `data:…`; None for the chunk of a .glb
 
 
-class View(msgspec.Struct, frozen=True):
-    """A run of bytes of a buffer; byteStride: from one element to the next, None where they lie close together."""
-
+class View(_Part, frozen=True):
     buffer: Count
     byteLength: Count
     byteOffset: Count = 0
-    byteStride: Positive | None = None
+    byteStride: Positive | None = None  # None where elements lie close together
 
 
-class Place(msgspec.Struct, frozen=True):
-    """Where in a view numbers begin, and for indices their type."""
-
+class Place(_Part, frozen=True):
     bufferView: Count
     byteOffset: Count = 0
-    componentType: int | None = None
+    componentType: int | None = None  # of indices
 
 
-class Sparse(msgspec.Struct, frozen=True):
+class Sparse(_Part, frozen=True):
     """`count` elements of an accessor that differ from what its view says, or from zero where it has none."""
 
     count: Count
@@ -65,7 +61,7 @@ class Sparse(msgspec.Struct, frozen=True):
     values: Place
 
 
-class Accessor(msgspec.Struct, frozen=True):
+class Accessor(_Part, frozen=True):
     """An array of `count` elements of `type` (SCALAR, VEC3 …), of numbers of `componentType`; zeros where it has no view."""
 
     componentType: int
@@ -77,29 +73,23 @@ class Accessor(msgspec.Struct, frozen=True):
     sparse: Sparse | None = None
 
 
-class Primitive(msgspec.Struct, frozen=True):
-    """Faces of one material: attribute (POSITION, NORMAL …) -> accessor; indices: accessor of the corners; mode: 4 is triangles."""
-
-    attributes: dict[str, Count]
-    indices: Count | None = None
+class Primitive(_Part, frozen=True):
+    attributes: dict[str, Count]  # POSITION, NORMAL … -> accessor
+    indices: Count | None = None  # accessor of the corners
     material: Count | None = None
-    mode: int = 4
+    mode: int = 4  # triangles
 
 
-class Geometry(msgspec.Struct, frozen=True):
-    """The primitives that glTF calls a mesh."""
-
+class Geometry(_Part, frozen=True):
     primitives: list[Primitive]
     name: str | None = None
 
 
-class Material(msgspec.Struct, frozen=True):
-    """Only its name counts here: `parts` in dataset.yaml may use it."""
-
-    name: str | None = None
+class Material(_Part, frozen=True):
+    name: str | None = None  # `parts` in dataset.yaml may use it
 
 
-class Node(msgspec.Struct, frozen=True):
+class Node(_Part, frozen=True):
     """A place in the scene's tree: a mesh, and its motion to the parent as a matrix (by columns) or translation, rotation
     (quaternion x y z w) and scale."""
 
@@ -112,13 +102,11 @@ class Node(msgspec.Struct, frozen=True):
     scale: Numbers3 = (1.0, 1.0, 1.0)
 
 
-class Scene(msgspec.Struct, frozen=True):
-    """The nodes at the top of a tree."""
-
+class Scene(_Part, frozen=True):
     nodes: list[Count] = []
 
 
-class Header(msgspec.Struct, frozen=True):
+class Header(_Part, frozen=True):
     """The JSON of a glTF file, as far as it says where triangles are; scene: the number of the one to read, None for the first."""
 
     asset: Asset
@@ -135,32 +123,29 @@ class Header(msgspec.Struct, frozen=True):
 
 def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
     """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
-    is_binary = file.suffix.lower() == ".glb"
-    text = _json_chunk(file, key, most_bytes) if is_binary else read_bytes(file, WHAT, key, most_bytes)
-    if text.count(b",") > MOST_VALUES:
-        cure = "export the geometry alone, with its data in a .bin file or as .glb"
-        raise InputError(f"its header has more than {MOST_VALUES:,} values", file=file, key=key, cure=cure)
-    with reading(WHAT, file, key, CURE):
+
+    def refused(fault: str, cure: str) -> InputError:
+        return InputError(fault, file=file, key=key, cure=cure)
+
+    size, length = check_plain(file, WHAT, key, most_bytes), None
+    with reading(WHAT, file, key, CURE), open(file, "rb") as stream:
+        if file.suffix.lower() == ".glb":
+            magic, version, _, length, kind = struct.unpack("<4sIII4s", stream.read(BEFORE_JSON))
+            if magic != b"glTF" or version != 2 or kind != b"JSON":
+                raise ValueError("it does not begin as a .glb of version 2 does")
+            if length > size - BEFORE_JSON:
+                raise ValueError("its first chunk is longer than the file")
+        text = stream.read(size if length is None else length)
+        if text.count(b",") > MOST_VALUES:
+            cure = "export the geometry alone, with its data in a .bin file or as .glb"
+            raise refused(f"its header has more than {MOST_VALUES:,} values", cure)
         header = msgspec.json.decode(text, type=Header)
     if header.asset.version.split(".")[0] != "2":
-        fault = f"is glTF {header.asset.version[:20]}"
-        raise InputError(fault, file=file, key=key, cure="export it again, as glTF 2.0")
+        raise refused(f"is glTF {header.asset.version[:20]}", "export it again, as glTF 2.0")
     for name in COMPRESSED:
         if name in header.extensionsRequired:
-            cure = "export it without compression"
-            raise InputError(f"its meshes are compressed ({name})", file=file, key=key, cure=cure)
+            raise refused(f"its meshes are compressed ({name})", "export it without compression")
     return header
-
-
-def _json_chunk(file: Path, key: str | None, most_bytes: int) -> bytes:
-    size = check_plain(file, WHAT, key, most_bytes)
-    with reading(WHAT, file, key, CURE), open(file, "rb") as stream:
-        magic, version, _, length, kind = struct.unpack("<4sIII4s", stream.read(BEFORE_JSON))
-        if magic != b"glTF" or version != 2 or kind != b"JSON":
-            raise ValueError("it does not begin as a .glb of version 2 does")
-        if length > size - BEFORE_JSON:
-            raise ValueError("its first chunk is longer than the file")
-        return stream.read(length)
 
 
 def buffer_path(uri: str) -> str | None:

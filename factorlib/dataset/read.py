@@ -75,10 +75,23 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
     the OBJ itself, and so is one that is no plain file; an absent glTF buffer is refused, and so is any companion outside
     the dataset, or too large.
     """
-    file, is_obj = refuse.folder / path, path.lower().endswith(".obj")
-    if not is_obj and not path.lower().endswith((".gltf", ".glb")):
-        return []
-    named = _mtllibs(file, key) if is_obj else _buffers(file, key, refuse)
+    file, suffix = refuse.folder / path, Path(path).suffix.lower()
+    is_obj, named = suffix == ".obj", []
+    if is_obj and check_plain(file, "an OBJ", key):
+        with (
+            reading("an OBJ", file, key),
+            file.open("rb") as stream,
+            mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
+        ):
+            names = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
+            named = [match.group(1).decode("utf-8", "replace").strip() for match in names]
+    elif suffix in (".gltf", ".glb"):
+        header = read_header(file, key)
+        try:
+            paths = [buffer_path(buffer.uri) for buffer in header.buffers if buffer.uri is not None]
+        except ValueError as error:
+            refuse(key, f"{file.name} {error}", "export it again, with its buffers beside it or as one .glb")
+        named = [path for path in paths if path is not None]
     near = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in named})
     for companion in near:
         try:
@@ -94,24 +107,3 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
             refuse(key, f"the mesh names {companion!r}, which is not there", cure)
         check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
     return near
-
-
-def _mtllibs(file: Path, key: str) -> list[str]:
-    if check_plain(file, "an OBJ", key) == 0:
-        return []
-    with (
-        reading("an OBJ", file, key),
-        file.open("rb") as stream,
-        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
-    ):
-        names = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
-        return [match.group(1).decode("utf-8", "replace").strip() for match in names]
-
-
-def _buffers(file: Path, key: str, refuse: Refusal) -> list[str]:
-    header = read_header(file, key)
-    try:
-        named = [buffer_path(buffer.uri) for buffer in header.buffers if buffer.uri is not None]
-    except ValueError as error:
-        refuse(key, f"{file.name} {error}", "export it again, with its buffers beside it or as one .glb")
-    return [path for path in named if path is not None]

@@ -37,8 +37,7 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
     if name in _OF_SET:
         facts, files = _OF_SET[name](dataset)
         facts = _json_able(facts)
-        parts = facts.items() if name == "set" else [(name, facts)]
-        for key, part in parts:
+        for key, part in facts.items() if name == "set" else [(name, facts)]:
             fields |= _fields(part, "the folder's name" if (name, key) == ("set", "name") else key)
     elif name in _OF_PHOTO:
         names = [photo] if photo is not None else [entry.name for entry in dataset.spec.photos]
@@ -80,11 +79,6 @@ def _object_masks(photo: PhotoEntry) -> list[str]:
     return [obj.mask for obj in photo.objects if obj.mask]
 
 
-def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
-    spec = dataset.spec
-    return schema.SetSlice(dataset.name, spec.materials, spec.meshes, [photo.name for photo in spec.photos]), []
-
-
 def _json_able(facts: Any) -> Any:
     return msgspec.json.decode(msgspec.json.encode(facts))
 
@@ -111,7 +105,12 @@ _OF_PHOTO: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
 }
 _OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
-    "set": _set,
+    "set": lambda dataset: (
+        schema.SetSlice(
+            dataset.name, dataset.spec.materials, dataset.spec.meshes, [p.name for p in dataset.spec.photos]
+        ),
+        [],
+    ),
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),
 }
 SLICES = (*_OF_PHOTO, *_OF_SET)

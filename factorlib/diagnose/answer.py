@@ -15,8 +15,8 @@ from factorlib.model.gauge import DETERMINED, RULE
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
+from factorlib.results.materials import Uncertainty
 from factorlib.results.solution import Earlier
-from factorlib.results.uncertainty import Uncertainty
 from factorlib.solve.evidence import Evidence
 from factorlib.solve.history import Solution
 

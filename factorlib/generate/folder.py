@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
+from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
-from factorlib.images.focal import FILM_DIAGONAL
 from factorlib.images.transfer import srgb_encode
 from factorlib.images.write import write_image
 from factorlib.meshes.mesh import Mesh

@@ -45,10 +45,6 @@ def box_mean(
 
     radiance: 0 where not finite.  Sums are float64: the mean of equal values is that value.
     """
-    if finite.all():
-        return (box_sum(radiance, factor) / factor**2).astype(np.float32), np.ones(
-            [n // factor for n in finite.shape], bool
-        )
     count = box_sum(finite, factor, np.int64)
     return (box_sum(radiance, factor) / np.maximum(count, 1)[..., None]).astype(np.float32), count > 0
 
@@ -73,19 +69,15 @@ def box_majority(values: Shaped[np.ndarray, "h w"], factor: int) -> Shaped[np.nd
     result, step = np.empty((rows, columns), values.dtype), max(1, VOTED_AT_ONCE // (factor * values.shape[1]))
     for first in range(0, rows, step):
         last = min(first + step, rows)
-        result[first:last] = _majority(values[first * factor : last * factor], factor, first)
+        strip = values[first * factor : last * factor]
+        candidates = np.unique(strip)  # ascending
+        smallest = np.full((last - first, columns), candidates[0])
+        largest, most = smallest.copy(), np.zeros(smallest.shape, np.int64)
+        for value in candidates:
+            votes = box_sum(strip == value, factor, np.int64)
+            smallest[votes > most] = value
+            largest[votes >= most] = value
+            most = np.maximum(votes, most)
+        odd = np.add.outer(np.arange(first, last), np.arange(columns)) % 2
+        result[first:last] = np.where(odd, largest, smallest)
     return result
-
-
-def _majority(values: np.ndarray, factor: int, first: int) -> np.ndarray:
-    """Of a strip whose boxes begin in row `first` of boxes."""
-    found = np.unique(values)
-    shape = [n // factor for n in values.shape]
-    smallest, largest = np.full(shape, found[0]), np.full(shape, found[0])
-    most = np.zeros(shape, np.int64)
-    for value in found:  # ascending
-        votes = box_sum(values == value, factor, np.int64)
-        smallest = np.where(votes > most, value, smallest)
-        largest = np.where(votes >= most, value, largest)
-        most = np.maximum(votes, most)
-    return np.where(np.add.outer(np.arange(first, first + shape[0]), np.arange(shape[1])) % 2, largest, smallest)

@@ -1,12 +1,14 @@
-"""What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags, and how much light its exposure let in."""
+"""What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags: how much light its exposure let in, and the focal length
+in pixels.  Focal lengths hold for the whole frame only: a crop keeps the tags and changes the angle, by how much nobody wrote down."""
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +16,42 @@ from PIL import Image
 
 EXIF_IFD = 0x8769
 NAMES = {
-    0x829A: "ExposureTime",
-    0x829D: "FNumber",
-    0x8827: "Exif:PhotographicSensitivity",
-    0x920A: "Exif:FocalLength",
-    0xA002: "Exif:PixelXDimension",
-    0xA003: "Exif:PixelYDimension",
-    0xA20E: "Exif:FocalPlaneXResolution",
-    0xA210: "Exif:FocalPlaneResolutionUnit",
-    0xA405: "Exif:FocalLengthIn35mmFilm",
-}
+    0x829A: "ExposureTime", 0x829D: "FNumber", 0x8827: "Exif:PhotographicSensitivity", 0x920A: "Exif:FocalLength",
+    0xA002: "Exif:PixelXDimension", 0xA003: "Exif:PixelYDimension", 0xA20E: "Exif:FocalPlaneXResolution",
+    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA405: "Exif:FocalLengthIn35mmFilm",
+}  # fmt: skip
 WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA405)
 DNG_VERSION = 0xC612  # a tag that every DNG has
 ISO_UNSAID = 65535  # what the tag holds for all that does not fit into it
 DAMAGED = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, struct.error)  # what Pillow makes of it
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
+FRAMES = (3 / 2, 4 / 3, 16 / 9)  # long side / short side of whole frames
+SAME_SHAPE = 0.02  # relative tolerance of proportions: cameras trim some pixels
+UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # EXIF FocalPlaneResolutionUnit
+log = logging.getLogger("factorlib.images")
+
+
+def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
+    """The tags of a block as HEIF keeps it ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does, as DNG and most raw
+    files do; none where there are none, or where they are damaged.  `DNG` is True for a DNG."""
+    exif, named, numbers = Image.Exif(), {}, {}
+    with (
+        suppress(*DAMAGED),
+        warnings.catch_warnings(action="ignore"),  # of damaged tags, in lines of Pillow's source
+        nullcontext() if isinstance(source, bytes | None) else Path(source).open("rb") as stream,
+    ):
+        exif.load(source or b"") if stream is None else exif.load_from_fp(stream)
+        named |= {"DNG": True} if DNG_VERSION in exif else {}
+        tags = exif.get_ifd(EXIF_IFD)
+        for tag in NAMES.keys() & tags.keys():
+            try:
+                number = float(tags[tag][0] if isinstance(tags[tag], tuple) else tags[tag])
+            except (TypeError, ValueError, IndexError, ZeroDivisionError):
+                continue
+            if math.isfinite(number):
+                numbers[NAMES[tag]] = round(number) if tag in WHOLE else number
+        named |= numbers
+    return named
 
 
 def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
@@ -38,58 +62,55 @@ def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
     >>> exposure_of_exif({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
     0.25
     """
-    time, aperture, iso = (
-        positive(exif.get(name)) for name in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity")
-    )
+    time, aperture, iso = (_positive(exif, n) for n in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity"))
     if time is None or aperture is None or iso is None or iso == ISO_UNSAID:
         return None
     exposure = time * iso / aperture**2
     return exposure if 0 < exposure < math.inf else None
 
 
-def exif_of_bytes(data: bytes | None) -> dict[str, float | int]:
-    """The tags of a block as HEIF keeps it ("Exif", two zeros, a TIFF); what is damaged says nothing."""
-    return _tags(data or b"", _named)
+def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str | Path = "") -> float | None:
+    """Focal length in pixels of a photo of width × height as stored; None where EXIF does not say it, or the photo is a crop.
 
+    The first of two ways that works: `FocalLengthIn35mmFilm` f₃₅ by the convention of CIPA DCG-001, the same angle across the diagonal
+    as on 36 × 24 mm film, so f₃₅ / 43.27 mm × the photo's diagonal (whole millimetres, so about 1 %); and `FocalLength` ×
+    `FocalPlaneXResolution`, scaled from the width the camera wrote (`PixelXDimension`) to this one.
 
-def exif_of_tiff(path: str | Path) -> dict[str, float | int]:
-    """The tags of a file that begins as a TIFF does, as DNG and most raw files do; none of others."""
-    return _tags(path, _named)
-
-
-def is_dng(path: str | Path) -> bool:
-    """Whether a file is a TIFF that says it is a DNG."""
-    return bool(_tags(path, lambda exif: {DNG_VERSION: True} if DNG_VERSION in exif else {}))
-
-
-def _tags(source: bytes | str | Path, take: Callable[[Image.Exif], dict]) -> dict:
-    """Pillow warns of tags that are damaged, in its own source's lines: such tags say nothing here."""
-    exif = Image.Exif()
-    try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            nullcontext() if isinstance(source, bytes) else Path(source).open("rb") as stream,
-        ):
-            exif.load(source) if stream is None else exif.load_from_fp(stream)
-            return take(exif)
-    except DAMAGED:
-        return {}
-
-
-def _named(exif: Image.Exif) -> dict[str, float | int]:
-    tags = exif.get_ifd(EXIF_IFD)
-    numbers = {tag: _number(tags[tag]) for tag in NAMES if tag in tags}
-    return {NAMES[tag]: round(value) if tag in WHOLE else value for tag, value in numbers.items() if value is not None}
-
-
-def _number(value: Any) -> float | None:
-    try:
-        number = float(value[0] if isinstance(value, tuple) else value)
-    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+    >>> round(focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 6000, 4000), 1)
+    8333.3
+    >>> focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 4000, 4000) is None
+    True
+    """
+    film, focal, density, across, down = (
+        _positive(exif, f"Exif:{tag}")
+        for tag in (
+            "FocalLengthIn35mmFilm",
+            "FocalLength",
+            "FocalPlaneXResolution",
+            "PixelXDimension",
+            "PixelYDimension",
+        )
+    )
+    unit = UNIT_MM.get(exif.get("Exif:FocalPlaneResolutionUnit", 2))
+    if film:
+        focal_px = film / FILM_DIAGONAL * math.hypot(width, height)
+    elif focal and density and across and unit:
+        focal_px = focal * density / unit * width / across
+    else:
         return None
-    return number if math.isfinite(number) else None
+    shape = _proportion(width, height)
+    as_taken = not (across and down) or abs(shape / _proportion(across, down) - 1) <= SAME_SHAPE
+    if not (as_taken and any(abs(shape / frame - 1) <= SAME_SHAPE for frame in FRAMES)):
+        log.warning("%s: is a crop of what the camera took, so its EXIF focal length is not used", file)
+        return None
+    return focal_px
 
 
-def positive(value: Any) -> float | None:
-    """The value of a tag as a number, None where it is none, or not more than 0."""
+def _proportion(a: float, b: float) -> float:
+    return max(a, b) / min(a, b)
+
+
+def _positive(exif: Mapping[str, Any], name: str) -> float | None:
+    """A tag as a number, None where it is none, or not more than 0."""
+    value = exif.get(name)
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None

@@ -7,16 +7,16 @@ be applied again.  The picture is decoded at once, in its own codes: 96 MB for 4
 from __future__ import annotations
 
 import io
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
 from PIL import ImageCms
 
 from factorlib.errors import InputError
-from factorlib.images.exif import exif_of_bytes
+from factorlib.images.exif import exif_of
 from factorlib.images.scanlines import COPY, Stored
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
@@ -39,7 +39,6 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
     """Raises InputError for a file that cannot be decoded, and for one in a transfer function of HDR video."""
 
     def refused(fault: str, cure: str) -> InputError:
-        """The error that names this file."""
         return InputError(fault, file=path, key=key, cure=cure)
 
     convert = f"convert it: magick {Path(path).name} {Path(path).stem}.png"
@@ -72,27 +71,22 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         codes = codes[..., None] if codes.ndim == 2 else codes
         return codes[..., :3] if codes.shape[2] >= 3 else np.broadcast_to(codes[..., :1], (height, width, 3))
 
+    exif = exif_of(info.get("exif"))
+    across, down = (exif.get(name) for name in SIZES)
+    if (
+        across and down and (across > down) != (width > height)
+    ):  # what the camera wrote is of the picture before it was turned
+        exif |= dict(zip(SIZES, (down, across)))
+    profile = ""
+    with suppress(OSError, ImageCms.PyCMSError):
+        if icc := info.get("icc_profile"):
+            profile = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip()
     return Stored(
         width=width,
         height=height,
-        exif=_upright(exif_of_bytes(info.get("exif")), width, height),
-        profile=_profile(info.get("icc_profile")),
+        exif=exif,
+        profile=profile,
         white=2 ** info["bit_depth"] - 1,
         encoding="srgb",
         rows=lambda begin, end: pixels()[begin:end],
     )
-
-
-def _upright(exif: dict[str, float | int], width: int, height: int) -> dict[str, Any]:
-    """With the sizes that the camera wrote, of the picture before it was turned, as those of a picture lying like this one."""
-    across, down = (exif.get(name) for name in SIZES)
-    if across is None or down is None or (across > down) == (width > height):
-        return exif
-    return exif | dict(zip(SIZES, (down, across)))
-
-
-def _profile(icc: bytes | None) -> str:
-    try:
-        return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip() if icc else ""
-    except (OSError, ImageCms.PyCMSError):
-        return ""

@@ -22,8 +22,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_any, box_mean
-from factorlib.images.exif import exposure_of_exif
-from factorlib.images.focal import focal_px_of_exif
+from factorlib.images.exif import exposure_of_exif, focal_px_of_exif
 from factorlib.images.heif import is_heif, open_heif
 from factorlib.images.raw import is_raw, open_raw
 from factorlib.images.scanlines import Stored, open_scanlines
@@ -95,7 +94,13 @@ def decoded(
     radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(stored, factor, path):
-        linear = _decoded(codes, stored.white, encoding)
+        if (white := stored.white) is None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                linear = np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
+        elif white >= 2**16:
+            linear = decoder(encoding)(codes / white).astype(np.float32)
+        else:
+            linear = decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
         look(linear)
         numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
@@ -108,7 +113,11 @@ def decoded(
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
         log.warning("%s: its colour profile is %r; %s", path, profile, words)
-    radiance, clipped, finite = (_oriented(pixels, stored.orientation) for pixels in (radiance, clipped, finite))
+    swapped, back = stored.orientation >= 5, [-1 if flip else 1 for flip in _flipped(stored.orientation)]
+    radiance, clipped, finite = (
+        np.ascontiguousarray((pixels.swapaxes(0, 1) if swapped else pixels)[:: back[0], :: back[1]])
+        for pixels in (radiance, clipped, finite)
+    )
     focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
     return Photo(
         radiance, clipped, finite, focal_px and focal_px / factor, finite.shape[1], finite.shape[0], encoding, factor,
@@ -123,7 +132,8 @@ def _strips(
 
     Boxes count from the displayed corner, so what is left over lies at the other end of an axis that display turns round.
     """
-    turned = _reversed_axes(stored.orientation)
+    flips = _flipped(stored.orientation)
+    turned = flips[::-1] if stored.orientation >= 5 else flips
     top, left = (n % factor if back else 0 for n, back in zip((stored.height, stored.width), turned))
     columns, height = slice(left, left + stored.width // factor * factor), stored.height // factor
     step = max(1, READ_AT_ONCE // (factor * stored.width))
@@ -139,24 +149,6 @@ def _strips(
             stored.rows(end, stored.height)  # a file that is cut short there is refused all the same
 
 
-def _reversed_axes(orientation: int) -> tuple[bool, bool]:
-    """Whether display reverses the order of the stored rows, and of the stored columns."""
-    down, across = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-    return (across, down) if orientation >= 5 else (down, across)
-
-
-def _oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Turned as EXIF says: 1 as is, 2-4 mirrored or half turned, 5-8 with rows and columns swapped."""
-    turned = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
-    rows, columns = -1 if orientation in (3, 4, 7, 8) else 1, -1 if orientation in (2, 3, 6, 7) else 1
-    return np.ascontiguousarray(turned[::rows, ::columns])
-
-
-def _decoded(codes: np.ndarray, white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
-    """Linear values, an array of their own."""
-    if white is None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
-    if white >= 2**16:
-        return decoder(encoding)(codes / white).astype(np.float32)
-    return decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
+def _flipped(orientation: int) -> tuple[bool, bool]:
+    """Whether the order of rows, and of columns, is turned round, once 5-8 have them swapped."""
+    return orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)

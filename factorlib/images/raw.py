@@ -11,32 +11,30 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.ndimage import maximum_filter
 
 from factorlib.dataset.schema import RAW
 from factorlib.errors import InputError
-from factorlib.images.exif import exif_of_tiff, is_dng
+from factorlib.images.exif import exif_of
 from factorlib.images.scanlines import CLIPPED, Stored
 
 ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's of LibRaw's `flip`
 AROUND = 5  # pixels a side from which demosaicing takes a pixel's colour
 WHITE = 2**16 - 1
+TAGS = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLength")
 
 
 def is_raw(path: str | Path) -> bool:
     """By its suffix, or as a TIFF that says it is a DNG: its first picture is but a preview."""
-    return Path(path).suffix.lower() in RAW or is_dng(path)
+    return Path(path).suffix.lower() in RAW or "DNG" in exif_of(path)
 
 
 def open_raw(path: str | Path, key: str | None) -> Stored:
     """Raises InputError for a file that LibRaw cannot read."""
 
     def refused(fault: str, error: Exception) -> InputError:
-        """The error that names this file, in LibRaw's words."""
         text = error.args[0] if error.args else error
         words = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
         cure = f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif"
@@ -48,11 +46,17 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
         raise refused("raw photos are read by rawpy, which cannot be imported", error) from None
     try:
         sensor = rawpy.imread(str(path))
-        sizes, camera = sensor.sizes, _of_camera(sensor.other)
+        sizes, other = sensor.sizes, sensor.other
     except rawpy.LibRawError as error:
         raise refused("not readable as a raw photo", error) from None
-    top, left, height, width = _crop(sizes)
+    # what the file says is the picture, in developed pixels; all of it where it does not
+    top, left = sizes.crop_top_margin - sizes.top_margin, sizes.crop_left_margin - sizes.left_margin
+    height, width = sizes.crop_height, sizes.crop_width
+    inside = top + height <= sizes.iheight and left + width <= sizes.iwidth
+    if not (min(top, left) >= 0 < min(height, width) and inside):
+        top, left, height, width = 0, 0, sizes.iheight, sizes.iwidth
     inner = slice(top, top + height), slice(left, left + width)
+    camera = other.shutter_speed, other.aperture, other.iso_speed, other.focal_length  # for files that are no TIFF
 
     @cache
     def developed() -> tuple[np.ndarray, np.ndarray]:
@@ -66,36 +70,19 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
                 )  # fmt: skip
             except rawpy.LibRawError as error:
                 raise refused("cannot be developed", error) from None
-            return pixels[inner], _saturated(sensor)[inner]
+            # where a sensor pixel that a developed one is made of has reached the white level
+            levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
+            full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
+            full = full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
+            return pixels[inner], full[inner]
 
     return Stored(
         width=width,
         height=height,
         orientation=ORIENTATION.get(sizes.flip, 1),
-        exif={**camera, **exif_of_tiff(path)},
+        exif={**dict(zip(TAGS, camera)), **exif_of(path)},
         white=WHITE,
         encoding="linear",
         rows=lambda begin, end: developed()[0][begin:end],
         saturated=lambda begin, end: np.repeat(developed()[1][begin:end, :, None], 3, axis=2),
     )
-
-
-def _saturated(sensor: Any) -> Bool[np.ndarray, "h w"]:
-    """Where a sensor pixel that a developed one is made of has reached the white level."""
-    levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
-    full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
-    return full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
-
-
-def _crop(sizes: Any) -> tuple[int, int, int, int]:
-    """Top, left, height and width, in developed pixels, of what the file says is the picture; all of it where it does not."""
-    top, left, height, width = sizes.crop_top_margin, sizes.crop_left_margin, sizes.crop_height, sizes.crop_width
-    top, left = top - sizes.top_margin, left - sizes.left_margin
-    inside = min(top, left) >= 0 < min(height, width) and top + height <= sizes.iheight and left + width <= sizes.iwidth
-    return (top, left, height, width) if inside else (0, 0, sizes.iheight, sizes.iwidth)
-
-
-def _of_camera(other: Any) -> dict[str, float]:
-    """What LibRaw knows of the exposure, for raw files that are no TIFF."""
-    names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLength")
-    return dict(zip(names, (other.shutter_speed, other.aperture, other.iso_speed, other.focal_length)))

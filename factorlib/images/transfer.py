@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 Values = Float[np.ndarray, "*shape"]
-ENCODINGS = ("srgb", "linear", "gamma2.2")
 
 
 def srgb_decode(encoded: Values) -> Values:
@@ -35,24 +34,11 @@ def srgb_encode(linear: Values) -> Values:
     return np.copysign(np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055), linear)
 
 
-def gamma_decode(encoded: Values, gamma: float = 2.2) -> Values:
-    """encoded^γ.
-
-    >>> gamma_decode(np.array([0.5])).round(6).tolist()
-    [0.217638]
-    """
-    return np.copysign(np.abs(encoded) ** gamma, encoded)
-
-
-def gamma_encode(linear: Values, gamma: float = 2.2) -> Values:
-    """linear^(1/γ).
-
-    >>> gamma_encode(np.array([0.217638])).round(6).tolist()
-    [0.5]
-    """
-    return np.copysign(np.abs(linear) ** (1 / gamma), linear)
+def gamma_decode(encoded: Values) -> Values:
+    """encoded^2.2."""
+    return np.copysign(np.abs(encoded) ** 2.2, encoded)
 
 
 def decoder(encoding: str) -> Callable[[Values], Values]:
-    """The function from values of `encoding` (one of ENCODINGS) to linear ones."""
+    """The function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
     return {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}[encoding]

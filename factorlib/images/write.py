@@ -25,7 +25,20 @@ def write_image(path: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> N
 
 def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes:
     """The bytes of an image file of `pixels` [h, w, c], in the format of the suffix of `name`; raises OSError where that fails."""
-    return bytes_of(lambda memory: _encode(Path(name), memory, spec, np.ascontiguousarray(pixels)))
+
+    def encode(memory: str) -> None:
+        output = oiio.ImageOutput.create(str(name))
+        if output is None:
+            raise OSError(f"{name}: cannot be written: {oiio.geterror()}")
+        written = output.open(memory, spec) and output.write_image(np.ascontiguousarray(pixels))
+        error = output.geterror()
+        closed = output.close()
+        error = error or output.geterror()
+        del output
+        if not (written and closed):
+            raise OSError(f"{name}: cannot be written: {error}")
+
+    return bytes_of(encode)
 
 
 def write_hdr(path: str | Path, radiance: Float[np.ndarray, "h w 3"]) -> None:
@@ -47,16 +60,3 @@ def write_gif(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], se
     each = max(20, round(1000 * seconds / len(frames)))  # browsers show shorter ones slowly
     solid[0].save(memory, "GIF", save_all=True, append_images=solid[1:], duration=each, loop=0, disposal=2)
     write_bytes(path, memory.getvalue())
-
-
-def _encode(path: Path, memory: str, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
-    output = oiio.ImageOutput.create(str(path))
-    if output is None:
-        raise OSError(f"{path}: cannot be written: {oiio.geterror()}")
-    written = output.open(memory, spec) and output.write_image(pixels)
-    error = output.geterror()
-    closed = output.close()
-    error = error or output.geterror()
-    del output
-    if not (written and closed):
-        raise OSError(f"{path}: cannot be written: {error}")

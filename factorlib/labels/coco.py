@@ -15,6 +15,7 @@ from jaxtyping import Bool, Int
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.labels.png import check_size
 from factorlib.reading import read_bytes, reading
 
 OVERSHOOT = 2.0  # pixels by which a polygon may leave the image
@@ -66,19 +67,17 @@ class Coco(msgspec.Struct, frozen=True):
 
 def read_coco(
     path: str | Path, image: str, materials: list[str], size: tuple[int, int], key: str = "masks"
-) -> tuple[dict[str, Bool[np.ndarray, "h w"]], tuple[int, int]]:
-    """The union of the annotations of each material in the photo named `image`, and the (height, width) they are for.
+) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """The union of the annotations of each material in the photo named `image`.
 
-    size: (height, width) of the photo, for files that do not say it; key: where the file is named, for messages.
-    Raises InputError naming the annotation.
+    size: (height, width) of the photo; key: where the file is named, for messages.
+    Raises InputError naming the annotation, and for a file that is about a picture of another size.
     """
     content = read_bytes(path, "COCO", key, MOST_BYTES)
     with reading("COCO", path, key, "it needs images, annotations and categories"):
         coco = msgspec.json.decode(content, type=Coco)
     entry = _entry(coco, image, path)
-    shape = (entry.height or size[0], entry.width or size[1])
-    if shape != size:
-        return {}, shape
+    check_size((entry.height or size[0], entry.width or size[1]), size, path, key)
     names = {category.id: category.name for category in coco.categories}
     of_material: dict[str, list[tuple[str, msgspec.Raw]]] = {}
     for index, annotation in enumerate(coco.annotations):
@@ -94,11 +93,11 @@ def read_coco(
         of_material.setdefault(name, []).append((f"{at}.segmentation", annotation.segmentation))
     masks, length = {}, 0.0  # of all outlines
     for name, own in of_material.items():
-        edges = np.zeros(shape[0] * shape[1] + 1, np.int32)  # how many shapes begin at a pixel, less how many end
+        edges = np.zeros(size[0] * size[1] + 1, np.int32)  # how many shapes begin at a pixel, less how many end
         for at, segmentation in own:
-            shapes, longer = _shapes(segmentation, shape, path, at)
+            shapes, longer = _shapes(segmentation, size, path, at)
             length += longer
-            if length > LONGEST_OF_ALL * sum(shape):
+            if length > LONGEST_OF_ALL * sum(size):
                 fault = "the outlines of this photo are longer than any drawing"
                 raise InputError(fault, file=path, key=at, cure=CURE)
             for counts in shapes:
@@ -107,8 +106,8 @@ def read_coco(
                 np.add.at(edges, borders[0::2], 1)
                 np.add.at(edges, borders[1::2], -1)
         inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
-        masks[name] = np.ascontiguousarray(inside.reshape(shape[::-1]).T)
-    return masks, shape
+        masks[name] = np.ascontiguousarray(inside.reshape(size[::-1]).T)
+    return masks
 
 
 def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
@@ -166,16 +165,19 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
             raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
         return [segmentation.counts], 0.0
-    polygons, length = [], 0.0
+    polygons, length, limit = [], 0.0, np.array(shape[::-1])
     for index, polygon in enumerate(segmentation):
-        fault, cure, longer = None, "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more", 0.0
-        if len(polygon) < 6 or len(polygon) % 2 or not np.isfinite(polygon).all():
+        fault, cure, corners = (
+            None,
+            "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more",
+            np.array(polygon),
+        )
+        if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is no polygon"
+        elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
+            fault = f"leaves the image of {_wh(shape)} pixels"
+            cure = "was it drawn at another size? cut it at the image's edge"
         else:
-            corners, limit = np.reshape(polygon, (-1, 2)), np.array(shape[::-1])
-            if (corners < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():
-                fault = f"leaves the image of {_wh(shape)} pixels"
-                cure = "was it drawn at another size? cut it at the image's edge"
             corners = np.clip(corners, 0, limit)
             longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
             if longer > LONGEST * sum(shape):

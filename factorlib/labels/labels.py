@@ -13,11 +13,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
+from numpy.lib.stride_tricks import sliding_window_view
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
-from factorlib.labels.png import check_size, read_inside, read_values
+from factorlib.labels.png import read_inside, read_values
 
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
 log = logging.getLogger("factorlib.labels")
@@ -44,19 +45,16 @@ def read_labels(
     size: (height, width) of the photo as displayed; image: its name, for COCO; key: of `masks`, for messages.
     Raises InputError naming file and key.
     """
-    where = file(masks) if isinstance(masks, str) else file(next(iter(masks.values())))
+    where = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
-        names = sorted(masks, key=materials.index)
-        inside = {name: read_inside(file(masks[name]), f"{key}.{name}", size) for name in names}
-        places = {name: (file(masks[name]), f"{key}.{name}") for name in names}
-        labels = _merged(inside, materials, size, places, edge=0)
+        places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
+        labels = _merged({name: read_inside(*at, size) for name, at in places.items()}, materials, places, edge=0)
     elif masks.lower().endswith(".json"):
-        inside, shape = read_coco(where, image, materials, size, key)
-        check_size(shape, size, where, key)
-        labels = _merged(inside, materials, size, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
+        inside = read_coco(where, image, materials, size, key)
+        labels = _merged(inside, materials, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
     else:
         labels = _of_values(read_values(where, key, size), where, materials, key)
-    if not labels.label.any():
+    if labels is None or not labels.label.any():
         fault = "the mask is empty: no pixel has a material"
         raise InputError(fault, file=where, key=key, cure="paint at least one material, or drop the photo")
     return labels
@@ -100,26 +98,21 @@ def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[st
 
 
 def _merged(
-    inside: Mapping[str, np.ndarray],
-    materials: list[str],
-    size: tuple[int, int],
-    where: Mapping[str, tuple[Path, str]],
-    edge: int,
-) -> Labels:
-    """One map of several masks; what two of them claim is refused where it is wider than `edge` pixels, else left out."""
-    label, left_out = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=bool)
-    for number, material in enumerate(materials, 1):
-        if material not in inside:
-            continue
+    inside: Mapping[str, np.ndarray], materials: list[str], where: Mapping[str, tuple[Path, str]], edge: int
+) -> Labels | None:
+    """One map of several masks, None of none; what two of them claim is refused where it is wider than `edge` pixels, else left out."""
+    if not inside:
+        return None
+    label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
+    left_out = label > 0
+    for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
+        path, key = where[material]
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            both, (path, key), also = (
-                inside[material] & (label == other),
-                where[material],
-                where[materials[other - 1]][0],
-            )
+            both, also = inside[material] & (label == other), where[materials[other - 1]][0]
             fault = f"materials {materials[other - 1]!r} and {material!r} share {int(both.sum())} pixels"
             fault += f" with {also.name}" if also != path else ""
-            if _is_wider(both, edge):
+            square = (edge + 1, edge + 1)
+            if min(both.shape) > edge and sliding_window_view(both, square).all((2, 3)).any():
                 cure = "a pixel shows one material: erase it from the one behind"
                 raise InputError(fault, file=path, key=key, cure=cure)
             log.warning("%s: %s: %s along their outlines: these are left out", path, key, fault)
@@ -127,12 +120,3 @@ def _merged(
         label[inside[material]] = number
     label[left_out] = 0
     return Labels(label=label, left_out=left_out)
-
-
-def _is_wider(region: Bool[np.ndarray, "h w"], width: int) -> bool:
-    """Whether a square of width + 1 pixels fits into it somewhere."""
-    for axis in (0, 1):
-        length = region.shape[axis] - width
-        rows = [np.take(region, range(k, k + length), axis=axis) for k in range(width + 1)]
-        region = np.logical_and.reduce(rows)
-    return bool(region.any())

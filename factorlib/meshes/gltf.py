@@ -10,7 +10,6 @@ import base64
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -27,12 +26,7 @@ UNNAMED = "GLTF"
 MOST_PARTS = 100_000  # of one file
 
 
-class Placed(msgspec.Struct, frozen=True):
-    """A primitive at a node's place."""
-
-    primitive: Primitive
-    names: tuple[str, ...]
-    world_from_node: Float[np.ndarray, "4 4"]
+Placed = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "4 4"]]  # a primitive, its names, world_from_node
 
 
 def check_count(parts: int, file: str | Path) -> None:
@@ -46,9 +40,10 @@ def read_gltf(path: Path, limits: Limits) -> Soup:
     """InputError, or what a wrong index in its header raises."""
     header = read_header(path, most_bytes=limits.bytes)
     check_count(sum(len(header.meshes[node.mesh].primitives) for node in header.nodes if node.mesh is not None), path)
-    places = [(place, *_size(place.primitive, header, path)) for place in _placed(header)]
-    limits.check(sum(vertices for _, vertices, _ in places), sum(triangles for _, _, triangles in places), path)
-    return _joined([place for place, _, triangles in places if triangles], _Buffers(header, path, limits))
+    places = _placed(header)
+    sizes = np.array([_size(primitive, header, path) for primitive, _, _ in places], object).reshape(-1, 2)
+    limits.check(*sizes.sum(axis=0).tolist(), path)
+    return _joined([place for place, size in zip(places, sizes) if size[1]], _Buffers(header, path, limits))
 
 
 # ── which triangles there are, and where ─────────────────────────────────────────────────────────────────────────────
@@ -66,7 +61,7 @@ def _placed(header: Header) -> list[Placed]:
             own = (node.name or str(index),) if len(primitives) == 1 else ()
             material = header.materials[primitive.material].name if primitive.material is not None else None
             known = dict.fromkeys(name for name in (names[node.mesh][k], *own, material) if name)
-            places.append(Placed(primitive, tuple(known), world_from_node))
+            places.append((primitive, tuple(known), world_from_node))
     return places
 
 
@@ -140,14 +135,16 @@ class _Buffers:
         self.header, self.path, self.left = header, path, limits.bytes
         self.contents: dict[int, bytes] = {}
 
+    def refused(self, fault: str) -> InputError:
+        return InputError(fault, file=self.path, cure=CURE)
+
     def buffer(self, index: int) -> bytes:
         """The bytes of buffer `index`; InputError where it is shorter than the header says, or larger than the limits."""
         if index not in self.contents:
             entry = self.header.buffers[index]
             content = self._content(entry.uri)
             if len(content) < entry.byteLength:
-                fault = f"buffer {index} has {len(content)} of {entry.byteLength} bytes"
-                raise InputError(fault, file=self.path, cure=CURE)
+                raise self.refused(f"buffer {index} has {len(content)} of {entry.byteLength} bytes")
             self.contents[index], self.left = content, self.left - len(content)
         return self.contents[index]
 
@@ -163,7 +160,7 @@ class _Buffers:
         begin = BEFORE_JSON + int.from_bytes(content[12:16], "little")
         length, kind = int.from_bytes(content[begin : begin + 4], "little"), content[begin + 4 : begin + 8]
         if kind != b"BIN\0" or begin + 8 + length > len(content):
-            raise InputError("its binary chunk is missing or cut short", file=self.path, cure=CURE)
+            raise self.refused("its binary chunk is missing or cut short")
         return content[begin + 8 : begin + 8 + length]
 
     def array(self, index: int) -> np.ndarray:
@@ -186,14 +183,14 @@ class _Buffers:
         last = offset + (count - 1) * stride + kind.itemsize * width
         data = self.buffer(view.buffer)
         if count and (last > view.byteLength or view.byteOffset + last > len(data)):
-            raise InputError(f"an accessor reaches beyond buffer view {index}", file=self.path, cure=CURE)
+            raise self.refused(f"an accessor reaches beyond buffer view {index}")
         return np.ndarray((count, width), kind, data, view.byteOffset + offset if count else 0, (stride, kind.itemsize))
 
     def vectors(self, primitive: Primitive, attribute: str) -> Float[np.ndarray, "v 3"]:
         """An attribute of a primitive's vertices; InputError where it is not of three numbers."""
         values = self.array(primitive.attributes[attribute])
         if values.shape[1] != 3:
-            raise InputError(f"a {attribute} has {values.shape[1]} numbers, not 3", file=self.path, cure=CURE)
+            raise self.refused(f"a {attribute} has {values.shape[1]} numbers, not 3")
         return floats(values)
 
     def faces(self, primitive: Primitive) -> Int[np.ndarray, "f 3"]:
@@ -204,8 +201,7 @@ class _Buffers:
             corners = np.arange(self.header.accessors[primitive.attributes["POSITION"]].count)
         if primitive.mode == TRIANGLES:
             if len(corners) % 3:
-                fault = f"a primitive has {len(corners)} corners, which makes no triangles"
-                raise InputError(fault, file=self.path, cure=CURE)
+                raise self.refused(f"a primitive has {len(corners)} corners, which makes no triangles")
             return corners.reshape(-1, 3)
         first = np.full(max(len(corners) - 2, 0), corners[0]) if primitive.mode == FAN else corners[:-2]
         faces = np.stack([first, corners[1:-1], corners[2:]], axis=1)
@@ -217,18 +213,17 @@ class _Buffers:
 def _joined(places: list[Placed], data: _Buffers) -> Soup:
     """One soup of all primitives, in the scene's frame; normals transform by the cofactors of the linear part."""
     vertices, faces, normals, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [no_normals(0)], 0
-    for place in places:
-        points, own = data.vectors(place.primitive, "POSITION"), data.faces(place.primitive)
-        linear, shift = place.world_from_node[:3, :3], place.world_from_node[:3, 3]
+    for primitive, _, world_from_node in places:
+        points, own = data.vectors(primitive, "POSITION"), data.faces(primitive)
+        linear, shift = world_from_node[:3, :3], world_from_node[:3, 3]
         of_corners = no_normals(len(own))
         with np.errstate(all="ignore"):  # as above
             vertices.append(points @ linear.T + shift)
-            if "NORMAL" in place.primitive.attributes:
+            if "NORMAL" in primitive.attributes:
                 cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
-                of_corners = at_corners(data.vectors(place.primitive, "NORMAL") @ cofactor.T, own)
+                of_corners = at_corners(data.vectors(primitive, "NORMAL") @ cofactor.T, own)
         normals.append(of_corners)
         faces.append(np.where((own >= 0) & (own < len(points)), own + offset, -1))
         offset += len(points)
-    part = np.repeat(np.arange(len(places)), [len(own) for own in faces[1:]])
-    names = [place.names for place in places]
+    part, names = np.repeat(np.arange(len(places)), [len(own) for own in faces[1:]]), [names for _, names, _ in places]
     return Soup(np.concatenate(vertices), np.concatenate(faces), part, names, np.concatenate(normals))

@@ -72,7 +72,10 @@ def corner_normals(
     """Unit normal at each corner of each face: angle-weighted over the faces of its vertex within `crease_deg` of its own."""
     area = area_vectors(vertices, faces)
     normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
-    weight = corner_angles(vertices, faces).reshape(-1)
+    corner = vertices[faces]
+    onward, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    angle = np.arctan2(np.linalg.norm(np.cross(onward, back), axis=-1), np.einsum("fkd,fkd->fk", onward, back))
+    weight = angle.reshape(-1)
     order = np.argsort(faces.reshape(-1), kind="stable")  # corners, grouped by vertex
     vertex = faces.reshape(-1)[order]
     starts = np.flatnonzero(np.r_[True, vertex[1:] != vertex[:-1]])
@@ -89,13 +92,6 @@ def corner_normals(
     length = np.linalg.norm(result, axis=1, keepdims=True)
     own = np.repeat(normal, 3, axis=0)
     return np.where(length > 1e-12, result / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
-
-
-def corner_angles(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Interior angle at each corner, radians; each face's sum to π."""
-    corner = vertices[faces]
-    onward, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
-    return np.arctan2(np.linalg.norm(np.cross(onward, back), axis=-1), np.einsum("fkd,fkd->fk", onward, back))
 
 
 def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

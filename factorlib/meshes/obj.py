@@ -6,18 +6,19 @@ The .mtl is never opened: a part's name is in the OBJ itself.
 
 from __future__ import annotations
 
+import re
 from array import array
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.soup import Soup, check_length, lines_of, quoted
+from factorlib.meshes.soup import Soup, lines_of, quoted
 
 MOST = 2**31  # vertices that any file numbers
 COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
+CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # a line that goes on in the next
 
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
@@ -27,7 +28,9 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     parts: dict[tuple[str, ...], int] = {}
     names = {"usemtl": (), "g": (), "o": ()}  # of the faces that follow
     current: int | None = None  # the part of these; None until a face asks
-    for number, line in _statements(content):
+    number = counted = 0
+    for line in lines_of(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
+        number += 1 + line.count("\v")
         key, *words = line.split("#", 1)[0].split() or [""]
         try:
             if key in table:
@@ -35,7 +38,10 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
                     raise ValueError("three numbers expected")
                 table[key].extend([float(word) for word in words[:3]])
             elif key == "f":
-                corners = [_corner(word, len(table["v"]) // 3, len(table["vn"]) // 3) for word in words]
+                corners = []
+                for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
+                    own = _index(normal, len(table["vn"]) // 3) if normal else -1
+                    corners.append((_index(vertex, len(table["v"]) // 3), own))
                 if len(corners) < 3:
                     raise ValueError("a face has three corners at least")
                 if current is None:
@@ -50,7 +56,8 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
         except (ValueError, IndexError, OverflowError) as error:
             fault = f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})"
             raise InputError(fault, file=path, cure="is it a text OBJ?") from error
-        if number % COUNTED_EVERY == 0:
+        if number - counted >= COUNTED_EVERY:
+            counted = number
             limits.check(len(table["v"]) // 3, len(part), path)
     limits.check(len(table["v"]) // 3, len(part), path)
     normals = np.concatenate([np.array(table["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
@@ -59,29 +66,6 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
     vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
     return Soup(vertices, corners, np.array(part, dtype=np.int64), list(parts), normals[index])
-
-
-def _statements(content: bytes) -> Iterator[tuple[int, str]]:
-    """Lines by the number they end at; a line that ends in a backslash goes on in the next."""
-    begun: list[str] = []
-    number = letters = 0
-    for number, line in enumerate(lines_of(content), start=1):
-        if line.endswith("\\"):
-            begun.append(line[:-1])
-            letters += len(line)
-            check_length(letters)
-            continue
-        yield number, " ".join([*begun, line]) if begun else line
-        begun.clear()
-        letters = 0
-    if begun:
-        yield number, " ".join(begun)
-
-
-def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
-    """Index of the vertex and of the normal of `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 0; −1 where it has no normal."""
-    fields = word.split("/")
-    return _index(fields[0], vertices), _index(fields[2], normals) if len(fields) > 2 and fields[2] else -1
 
 
 def _index(word: str, count: int) -> int:

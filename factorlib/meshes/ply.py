@@ -1,8 +1,7 @@
 """PLY files: read in text and both byte orders, written in binary little-endian, the same mesh as the same bytes.
 
-The numbers of a text file are read as rows of float64, so that one reader does for text and binary.  Rows are read at once where
-their lists are as long as those of the first row, else one by one (trimesh refuses these).  Nothing is made that the file has no
-room for.
+The numbers of a text file are read as rows of float64, so that one reader does for text and binary.  Lists in one file may differ in
+length (trimesh refuses these).  Nothing is made that the file has no room for.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from factorlib.errors import InputError
@@ -30,58 +28,38 @@ CORNERS = ("vertex_indices", "vertex_index")
 CURE = "is it whole, and a PLY? export it again"
 
 
-class Property(msgspec.Struct, frozen=True):
-    """The type of a number, and of the length that comes before a list of them (None: a single number), as NumPy writes them."""
-
-    type: str
-    length: str | None = None
-
-
-class Element(msgspec.Struct, frozen=True):
-    """A table of the file (`vertex`, `face` …): `count` rows of `properties`, in this order."""
-
-    count: int
-    properties: dict[str, Property]
-
-
-class Column(msgspec.Struct, frozen=True):
-    """values: one a row, or those of all lists in a row; counts: [rows] how many of them each row has."""
-
-    values: np.ndarray
-    counts: np.ndarray
+Properties = dict[
+    str, tuple[str, str | None]
+]  # type of each number, and of the length before a list of them, as NumPy writes them
+Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows in one row; how many each row has
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     """Vertices, polygons and, where there are all three of nx, ny, nz, normals; textures that it names are left alone."""
     order, elements, start = _header(path, content)
-    counts = {name: element.count for name, element in elements.items()}
+    counts = {name: count for name, (count, _) in elements.items()}
     limits.check(counts.get("vertex", 0), counts.get("face", 0), path)
-    rows = _Rows(content, start, order) if order else _Rows(numbers_in(content[start:]).tobytes(), 0, "")
-    columns = {name: rows.columns(element) for name, element in elements.items()}
+    content, at, columns = (content, start, {}) if order else (numbers_in(content[start:]).tobytes(), 0, {})
+    for name, (count, properties) in elements.items():
+        columns[name], at = _columns(content, at, order, count, properties)
     faces = columns.get("face", {})  # the list of that name, or the only one
     name = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
-    polygons = faces[name] if name else Column(np.empty(0), np.zeros(0, np.int64))
-    limits.check(0, int(np.maximum(polygons.counts - 2, 0).sum()), path)
-    if polygons.values.dtype.kind == "f" and not (np.abs(polygons.values) < 2**53).all():
+    values, sizes = faces[name] if name else (np.empty(0), np.zeros(0, np.int64))
+    limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
+    whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
+    if not whole or ((corners := values.astype(np.int64)) != values).any():
         raise InputError("a corner of a face is no whole number", file=path, cure=CURE)
-    corners = polygons.values.astype(np.int64)
-    if (corners != polygons.values).any():
-        raise InputError("a corner of a face is no whole number", file=path, cure=CURE)
-    points, normals = (_vectors(columns.get("vertex", {}), names) for names in ("xyz", ("nx", "ny", "nz")))
-    if points is None:
+    numbers = {name: floats(own) for name, (own, each) in columns.get("vertex", {}).items() if (each == 1).all()}
+    if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
-    return of_one_part(points, fans(polygons.counts, corners), path.stem, normals)
+    points, normals = (np.stack([numbers[n] for n in names], axis=1) if set(names) <= numbers.keys() else None
+                       for names in ("xyz", ("nx", "ny", "nz")))  # fmt: skip
+    return of_one_part(points, fans(sizes, corners), path.stem, normals)
 
 
-def _vectors(columns: dict[str, Column], names: tuple[str, ...] | str) -> np.ndarray | None:
-    """Three properties as vectors; None where one is missing, or a list."""
-    if not all(name in columns and (columns[name].counts == 1).all() for name in names):
-        return None
-    return np.stack([floats(columns[name].values) for name in names], axis=1)
-
-
-def _header(path: Path, content: bytes) -> tuple[str, dict[str, Element], int]:
-    """The byte order ("": text), the elements, and where rows begin; InputError for counts that the file has no room for."""
+def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:
+    """The byte order ("": text), rows and properties of each element, and where rows begin; InputError for counts that the file has
+    no room for."""
     end = END.search(content, 0, LONGEST)
     if not content.startswith(b"ply") or end is None:
         raise InputError("has no header of a PLY", file=path, cure=CURE)
@@ -96,13 +74,13 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, Element], int]:
                     order = ORDERS[word]
                 case ["element", name, count] if COUNT.fullmatch(count) and name not in elements:
                     properties = {}
-                    elements[name] = Element(int(count), properties)
+                    elements[name] = int(count), properties
                 case ["property", "list", length, kind, name] if (
                     TYPES.get(length, "f")[0] != "f" and name not in properties
                 ):
-                    properties[name] = Property(TYPES[kind], TYPES[length])
+                    properties[name] = TYPES[kind], TYPES[length]
                 case ["property", kind, name] if name not in properties:
-                    properties[name] = Property(TYPES[kind])
+                    properties[name] = TYPES[kind], None
                 case _:
                     raise ValueError("not a line of PLY, or a second one of that name")
         except (ValueError, LookupError, TypeError) as error:
@@ -111,65 +89,48 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, Element], int]:
     if order is None:
         raise InputError("its header does not say its format", file=path, cure=CURE)
     # a row takes at least: every list empty; in text a digit and a space each
-    sizes = [sum(np.dtype(p.length or p.type).itemsize if order else 2 for p in element.properties.values())
-             for element in elements.values()]  # fmt: skip
-    needed = sum(element.count * size for element, size in zip(elements.values(), sizes))
+    sizes = [sum(np.dtype(length or kind).itemsize if order else 2 for kind, length in properties.values())
+             for _, properties in elements.values()]  # fmt: skip
+    needed = sum(count * size for (count, _), size in zip(elements.values(), sizes))
     if needed > len(content) - start + 1:  # text may end without a line's end
-        counts = ", ".join(f"{element.count:,} {quoted(name)[1:-1]}" for name, element in elements.items())
+        counts = ", ".join(f"{count:,} {quoted(name)[1:-1]}" for name, (count, _) in elements.items())
         fault = f"its header says {counts}: {needed:,} bytes at least; {len(content) - start:,} follow"
         raise InputError(fault, file=path, cure=CURE)
     return order, elements, start
 
 
-class _Rows:
-    """The rows of a file's elements, from byte `at` on; byte order "": every number is a float64."""
+def _columns(content: bytes, at: int, order: str, count: int, properties: Properties) -> tuple[dict[str, Column], int]:
+    """The columns of an element's rows, and where these end.  Rows whose lists are as long as the next one's are taken together.
 
-    def __init__(self, content: bytes, at: int, order: str):
-        self.content, self.at, self.order = content, at, order
-
-    def columns(self, element: Element) -> dict[str, Column]:
-        """All rows of an element, by property; `at` moves behind them.  ValueError where they end early."""
-        if not element.count or not element.properties:
-            return {name: Column(np.empty(0), np.zeros(0, np.int64)) for name in element.properties}
-        begin, lengths = self.at, [len(self._next(p)) for p in element.properties.values()]
-        self.at = begin
-        if (columns := self._alike(element, lengths)) is not None:
-            return columns
-        rows = [{name: self._next(p) for name, p in element.properties.items()} for _ in range(element.count)]
-        values = {name: [row[name] for row in rows] for name in element.properties}
-        return {name: Column(np.concatenate(own), np.array([len(v) for v in own])) for name, own in values.items()}
-
-    def _kind(self, name: str) -> np.dtype:
-        return np.dtype(self.order + name if self.order else "f8")
-
-    def _numbers(self, kind: np.dtype, count: int) -> np.ndarray:
-        if self.at + count * kind.itemsize > len(self.content):
-            raise ValueError("its rows end early")
-        self.at += count * kind.itemsize
-        return np.frombuffer(self.content, kind, count, self.at - count * kind.itemsize)
-
-    def _next(self, p: Property) -> np.ndarray:
-        """The next number, or those of the next list."""
-        length = 1 if p.length is None else self._numbers(self._kind(p.length), 1)[0].item()
-        if length < 0 or length != int(length):
-            raise ValueError(f"a list of {length} numbers")
-        return self._numbers(self._kind(p.type), int(length))
-
-    def _alike(self, element: Element, lengths: list[int]) -> dict[str, Column] | None:
-        """All rows with lists of `lengths`, as one structured array; None where there is no room for them, or one has others."""
-        fields = []
-        for number, (p, n) in enumerate(zip(element.properties.values(), lengths)):
-            fields += [(f"n{number}", self._kind(p.length))] if p.length else []
-            fields += [(f"v{number}", self._kind(p.type), (n,))]
-        kind = np.dtype(fields)
-        if self.at + element.count * kind.itemsize > len(self.content):
-            return None
-        rows = np.frombuffer(self.content, kind, element.count, self.at)
-        if any((rows[name] != lengths[int(name[1:])]).any() for name in kind.names if name[0] == "n"):
-            return None
-        self.at += element.count * kind.itemsize
-        columns = [Column(rows[f"v{k}"].reshape(-1), np.full(len(rows), n)) for k, n in enumerate(lengths)]
-        return dict(zip(element.properties, columns))
+    order: the byte order; "": every number is a float64.  Raises ValueError where the file ends early, or a list has no length.
+    """
+    kinds = [[np.dtype(order + t if order else "f8") if t else None for t in each] for each in properties.values()]
+    pieces, row, ahead = [([np.empty(0)], [np.zeros(0, np.int64)]) for _ in kinds], 0, 64
+    while kinds and row < count:
+        lengths, fields, place = [], [], at
+        for number, (kind, counter) in enumerate(kinds):
+            if counter:
+                fields.append((f"n{number}", counter))
+                length = np.frombuffer(content, counter, 1, place)[0].item()
+                if length < 0 or length != int(length):
+                    raise ValueError(f"a list of {length} numbers")
+                place += counter.itemsize
+            lengths.append(int(length) if counter else 1)
+            fields.append((f"v{number}", kind, (lengths[-1],)))
+            place += lengths[-1] * kind.itemsize
+            if place > len(content):
+                raise ValueError("its rows end early")
+        layout = np.dtype(fields)
+        rows = np.frombuffer(content, layout, min(ahead, count - row, (len(content) - at) // layout.itemsize), at)
+        others = [rows[name] != lengths[int(name[1:])] for name in layout.names if name[0] == "n"]
+        other = np.logical_or.reduce(others) if others else np.zeros(len(rows), bool)
+        rows, ahead = (rows[: np.argmax(other)], 64) if other.any() else (rows, 2 * ahead)
+        for number, (values, sizes) in enumerate(pieces):
+            values.append(rows[f"v{number}"].reshape(-1))
+            sizes.append(np.full(len(rows), lengths[number]))
+        row, at = row + len(rows), at + len(rows) * layout.itemsize
+    joined = [(np.concatenate(values[1:] or values), np.concatenate(sizes)) for values, sizes in pieces]
+    return dict(zip(properties, joined)), at
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:

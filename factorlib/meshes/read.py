@@ -50,14 +50,14 @@ def read_mesh(
     Raises InputError, and nothing else, for a file that cannot be read, is larger, or has no usable faces, a vertex that is not
     finite, a part of the mesh that has no material, a named part that the mesh lacks, and a material that the dataset lacks.
     """
-    soup = read_soup(path, limits or Limits())
+    soup = _soup(path, limits)
     label = part_labels(soup.parts, materials, made_of, overrides or {}, path)
     return usable(soup, label[soup.part], crease_deg, path)
 
 
 def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str, ...]]:
     """The names of each part of a mesh file in which everything but its materials is as `read_mesh` needs it."""
-    soup = read_soup(path, limits or Limits())
+    soup = _soup(path, limits)
     solid(soup, path)
     return soup.parts
 
@@ -81,9 +81,8 @@ class MeshesOnce:
         return self._meshes[key]
 
 
-def read_soup(path: str | Path, limits: Limits) -> Soup:
-    """What the file says; InputError where it says nothing usable."""
-    path = Path(path)
+def _soup(path: str | Path, limits: Limits | None) -> Soup:
+    path, limits = Path(path), limits or Limits()
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
@@ -145,32 +144,36 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Pa
     if flip.any():
         log.info("%s: %d faces turned to agree with their neighbours", file, int(flip.sum()))
     normals = merged_normals(corner_normals(vertices, faces, crease_deg), supplied, area_vectors(vertices, faces))
-    return split_at_creases(vertices, faces, normals, face_label, is_open)
+    # one vertex per position and normal
+    rounded = np.round(normals.reshape(-1, 3) * 2**20).astype(np.int64)
+    key = np.concatenate([faces.reshape(-1, 1), rounded], axis=1)
+    _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return Mesh(
+        vertices=np.ascontiguousarray(vertices[faces.reshape(-1)[first]]),
+        faces=index.reshape(-1, 3).astype(np.int32),
+        normals=np.ascontiguousarray(normals.reshape(-1, 3)[first]),
+        face_label=face_label.astype(np.int16),
+        open=is_open,
+    )
 
 
 def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Welded vertices, the faces by these, and which of the faces to keep; InputError if none."""
+    """Welded vertices, the faces by these, and which of them have an area and are no copies, which the log counts; InputError if none."""
     used, faces = np.unique(soup.faces, return_inverse=True)  # a stray vertex far away must not set the scale
     weld = welded(soup.vertices[used])
     vertices = soup.vertices[used][np.unique(weld, return_index=True)[1]]
     faces = weld[faces.reshape(-1, 3)]
-    keep = good_faces(vertices, faces, file)
-    if not keep.any():
-        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
-    return vertices, faces, keep
-
-
-def good_faces(vertices: np.ndarray, faces: np.ndarray, file: str | Path) -> np.ndarray:
-    """Which faces have an area and are no copy of an earlier one (in either winding); what is dropped is logged."""
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     solid = distinct & (np.linalg.norm(area_vectors(vertices, faces), axis=1) > 1e-14 * extent**2)
-    single = np.zeros(len(faces), bool)
+    single = np.zeros(len(faces), bool)  # no copy of an earlier one, in either winding
     single[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = True
     for count, what in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
         if count:
             log.info("%s: %d %s faces dropped", file, count, what)
-    return solid & single
+    if not (solid & single).any():
+        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
+    return vertices, faces, solid & single
 
 
 def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
@@ -182,19 +185,3 @@ def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> n
         right_length = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05)
         sane = right_length & (np.sum(unit * face, axis=-1) > 0.26)
     return np.where(sane[..., None], unit, own)
-
-
-def split_at_creases(
-    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, face_label: np.ndarray, is_open: bool
-) -> Mesh:
-    """One vertex per position and normal."""
-    rounded = np.round(normals.reshape(-1, 3) * 2**20).astype(np.int64)
-    key = np.concatenate([faces.reshape(-1, 1), rounded], axis=1)
-    _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return Mesh(
-        vertices=np.ascontiguousarray(vertices[faces.reshape(-1)[first]]),
-        faces=index.reshape(-1, 3).astype(np.int32),
-        normals=np.ascontiguousarray(normals.reshape(-1, 3)[first]),
-        face_label=face_label.astype(np.int16),
-        open=is_open,
-    )

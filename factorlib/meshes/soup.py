@@ -9,6 +9,7 @@ import io
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import msgspec
 import numpy as np
@@ -83,31 +84,29 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
 def check(soup: Soup, file: str | Path) -> Soup:
     """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
     place that leaves no digits for the shape."""
-    fault, cure = _fault(soup)
-    if fault:
+
+    def refuse(fault: str, cure: str) -> NoReturn:
         raise InputError(fault, file=file, cure=cure)
-    return soup
 
-
-def _fault(soup: Soup) -> tuple[str | None, str]:
     if len(soup.faces) == 0:
-        return "mesh without faces", "export triangles, not only points or lines"
+        refuse("mesh without faces", "export triangles, not only points or lines")
     low, high = int(soup.faces.min()), int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
-        return f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}", "is the file whole?"
+        fault = f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}"
+        refuse(fault, "is the file whole?")
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
         fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
-        return fault, "remove them in a mesh editor, or export the mesh again"
+        refuse(fault, "remove them in a mesh editor, or export the mesh again")
     corners, cure = soup.vertices[soup.faces.reshape(-1)], "give it in another unit, about its own origin"
     largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
     if largest > LARGEST:
-        return f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", cure
+        refuse(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", cure)
     if 0 < extent < LEAST_EXTENT:
-        return f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", cure
+        refuse(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", cure)
     if 0 < extent < LEAST_SHARE * largest:
-        return f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", cure
-    return None, ""
+        refuse(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", cure)
+    return soup
 
 
 def lines_of(content: bytes) -> Iterator[str]:
@@ -124,14 +123,9 @@ def lines_of(content: bytes) -> Iterator[str]:
         encoding = "latin-1"
     with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line: a list of them is far larger
         for line in text:
-            check_length(len(line))
+            if len(line) > LONGEST:
+                raise ValueError(f"a line of more than {LONGEST:,} letters")
             yield line.rstrip("\n")
-
-
-def check_length(letters: int) -> None:
-    """ValueError for more letters than the line of any polygon has."""
-    if letters > LONGEST:
-        raise ValueError(f"a line of more than {LONGEST:,} letters")
 
 
 def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:

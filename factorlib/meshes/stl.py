@@ -18,9 +18,8 @@ HEADER = 84  # bytes: 80 for any text, 4 for the number of triangles
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
 SOLID = re.compile(rb"\s*solid\b", re.IGNORECASE)
-OFF = re.compile(
-    r"(ST)?C?N?OFF\b(?!\s*BINARY)|(?=[0-9])|OFF(?=[0-9])"
-)  # the word may be left out, so may the space after
+# the word may be left out, so may the space after
+OFF = re.compile(r"(ST)?C?N?OFF\b(?!\s*BINARY)|(?=[0-9])|OFF(?=[0-9])")
 CURE = "is it whole? export it again"
 
 

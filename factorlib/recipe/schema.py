@@ -4,26 +4,31 @@
     photos: [kitchen]
     lights: [hall, my_studio.exr]
 
-Photos, objects, materials and lights go by their names in dataset.yaml; files are relative to the recipe.
+Photos, objects, materials and lights go by their names in dataset.yaml; files are relative to the recipe.  Materials of one's own stand in
+a table, a JSON file like materials.json, of which only the reflectances are read.
 Angles are in degrees, sizes in pixels, colours linear Rec. 709.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 
-from factorlib.recipe.table import Colour, Share
+from factorlib.dataset.schema import Share, Shares, Vec2
+from factorlib.errors import InputError
+from factorlib.reading import read_text, reading
 
-Vec2 = tuple[float, float]
 Samples = Annotated[int, msgspec.Meta(ge=1, le=65536)]
 Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
-Backdrop = Literal["none", "light"]
+LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
+MOST_REFLECTED = 0.999  # max diffuse + max specular: a surface that reflects more than arrives never comes to rest with light between surfaces
+CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, numbers from 0 to 1'
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
@@ -47,11 +52,18 @@ class Sized(OfPhotos, frozen=True, kw_only=True):
     """Width of the pictures; without it that of the photo as the pipeline works on it."""
 
 
+class Backdropped(Sized, frozen=True, kw_only=True):
+    """Of kinds that show what is beside the objects."""
+
+    background: Literal["none", "light"] = "none"
+    """What is seen beside the objects: nothing (transparent), or the light."""
+
+
 class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
     """The photo with its objects replaced by path-traced ones."""
 
 
-class View(Sized, frozen=True, kw_only=True, tag="view"):
+class View(Backdropped, frozen=True, kw_only=True, tag="view"):
     """The objects from another side: the camera is moved about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
@@ -60,19 +72,15 @@ class View(Sized, frozen=True, kw_only=True, tag="view"):
     """Angle upward, added to the photo's own."""
     zoom: Factor = 1.0
     """Factor on the size in the picture."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
-class Turntable(Sized, frozen=True, kw_only=True, tag="turntable"):
+class Turntable(Backdropped, frozen=True, kw_only=True, tag="turntable"):
     """An animation once around the objects; the light stays."""
 
     frames: Frames = 24
     """Pictures of the whole turn."""
     seconds: Seconds = 4.0
     """Of the whole turn."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
 class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
@@ -84,15 +92,13 @@ class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
     """Of the whole turn."""
 
 
-class Relight(Sized, frozen=True, kw_only=True, tag="relight"):
+class Relight(Backdropped, frozen=True, kw_only=True, tag="relight"):
     """The photo's objects in other lights."""
 
     lights: list[str] = []
     """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); all other photos where none is named."""
     rotate: Degrees = 0.0
     """Turn of those lights about the camera's upright axis."""
-    background: Backdrop = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
 
 
 class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
@@ -101,13 +107,13 @@ class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
     materials: dict[str, str]
     """Material of the data set -> the one that takes its place: another of the data set, or one of `table`."""
     table: str | None = None
-    """File of materials of one's own, like materials.json (`factorlib.recipe.table`)."""
+    """File of materials of one's own, like materials.json."""
 
 
 class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a ground reflects beside its diffuse colour, which the photo shows."""
 
-    specular: Colour = (0.0, 0.0, 0.0)
+    specular: Shares = (0.0, 0.0, 0.0)
     """k_s of a ground that reflects, such as a polished floor."""
     roughness: Share = 0.3
     """Of that reflection."""
@@ -121,7 +127,7 @@ class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
     material: str | None = None
     """Material of the data set or of `table`; without it the mesh's own, and for a file or ball the data set's first."""
     table: str | None = None
-    """File of materials of one's own, like materials.json (`factorlib.recipe.table`)."""
+    """File of materials of one's own, like materials.json."""
     beside: str | None = None
     """Object on whose ground it stands; without it the photo's first."""
     at: Vec2 | None = None
@@ -148,11 +154,7 @@ class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
 
 
 AnyRecipe = Resynthesis | View | Turntable | MovingLight | Relight | Transfer | Insert | Grid
-KINDS = {
-    kind.__struct_config__.tag: kind
-    for kind in (Resynthesis, View, Turntable, MovingLight, Relight, Transfer, Insert, Grid)
-}
-LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
+KINDS = {kind.__struct_config__.tag: kind for kind in AnyRecipe.__args__}
 
 
 def recipe_of(facts: dict) -> AnyRecipe:
@@ -172,3 +174,33 @@ def is_light_file(name: str) -> bool:
 def is_mesh_file(name: str) -> bool:
     """Whether a mesh is a file, not one of the data set or the ball: it has a suffix."""
     return "." in name
+
+
+class OwnMaterial(msgspec.Struct, frozen=True):
+    """Lambert k_d and GGX k_s per channel (linear Rec. 709), and roughness with α = roughness²; what else the file says is passed over."""
+
+    diffuse: Shares
+    specular: Shares
+    roughness: Share
+
+
+def read_table(path: Path) -> dict[str, OwnMaterial]:
+    """By name; InputError for a file that is no such table, or has a material that reflects more light than arrives."""
+    text = read_text(path, "a table of materials")
+    with reading("a table of materials", path, cure=CURE):
+        content = msgspec.json.decode(text)
+    materials = content.get("materials") if isinstance(content, dict) else None
+    if not isinstance(materials, dict) or not materials:
+        raise InputError("it holds no materials", file=path, key="materials", cure=CURE)
+    table = {}
+    for name, entry in materials.items():
+        key = f"materials.{name}"
+        try:
+            table[name] = msgspec.convert(entry, OwnMaterial)
+        except msgspec.ValidationError as error:
+            raise InputError(str(error), file=path, key=key, cure=CURE) from None
+        total = max(table[name].diffuse) + max(table[name].specular)
+        if total > MOST_REFLECTED:
+            found = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
+            raise InputError(found, file=path, key=key, cure=f"at most {MOST_REFLECTED}")
+    return table

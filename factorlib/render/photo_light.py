@@ -9,8 +9,8 @@ import numpy as np
 
 from factorlib.dataset.schema import LightSlice
 from factorlib.light.lobes import Lobes
-from factorlib.results.exposures import read_exposures
 from factorlib.results.lobes import read_lobes
+from factorlib.results.materials import read_exposures
 
 log = logging.getLogger("factorlib.render")
 

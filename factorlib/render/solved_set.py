@@ -19,8 +19,7 @@ from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file
-from factorlib.recipe.table import read_table
+from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import Ground
 from factorlib.render.photo_light import light_of

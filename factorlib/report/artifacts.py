@@ -14,9 +14,8 @@ from jaxtyping import Float
 
 from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.reading import check_plain
-from factorlib.results.exposures import read_exposures
 from factorlib.results.materials import Channels as Factors
-from factorlib.results.materials import MaterialTable, Solved, read_materials
+from factorlib.results.materials import MaterialTable, Solved, read_exposures, read_materials
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses

@@ -1,4 +1,5 @@
-"""materials.json of `solve` and `export`: reflectances with standard errors, their gauge, and what was decided of the model."""
+"""JSON of `solve` and `export`: materials.json has reflectances with standard errors, their gauge, and what was decided of the model;
+exposures.json what each photo's light is multiplied by, per channel; uncertainty.json the standard errors and the residual level."""
 
 from __future__ import annotations
 
@@ -10,8 +11,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from factorlib.errors import InputError
-from factorlib.jsonfile import write_json
-from factorlib.results.file import read_result
+from factorlib.jsonfile import read_result
 
 Vec3 = tuple[float, float, float]
 AtLeast0 = Annotated[float, msgspec.Meta(ge=0)]
@@ -134,14 +134,17 @@ class MaterialTable(msgspec.Struct, frozen=True):
     model: Model = Model()
 
 
+class Uncertainty(msgspec.Struct, frozen=True):
+    """residual_sigma: deviation of the residuals in units of the noise model;  materials: by name;  gauge: of the standard errors."""
+
+    residual_sigma: AtLeast0
+    materials: dict[str, StandardErrors]
+    gauge: str
+
+
 def solved(reflectance: Reflectance, stderr: StandardErrors) -> Solved:
     """A reflectance with its standard errors and α."""
     return Solved(reflectance.diffuse, reflectance.specular, reflectance.roughness, reflectance.roughness**2, stderr)
-
-
-def write_materials(path: str | Path, table: MaterialTable) -> None:
-    """Write materials.json."""
-    write_json(path, table)
 
 
 def read_materials(path: str | Path, cure: str = "") -> MaterialTable:
@@ -161,3 +164,13 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
             found = f"not the materials of this set: {name!r} is missing"
             raise InputError(found, file=path, cure="run the stage `solve` again")
     return [table.materials[name] for name in names]
+
+
+def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
+    """Factors by photo, all positive; raises InputError for a file that is none."""
+    exposures = read_result(path, dict[str, Channels], "solve", cure)
+    for photo, channels in exposures.items():
+        if min(channels) <= 0:
+            cure = cure or "run the stage `solve` again"
+            raise InputError("an exposure is not a positive number", file=path, key=photo, cure=cure)
+    return exposures

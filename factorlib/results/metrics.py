@@ -21,8 +21,7 @@ from pathlib import Path
 
 import msgspec
 
-from factorlib.jsonfile import write_json
-from factorlib.results.file import read_result
+from factorlib.jsonfile import read_result
 from factorlib.results.materials import Reflectance, Vec3
 
 
@@ -207,11 +206,6 @@ class Metrics(msgspec.Struct, frozen=True):
     poses: dict[str, dict[str, PoseError]] | None
     reasons: dict[str, str]
     relit_set: RelitSet | None = None
-
-
-def write_metrics(path: str | Path, metrics: Metrics) -> None:
-    """Write metrics.json."""
-    write_json(path, metrics)
 
 
 def read_metrics(path: str | Path) -> Metrics:

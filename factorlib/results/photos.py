@@ -7,8 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.jsonfile import write_json
-from factorlib.results.file import read_result
+from factorlib.jsonfile import read_result
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Size = Annotated[int, msgspec.Meta(ge=1)]
@@ -34,11 +33,6 @@ class PhotoFacts(msgspec.Struct, frozen=True):
     illumination: str = ""
     pixels: dict[str, int] = {}
     clipped_fraction: float = 0.0
-
-
-def write_photo_facts(path: str | Path, photo: PhotoFacts) -> None:
-    """Write the entry of one photo."""
-    write_json(path, photo)
 
 
 def read_photo_facts(path: str | Path) -> PhotoFacts:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -15,8 +14,7 @@ from msgspec import UNSET, UnsetType
 
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, is_pose
-from factorlib.jsonfile import write_json
-from factorlib.results.file import read_result
+from factorlib.jsonfile import read_result
 
 FILE = "poses.json"
 SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
@@ -117,16 +115,6 @@ class PhotoPoses(msgspec.Struct, frozen=True):
 def entry_of(pose: Pose) -> dict[str, list]:
     """The fields of a `PoseEntry`."""
     return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-
-
-def write_poses(path: str | Path, photos: Mapping[str, PhotoPoses]) -> None:
-    """Write poses.json."""
-    write_json(path, photos)
-
-
-def write_photo_poses(path: str | Path, photo: PhotoPoses) -> None:
-    """Write the entry of one photo."""
-    write_json(path, photo)
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:

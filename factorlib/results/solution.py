@@ -9,9 +9,8 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
-from factorlib.results.exposures import read_exposures
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Channels, MaterialTable, read_materials
+from factorlib.results.materials import Channels, MaterialTable, read_exposures, read_materials
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")
 CURE = "name the folder of a result of `solve`, as it was written"
@@ -48,16 +47,14 @@ def read_earlier(folder: Path) -> Earlier:
     """Raises InputError for files that the stage `solve` did not write."""
     table, lobes, exposures = (folder / name for name in FILES)
     earlier = Earlier(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
-    same = set(earlier.table.gauge.component) == set(earlier.table.materials)
-    _check(same, table, "`gauge.component` names other materials")
+    fault, path = None, lobes
+    if set(earlier.table.gauge.component) != set(earlier.table.materials):
+        fault, path = "`gauge.component` names other materials", table
     for name, light in earlier.lights.items():
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
         shaped = (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
-        good = finite and shaped and (light.weight >= 0).all()
-        _check(good, lobes, f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis")
+        if not (finite and shaped and (light.weight >= 0).all()):
+            fault = f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis"
+    if fault:
+        raise InputError(f"no earlier solution to start from: {fault}", file=path, cure=CURE)
     return earlier
-
-
-def _check(good: bool, path: Path, found: str) -> None:
-    if not good:
-        raise InputError(f"no earlier solution to start from: {found}", file=path, cure=CURE)

@@ -27,8 +27,8 @@ from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
+from factorlib.jsonfile import read_result
 from factorlib.meshes.read import read_mesh
-from factorlib.results.file import read_result
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.stage import Inputs, silent

@@ -25,9 +25,8 @@ from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised
-from factorlib.results.exposures import read_exposures
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import in_order, read_materials
+from factorlib.results.materials import in_order, read_exposures, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import Observations, read_observations
 from studies.steps import Params

@@ -73,20 +73,14 @@ def write(folder, spec=SPEC):
 
 
 def changed(key, value):
-    """SPEC with another value at a key as errors write it, as in photos[0].camera; none where `value` is None."""
+    """SPEC with another value at a key as errors write it, as in photos[0].camera."""
     spec = copy.deepcopy(SPEC)
     *way, last = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", key)]
     place = spec
     for step in way:
         place = place[step] if isinstance(place, list) or step in place else place.setdefault(step, {})
-    if value is None:
-        del place[last]
-    else:
-        place[last] = value
+    place[last] = value
     return spec
-
-
-# ── good ones ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_folder_and_file_are_the_same_dataset(folder):
@@ -125,34 +119,21 @@ def test_a_slice_is_json_converts_to_its_type_and_names_the_files_it_needs(folde
     assert dataset_slice(dataset, "objects", "hall").files == ["box 1.bin", "box.gltf"]
     all_files = ["coco.json", "garden.exr", "kitchen.jpg", "kitchen.png", "own.png", "red.png"]
     assert dataset_slice(dataset, "photo").files == all_files
-
-
-def test_an_mtl_that_is_not_there_is_not_needed(folder):
-    (folder / "chair.mtl").unlink()
-    assert dataset_slice(read_dataset(write(folder)), "objects", "garden").files == ["chair.obj"]
-
-
-def test_order_of_photos_changes_no_photo(folder):
-    before = read_dataset(write(folder))
-    photos = SPEC["photos"][::-1] + [{**SPEC["photos"][1], "name": "attic"}]
-    after = read_dataset(write(folder, SPEC | {"photos": photos}))
-    for name in ("photo", "objects", "light", "materials"):
-        for photo in ("kitchen", "garden", "hall"):
-            assert dataset_slice(before, name, photo) == dataset_slice(after, name, photo)
-    assert dataset_slice(before, "set") != dataset_slice(after, "set")
+    (folder / "chair.mtl").unlink()  # which is not needed
+    assert dataset_slice(read_dataset(folder), "objects", "garden").files == ["chair.obj"]
 
 
 def test_a_slice_holds_what_its_readers_need_and_no_more(folder):
     before = read_dataset(write(folder))
+    photos = SPEC["photos"][::-1] + [{**SPEC["photos"][1], "name": "attic"}]
+    reordered = read_dataset(write(folder, SPEC | {"photos": photos}))
     posed = read_dataset(write(folder, changed("photos[0].objects[1].pose.translation", [0, 0, 3])))
-    pairs = [(name, photo) for name in SLICES for photo in ("kitchen", "garden")]
-    differ = [pair for pair in pairs if dataset_slice(before, *pair) != dataset_slice(posed, *pair)]
-    assert differ == [("objects", "kitchen")]
     default = read_dataset(write(folder, changed("photos[1].illumination", "garden")))  # written out
-    assert all(dataset_slice(before, name) == dataset_slice(default, name) for name in SLICES)
+    pairs = [(name, photo) for name in SLICES for photo in ("kitchen", "garden", "hall")]
+    differ = [[pair[0] for pair in pairs if dataset_slice(before, *pair) != dataset_slice(after, *pair)]
+              for after in (reordered, posed, default)]  # fmt: skip
+    assert differ == [["set"] * 3, ["objects"], []]
 
-
-# ── truth ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 TRUTH = {
     "materials": {"red": {"diffuse": [0.5, 0.1, 0.1], "specular": [0.1, 0.1, 0.1], "roughness": 0.3}},
@@ -168,21 +149,16 @@ def write_truth(folder, truth):
     return write(folder, {**SPEC, "truth": "truth/truth.yaml"})
 
 
-def test_truth_is_its_own_slice(folder):
+def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog):
     plain, dataset = read_dataset(write(folder)), read_dataset(write_truth(folder, TRUTH))
     truth = dataset_slice(dataset, "truth")
     assert truth.files == ["truth/garden.exr"]
     assert msgspec.convert(truth.facts, schema.TruthFile).materials["red"].roughness == 0.3
     assert all(dataset_slice(plain, name) == dataset_slice(dataset, name) for name in SLICES if name != "truth")
-
-
-@pytest.mark.parametrize("gone", ["truth/truth.yaml", "truth/garden.exr"])
-def test_missing_truth_is_a_warning(folder, gone, caplog):
-    write_truth(folder, TRUTH)
-    (folder / gone).unlink()
-    with caplog.at_level(logging.WARNING):
-        dataset = read_dataset(folder)
-    assert dataset_slice(dataset, "truth").facts is None and gone in caplog.text
+    for gone in ("truth/garden.exr", "truth/truth.yaml"):
+        (folder / gone).unlink()
+        with caplog.at_level(logging.WARNING):
+            assert dataset_slice(read_dataset(folder), "truth").facts is None and gone in caplog.text
 
 
 @pytest.mark.parametrize("truth, key, cure", [
@@ -229,13 +205,9 @@ BAD = [
     ("photos[1].masks.rde", "red.png", "did you mean 'red'"),
     ("photos[0].encoding", "sgrb", "srgb"),
     ("photos[0].camera.focal_px", 0.0, "give finite pixels"),
-    ("photos[0].camera.focal_px", NAN, "finite"),
     ("photos[0].camera.focal_px", 1e300, "1e+300"),
-    ("photos[0].camera.focal_px", 0.01, ".01"),
     ("photos[0].camera.principal_point > [1]", [1.0, INF], "finite"),
-    ("photos[0].camera.principal_point > [0]", [1e9, 0.0], "1000000000.0"),
     ("photos[0].objects[1].name", "chair_1", "objects[0] has it already"),
-    ("photos[0].objects[0].name", "chair 1", "A-Z a-z 0-9"),
     ("photos[0].objects[0].mesh", "chiar", "did you mean 'chair'"),
     ("photos[0].objects[0].materials.shel", "red", "did you mean 'shell'"),
     ("photos[0].objects[0].materials.shell", "whit", "did you mean 'white'"),
@@ -244,7 +216,6 @@ BAD = [
     ("photos[0].objects[0].pose > .rotation", {**POSE, "rotation": [*TURN[:2], [0, 2.0, 0]]}, "unit vectors"),
     ("photos[0].objects[0].pose > .rotation", {**POSE, "rotation": MIRROR}, "reflection"),
     ("photos[0].objects[0].pose > .translation[1]", {**POSE, "translation": [0, NAN, 1]}, "finite"),
-    ("photos[0].objects[0].pose > .translation[2]", {**POSE, "translation": [0, 0, 1e300]}, "1e+300"),
     (K0, KEYPOINTS[:3], "give 4 or more"),
     (K0, ON_A_LINE, "every point lies on one line"),
     (f"{K0} > [4].pixel", [*KEYPOINTS, {"pixel": KEYPOINTS[1]["pixel"], "point": [9, 9, 9]}], "keypoints[1]"),
@@ -279,27 +250,25 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
 
 def test_photos_of_one_light_agree_on_its_frame(folder):
     spec = changed("photos[0].illumination", "studio")
-    spec["photos"][1]["illumination"] = "studio"
-    spec["photos"][0]["world_from_camera"] = TURN
+    spec["photos"][0] |= {"world_from_camera": TURN}
+    spec["photos"][1] |= {"illumination": "studio"}
     with pytest.raises(InputError, match="'studio'") as caught:
         read_dataset(write(folder, spec))
     assert caught.value.key == "photos[1].world_from_camera"
-    spec["photos"][1]["world_from_camera"] = TURN
-    dataset = read_dataset(write(folder, spec))
-    assert dataset_slice(dataset, "light", "garden").facts == {"illumination": "studio", "world_from_camera": TURN}
+    spec["photos"][1] |= {"world_from_camera": TURN}
+    facts = dataset_slice(read_dataset(write(folder, spec)), "light", "garden").facts
+    assert facts == {"illumination": "studio", "world_from_camera": TURN}
 
 
-@pytest.mark.parametrize("name", ["studies", "bench", "store"])
-def test_names_of_build_are_no_datasets(folder, name):
-    write(folder)
-    with pytest.raises(InputError, match=name):
-        read_dataset(folder.rename(folder.parent / name))
-
-
-def test_no_dataset_there(tmp_path):
+def test_names_of_build_and_what_is_not_there_are_no_datasets(folder):
+    place = write(folder)
+    for name in ("studies", "bench", "store"):
+        place = place.rename(folder.parent / name)
+        with pytest.raises(InputError, match=name):
+            read_dataset(place)
     with pytest.raises(InputError, match="no such dataset") as caught:
-        read_dataset(tmp_path)
-    assert "dataset.yaml" in str(caught.value.file) and caught.value.cure
+        read_dataset(folder)
+    assert "set" in str(caught.value.file) and caught.value.cure
 
 
 @pytest.mark.parametrize("old, new, line, words", [

@@ -43,23 +43,18 @@ def made(folder, masks="masks", meshes="meshes"):
     return missing, load_yaml(folder / "data" / "mine" / "dataset.yaml")
 
 
-def test_labels_of_pixels_become_materials_and_parts_are_left_open(folder):
-    masks(folder, kitchen=LABEL, IMG_0412=[0, 1])
+def test_labels_become_materials_parts_are_left_open_and_a_further_mask_is_the_silhouette_of_an_object(folder):
+    masks(folder, kitchen=LABEL, kitchen_left=[0, 1, 0], kitchen_right=[0, 0, 1], IMG_0412=[0, 1])
     missing, spec = made(folder)
     assert spec["materials"] == ["label_1", "label_2"]
     assert spec["meshes"] == {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "?", "legs": "?"}}}
     assert [photo["name"] for photo in spec["photos"]] == ["IMG_0412", "kitchen"]
     assert missing == ["mesh chair: write which material shell, legs are made of"]
-    with pytest.raises(InputError, match=r"\?"):
-        read_dataset(folder / "data" / "mine")
-
-
-def test_beside_labels_a_further_mask_is_the_silhouette_of_an_object(folder):
-    masks(folder, kitchen=[0, 1, 2], kitchen_left=[0, 1, 0], kitchen_right=[0, 0, 1], IMG_0412=[0, 1])
-    _, spec = made(folder)
     objects = [{"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")]
     assert spec["photos"][1]["objects"] == objects
     assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
+    with pytest.raises(InputError, match=r"\?"):
+        read_dataset(folder / "data" / "mine")
 
 
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
@@ -129,27 +124,26 @@ def test_a_folder_that_is_there_is_left_alone_and_nothing_half_made_stays(folder
     assert not list((folder / "data").iterdir())
 
 
-@pytest.mark.parametrize("name", ["photos", "masks", "meshes"])
-def test_a_folder_that_is_not_there_is_named(folder, name):
-    (folder / name).rename(folder / "elsewhere")
-    with pytest.raises(InputError, match=f"{name.upper()}: there is no such folder"):
-        made(folder)
-
-
-def test_two_photos_of_one_name_are_refused(folder):
+def test_a_folder_that_is_not_there_and_two_photos_of_one_name_are_refused(folder):
+    for name in ("photos", "masks", "meshes"):
+        (folder / name).rename(folder / "elsewhere")
+        with pytest.raises(InputError, match=f"{name.upper()}: there is no such folder"):
+            made(folder)
+        (folder / "elsewhere").rename(folder / name)
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "photos" / "kitchen.png")
     with pytest.raises(InputError, match="would both be called 'kitchen'"):
         made(folder)
 
 
-@pytest.mark.parametrize("name", ["photos", "poses"])
-def test_a_photo_whose_name_the_results_take_is_listed(folder, name):
-    (folder / "photos" / "kitchen.jpg").rename(folder / "photos" / f"{name}.jpg")
-    masks(folder, **{f"{photo}_{part}": SHELL for photo in (name, "IMG_0412") for part in ("shell", "legs")})
+def test_a_photo_whose_name_the_results_take_is_listed_and_names_that_yaml_takes_for_numbers_are_quoted(folder):
+    for old, new in (("kitchen", "poses"), ("IMG 0412", "0812")):
+        next((folder / "photos").glob(f"{old}.*")).rename(folder / "photos" / f"{new}.jpg")
+    masks(folder, **{f"{photo}_{part}": SHELL for photo in ("poses", "0812") for part in ("shell", "1e3")})
+    (folder / "meshes" / "chair.obj").write_text(OBJ.replace("g legs", "g 1e3"))
     missing, _ = made(folder)
-    assert missing == [f"photo {name}: write another `name`: a file of the results is called {name}"]
+    assert missing == ["photo poses: write another `name`: a file of the results is called poses"]
     file = folder / "data" / "mine" / "dataset.yaml"
     with pytest.raises(InputError, match="rename the photo"):
         read_dataset(file)
-    file.write_text(file.read_text().replace(f"name: {name}", "name: hall"))  # and that is all
-    assert read_dataset(file).photo("hall").image == f"photos/{name}.jpg"
+    file.write_text(file.read_text().replace("name: poses", "name: hall"))  # and that is all
+    assert read_dataset(file).photo("hall").image == "photos/poses.jpg" and read_dataset(file).photo("0812")

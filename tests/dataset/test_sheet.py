@@ -7,16 +7,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, drawn, legend, write_sheet
-
-EAMES = LIBRARY / "data" / "eames"
-
-
-def test_a_row_for_each_photo_with_its_labels_and_meshes(tmp_path):
-    done = []
-    write_sheet(EAMES, tmp_path / "sheet.png", lambda k, total: done.append((k, total)))
-    height = HEAD + 2 * MARGIN + 6 * (MESH_SIDE + HEAD + MARGIN)
-    assert read_png(tmp_path / "sheet.png").shape == (height, 2 * (240 + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
-    assert done == [(k, 12) for k in range(12)]
+from tests.faults import good
 
 
 def test_a_mesh_is_drawn_upright_in_the_colours_of_its_labels():
@@ -41,13 +32,13 @@ def test_a_legend_of_254_long_names_is_no_wider_than_its_sheet():
     assert legend(["a" * 100], colours, 10).shape[1] > 500
 
 
-def test_validate_writes_it_only_when_asked_and_always_the_same(tmp_path, capsys):
-    (tmp_path / "data").mkdir()
+def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_the_same(tmp_path, capsys):
     (tmp_path / "pipeline.yaml").write_text((LIBRARY / "pipeline.yaml").read_text())
     (tmp_path / "stages").symlink_to(LIBRARY / "stages")
-    project, sheet = Project(tmp_path, photo_sets()), tmp_path / "build" / "eames" / "sheet.png"
-    assert verbs.validate(project, str(EAMES), []) == 0 and not sheet.exists()
-    assert verbs.validate(project, str(EAMES), [], sheet=True) == 0
-    assert "contact sheet" in capsys.readouterr().out
-    write_sheet(EAMES, tmp_path / "again.png")
-    assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes()
+    folder = good.make_set(tmp_path / "data" / "set")
+    project, sheet, done = Project(tmp_path, photo_sets()), tmp_path / "build" / "set" / "sheet.png", []
+    assert verbs.validate(project, str(folder), [], sheet=True) == 0 and "contact sheet" in capsys.readouterr().out
+    write_sheet(folder, tmp_path / "again.png", lambda k, total: done.append((k, total)))
+    assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes() and done == [(k, 4) for k in range(4)]
+    height = HEAD + 2 * MARGIN + 2 * (MESH_SIDE + HEAD + MARGIN)
+    assert read_png(sheet).shape == (height, 2 * (good.W + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)

@@ -67,9 +67,6 @@ def pixels(external, points, name="chair"):
     return Camera(*SIZE, focal, centre).project(Pose(np.array(pose.rotation), np.array(pose.translation)).apply(points))
 
 
-# ── COLMAP ───────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE_PINHOLE", params=(300.0, 104.0, 71.0)):
     """A model of a camera that stands at different places; its images are returned by name."""
     made = pycolmap.Reconstruction()
@@ -84,11 +81,9 @@ def colmap(folder, names=("hall.png", "attic.png"), form="binary", model="SIMPLE
 
 
 def is_pose_of(external, image):
-    rigid = image.cam_from_world()
-    pose = external.poses["chair"]
-    return np.allclose(pose.rotation, rigid.rotation.matrix(), atol=1e-14) and np.allclose(
-        pose.translation, rigid.translation, atol=1e-14
-    )
+    rigid, pose = image.cam_from_world(), external.poses["chair"]
+    theirs = np.column_stack([rigid.rotation.matrix(), rigid.translation])
+    return np.allclose(np.column_stack([pose.rotation, pose.translation]), theirs, atol=1e-14)
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
@@ -100,11 +95,7 @@ def test_points_of_the_mesh_are_where_colmap_puts_them_in_its_world(folder, form
     for name in PHOTOS:
         expected = [images[f"{name}.png"].project_point(p) for p in in_world]
         assert np.allclose(pixels(external[name], POINTS), expected, atol=1e-9) and external[name].source == "colmap"
-
-
-def test_a_mesh_in_the_worlds_frame_gets_the_models_pose_exactly(folder):
-    images = colmap(folder)
-    external = read(folder, PLACED).external["attic"]
+    external = read(folder, PLACED).external["attic"]  # in the world's frame: the model's pose exactly
     assert is_pose_of(external, images["attic.png"])
     assert external.focal_px == 300.0 and external.principal_point == (104.0, 71.0)
     without = read(folder, {"colmap": "sparse/0"}).external["hall"]
@@ -124,44 +115,37 @@ def test_lights_are_fixed_to_the_models_world_where_asked_for(folder):
     refusal(folder, fixed, "photos[1].world_from_camera", "only one of", photo={"illumination": "attic"})
 
 
-@pytest.mark.parametrize("names, match", [
-    (("photos/hall.png", "other/hall.png"), "photos/hall.png"),
-    (("other/hall.png", "hall.jpg"), "other/hall.png"),
-    (("b/hall.JPG", "attic.png"), "b/hall.JPG"),
-])  # fmt: skip
-def test_a_photo_is_matched_by_path_then_file_name_then_that_without_suffix(folder, names, match):
-    images = colmap(folder, names)
-    assert is_pose_of(read(folder, PLACED).external["hall"], images[match])
-
-
-def test_what_follows_a_dot_is_no_suffix_unless_of_an_image(folder):
-    (folder / "photos/r_0.5.png").write_text("")
-    transforms(folder, [frame("train/r_0.5", EYE, (0, 0, 5)), frame("train/r_0", EYE, (0, 0, 6))])
-    assert set(read(folder, OF_TRANSFORMS, photo={"image": "photos/r_0.5.png"}).external) == {"hall"}
-
-
-def test_a_photo_that_could_be_several_images_is_refused_until_it_is_said_which(folder):
+def test_a_photo_is_matched_by_path_then_file_name_then_that_without_suffix_or_as_it_is_said(folder):
+    for names, match in (
+        (("photos/hall.png", "other/hall.png"), "photos/hall.png"),
+        (("other/hall.png", "hall.jpg"), "other/hall.png"),
+        (("b/hall.JPG", "attic.png"), "b/hall.JPG"),
+    ):
+        images = colmap(folder, names)
+        assert is_pose_of(read(folder, PLACED).external["hall"], images[match])
     images = colmap(folder, names=("x/hall.png", "y/hall.png"))
     refusal(folder, PLACED, "cameras.images.hall", "could be 'x/hall.png', 'y/hall.png'")
     external = read(folder, PLACED | {"images": {"hall": "y/hall.png", "attic": "x/hall.png"}}).external
     assert is_pose_of(external["hall"], images["y/hall.png"])
+    (folder / "photos/r_0.5.png").write_text("")  # what follows this dot is no suffix
+    transforms(folder, [frame("train/r_0.5", EYE, (0, 0, 5)), frame("train/r_0", EYE, (0, 0, 6))])
+    assert set(read(folder, OF_TRANSFORMS, photo={"image": "photos/r_0.5.png"}).external) == {"hall"}
 
 
-def test_a_photo_that_is_not_in_the_model_is_warned_of_and_searched(folder, caplog):
-    colmap(folder, names=("hall.png",))
-    with caplog.at_level(logging.WARNING):
-        dataset = read(folder, {"colmap": "sparse/0"})
-    assert set(dataset.external) == {"hall"}
-    assert "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
-    assert dataset_slice(dataset, "objects", "attic").facts["external"] is None
-
-
-def test_an_image_without_a_pose_is_not_in_the_model(folder):
+def test_a_photo_that_is_not_in_the_model_or_has_no_pose_there_is_warned_of_and_searched(folder, caplog):
     colmap(folder)
     model = pycolmap.Reconstruction(str(folder / "sparse/0"))
     model.deregister_frame(next(image.frame_id for image in model.images.values() if image.name == "attic.png"))
     model.write_binary(str(folder / "sparse/0"))
-    assert set(read(folder, {"colmap": "sparse/0"}).external) == {"hall"}
+    for names in (None, ("hall.png",)):
+        if names:
+            colmap(folder, names=names)
+        with caplog.at_level(logging.WARNING):
+            dataset = read(folder, {"colmap": "sparse/0"})
+        assert set(dataset.external) == {"hall"}
+        assert "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
+        assert dataset_slice(dataset, "objects", "attic").facts["external"] is None
+        caplog.clear()
 
 
 def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
@@ -178,43 +162,24 @@ def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
     assert set(external["hall"].poses) == {"other"}
 
 
-def test_a_change_of_one_pose_changes_the_slice_of_that_photo_only(folder):
-    at = lambda z: transforms(folder, [frame("hall.png", EYE, (0, 0, 5)), frame("attic.png", EYE, (0, 0, z))])  # noqa: E731
-    before = read(at(5), OF_TRANSFORMS)
-    after = read(at(6), OF_TRANSFORMS)
-    pairs = [(name, photo) for name in ("photo", "objects", "light") for photo in PHOTOS]
-    assert [p for p in pairs if dataset_slice(before, *p) != dataset_slice(after, *p)] == [("objects", "attic")]
+def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused_unless_it_is_so_within_half_a_pixel(folder):
+    for model, params, fault, cure in (
+        ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -0.1), "distorts", "image_undistorter"),
+        ("OPENCV_FISHEYE", (60.0, 60.0, 100.0, 75.0, 0.1, 0.0, 0.0, 0.0), "distorts", "image_undistorter"),
+        ("PINHOLE", (300.0, 310.0, 100.0, 75.0), "not square", "SIMPLE_PINHOLE"),
+        ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -8.0), "no ray", "image_undistorter"),
+    ):
+        colmap(folder, model=model, params=params)
+        assert cure in refusal(folder, {"colmap": "sparse/0"}, "cameras.colmap: hall.png", fault).cure
+    for model, params in (("PINHOLE", (300.0, 301.0, 100.0, 75.0)), ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, 0.01))):
+        colmap(folder, model=model, params=params)
+        external = read(folder, {"colmap": "sparse/0"}).external["hall"]
+        true = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params)
+        corners = np.array([[x, y] for x in np.linspace(0, 200, 9) for y in np.linspace(0, 150, 9)])
+        rays = np.column_stack([true.cam_from_img(corners), np.ones(len(corners))])
+        ours = Camera(*SIZE, external.focal_px, external.principal_point).project(rays)
+        assert 0.05 < np.linalg.norm(ours - corners, axis=1).max() <= 0.5
 
-
-# ── lenses ───────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@pytest.mark.parametrize("model, params, fault, cure", [
-    ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -0.1), "distorts", "image_undistorter"),
-    ("OPENCV_FISHEYE", (60.0, 60.0, 100.0, 75.0, 0.1, 0.0, 0.0, 0.0), "distorts", "image_undistorter"),
-    ("PINHOLE", (300.0, 310.0, 100.0, 75.0), "not square", "SIMPLE_PINHOLE"),
-    ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -8.0), "no ray", "image_undistorter"),
-])  # fmt: skip
-def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused(folder, model, params, fault, cure):
-    colmap(folder, model=model, params=params)
-    assert cure in refusal(folder, {"colmap": "sparse/0"}, "cameras.colmap: hall.png", fault).cure
-
-
-@pytest.mark.parametrize(
-    "model, params", [("PINHOLE", (300.0, 301.0, 100.0, 75.0)), ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, 0.01))]
-)
-def test_less_than_half_a_pixel_does_not_matter_and_stays_so(folder, model, params):
-    """Nowhere in the image does the pinhole that is taken differ from the camera by more."""
-    colmap(folder, model=model, params=params)
-    external = read(folder, {"colmap": "sparse/0"}).external["hall"]
-    true = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params)
-    corners = np.array([[x, y] for x in np.linspace(0, 200, 9) for y in np.linspace(0, 150, 9)])
-    rays = np.column_stack([true.cam_from_img(corners), np.ones(len(corners))])
-    off = np.linalg.norm(Camera(*SIZE, external.focal_px, external.principal_point).project(rays) - corners, axis=1)
-    assert 0.05 < off.max() <= 0.5
-
-
-# ── transforms.json ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 LENS = {"fl_x": 300.0, "cx": 104.0, "cy": 71.0, "w": 200, "h": 150}
 FROM_X = np.column_stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)])  # looks along −x, y up: its right is −z, its back +x
@@ -241,16 +206,13 @@ def test_what_is_right_and_up_of_an_opengl_camera_is_right_and_up_in_the_photo(f
     assert np.allclose(world @ [0, 0, 1], (-1, 0, 0)) and np.allclose(world @ [0, 1, 0], (0, -1, 0))
 
 
-def test_a_field_of_view_is_a_focal_length_at_any_size(folder):
+def test_a_field_of_view_is_a_focal_length_at_any_size_and_a_frames_own_lens_goes_before_the_files(folder):
     """NeRF's own scenes: half a width lies at half the angle; without w, of whatever width the photo has."""
     frames = [frame("hall", EYE, (0, 0, 5)), frame("attic", EYE, (0, 0, 5), w=200, h=150)]
     external = read(transforms(folder, frames, {"camera_angle_x": 2 * math.atan(100 / 300)}), OF_TRANSFORMS).external
     for name in PHOTOS:
         assert focal_and_centre(external[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
         assert focal_and_centre(external[name], 400, 300, name) == (pytest.approx(600), (200.0, 150.0))
-
-
-def test_a_frames_own_lens_goes_before_the_files(folder):
     transforms(folder, [frame("hall", EYE, (0, 0, 5), fl_x=320.0), frame("attic", EYE, (0, 0, 5))])
     external = read(folder, OF_TRANSFORMS).external
     assert external["hall"].focal_px == 320.0 and external["attic"].focal_px == 300.0
@@ -261,21 +223,17 @@ FRAMES = [frame("hall", EYE, (0, 0, 5))]
 
 @pytest.mark.parametrize("lens, frames, key, words", [
     ({"w": 200, "h": 150}, FRAMES, "frames[0].fl_x", "camera_angle_x"),
-    (LENS | {"fl_x": -3.0}, FRAMES, "fl_x", "give finite pixels"),
     (LENS | {"k1": 0.1}, FRAMES, "transforms.json: frames[0]", "image_undistorter"),
     (LENS | {"camera_model": "EQUIRECTANGULAR"}, FRAMES, "frames[0].camera_model", "OPENCV"),
     (LENS, [frame("hall", 2 * EYE, (0, 0, 5))], "frames[0].transform_matrix", "not a rotation"),
     (LENS, [frame("hall", np.diag([1.0, 1, -1]), (0, 0, 5))], "frames[0].transform_matrix", "reflection"),
     (LENS, [FRAMES[0] | {"transform_matrix": [[1, 0, 0, 0]]}], "frames[0].transform_matrix", "[R | t]"),
-    (LENS, [frame("hall", EYE, (0, 0, math.nan))], "frames[0].transform_matrix[2][3]", "finite"),
     (LENS, [{"file_path": "hall"}], "frames[0]", "transform_matrix"),
     (LENS, [frame("cellar", EYE, (0, 0, 5))], "cameras.transforms", "'cellar'"),
 ])  # fmt: skip
 def test_wrong_transforms_are_refused_where_they_are_wrong(folder, lens, frames, key, words):
     refusal(transforms(folder, frames, lens), OF_TRANSFORMS, key, words)
 
-
-# ── BOP ──────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 K = [300.0, 0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]
 GT = {"obj_id": 5, "cam_R_m2c": NINE, "cam_t_m2c": [0.0, 0.0, 1500.0]}
@@ -290,16 +248,12 @@ def bop(folder, cameras=None, poses=None):
 
 @pytest.mark.parametrize("unit_mm", [1.0, 1000.0])
 def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folder, unit_mm):
-    """150 mm to the right at 1500 mm: 30 px; the centre of pixel (103.5, 70.5) lies at (104, 71) here."""
-    external = read(bop(folder), OF_BOP | {"mesh_unit_mm": unit_mm}, names=("000007",)).external["seven"]
+    """Where a turned model's point lands; the centre of pixel (103.5, 70.5) lies at (104, 71) here."""
+    bop(folder, poses={"7": [GT | {"obj_id": 2}, GT | {"cam_R_m2c": TURN.ravel().tolist()}]})
+    external = read(folder, OF_BOP | {"mesh_unit_mm": unit_mm}, names=("000007",)).external["seven"]
     assert external.source == "bop" and external.poses["chair"].translation[2] == 1500 / unit_mm
-    assert np.allclose(pixels(external, np.array([[150.0, 0, 0]]) / unit_mm), [[104 + 30, 71]])
-
-
-def test_bop_turns_the_model_into_the_camera(folder):
-    bop(folder, poses={"7": [GT | {"cam_R_m2c": TURN.ravel().tolist()}]})
     x, y, z = TURN @ [100, 50, 20] + [0, 0, 1500]
-    place = pixels(read(folder, OF_BOP, names=("000007",)).external["seven"], np.array([[100.0, 50, 20]]))
+    place = pixels(external, np.array([[100.0, 50, 20]]) / unit_mm)
     assert np.allclose(place, [[104 + 300 * x / z, 71 + 300 * y / z]])
 
 
@@ -316,15 +270,11 @@ def test_a_scene_without_poses_or_without_this_one_is_searched_and_ids_can_be_sa
     ({"7": {"cam_K": [300.0, 5.0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]}}, None, "7.cam_K", "square axes"),
     ({"7": {"cam_K": [300.0, 0, 103.5, 0, 320.0, 70.5, 0, 0, 1.0]}}, None, "scene_camera.json: 7", "not square"),
     ({"7": {"cam_K": NINE[:4]}}, None, "7.cam_K", "cam_K"),
-    ({"first": {"cam_K": K}}, None, "first", "whole numbers"),
     (None, {"7": [GT, GT]}, "cameras.obj_ids.chair", "2 times"),
     (None, {"7": [GT | {"cam_R_m2c": [2.0, *NINE[1:]]}]}, "7[0].cam_R_m2c", "not a rotation"),
 ])  # fmt: skip
 def test_wrong_scenes_are_refused_where_they_are_wrong(folder, cameras, poses, key, words):
     refusal(bop(folder, cameras, poses), OF_BOP, key, words, names=("000007",))
-
-
-# ── the key in dataset.yaml, and photos of another size ──────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("cameras, key, words", [
@@ -353,34 +303,30 @@ def test_a_wrong_key_is_refused_with_a_cure(folder, cameras, key, words):
 
 def test_objects_of_one_photo_share_a_scale(folder):
     colmap(folder)
-    cameras = {"colmap": "sparse/0", "world_from_object": {"chair": {}, "other": {"scale": 2}}}
-    refusal(
-        folder, cameras, "cameras.world_from_object", "different scales", objects=[CHAIR, CHAIR | {"name": "other"}]
+    cameras, objects = (
+        PLACED | {"world_from_object": {"chair": {}, "other": {"scale": 2}}},
+        [CHAIR, CHAIR | {"name": "other"}],
     )
+    refusal(folder, cameras, "cameras.world_from_object", "different scales", objects=objects)
 
 
 EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 
 
-@pytest.mark.parametrize(
-    "width, height, scale", [(200, 150, 1), (400, 300, 2), (100, 75, 0.5), (67, 50, 0.335), (133, 100, 0.665)]
-)
-def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_of_it(width, height, scale):
-    focal, centre = focal_and_centre(EXTERNAL, width, height, "hall")
-    place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
-    off = 0 if scale in (1, 2, 0.5) else 0.5
-    assert np.allclose(Camera(width, height, focal, centre).project(np.array([0.2, -0.1, 1.0])), place, atol=off)
-
-
-@pytest.mark.parametrize("external, width, height, words", [
-    (EXTERNAL, 200, 140, "cropped or squeezed"),
-    (EXTERNAL, 150, 200, "EXIF orientation"),
-    (ExternalCamera("bop", 300.0, (104.0, 71.0), None, {}), 100, 75, "at the size that the source was made of"),
-])  # fmt: skip
-def test_another_picture_is_refused(external, width, height, words):
-    with pytest.raises(InputError, match=words) as caught:
-        focal_and_centre(external, width, height, "hall")
-    assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure
+def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_and_another_is_refused():
+    sizes = (200, 150, 0), (400, 300, 0), (100, 75, 0), (67, 50, 0.5), (133, 100, 0.5)
+    for width, height, off in sizes:
+        focal, centre = focal_and_centre(EXTERNAL, width, height, "hall")
+        place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
+        assert np.allclose(Camera(width, height, focal, centre).project(np.array([0.2, -0.1, 1.0])), place, atol=off)
+    for external, width, height, words in (
+        (EXTERNAL, 200, 140, "cropped or squeezed"),
+        (EXTERNAL, 150, 200, "EXIF orientation"),
+        (ExternalCamera("bop", 300.0, (104.0, 71.0), None, {}), 100, 75, "at the size that the source was made of"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            focal_and_centre(external, width, height, "hall")
+        assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure
 
 
 def test_thousands_of_photos_find_their_images_in_a_moment():

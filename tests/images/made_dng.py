@@ -10,17 +10,7 @@ import numpy as np
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 FORM = {BYTE: "B", ASCII: "B", SHORT: "H", LONG: "I", RATIONAL: "II", SRATIONAL: "ii"}
-XYZ_TO_SRGB = (
-    3.2406,
-    -1.5372,
-    -0.4986,
-    -0.9689,
-    1.8758,
-    0.0415,
-    0.0557,
-    -0.2040,
-    1.0570,
-)  # a sensor that sees Rec. 709
+XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)  # fmt: skip  # a sensor that sees Rec. 709
 WHITE, BLACK = 4000, 64
 
 

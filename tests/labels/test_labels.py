@@ -47,9 +47,6 @@ def palette(path, values):
     return path.name
 
 
-# ---- the same labels from every kind of file -----------------------------------------------------------------
-
-
 def coco(folder, annotations, images=None, categories=MATERIALS):
     """annotations: (category_id, segmentation); categories are numbered from 10."""
     content = {
@@ -103,43 +100,31 @@ def test_every_form_is_the_same_labels(tmp_path, form):
     assert not found.left_out.any()
 
 
-@pytest.mark.parametrize("bits", [1, 2, 4])
-def test_grey_of_few_bits_is_not_stretched(tmp_path, bits):
-    values = (LABEL > 0).astype(np.uint8)
-    image = Image.fromarray(values.astype(bool)) if bits == 1 else Image.fromarray(values)
-    image.save(tmp_path / "a.png", **({} if bits == 1 else {"bits": bits}))
-    assert (tmp_path / "a.png").read_bytes()[24] == bits
-    np.testing.assert_array_equal(read_values(tmp_path / "a.png", KEY), values)
-
-
-def test_255_is_left_out_in_a_label_mask_and_inside_in_a_mask_of_one_material(tmp_path):
+def test_grey_of_few_bits_is_not_stretched_255_is_left_out_or_inside_and_a_soft_edge_is_cut_at_half(tmp_path):
+    for bits in (1, 2, 4):
+        image = Image.fromarray(LABEL > 0) if bits == 1 else Image.fromarray((LABEL > 0).astype(np.uint8))
+        image.save(tmp_path / "a.png", **({} if bits == 1 else {"bits": bits}))
+        assert (tmp_path / "a.png").read_bytes()[24] == bits
+        np.testing.assert_array_equal(read_values(tmp_path / "a.png", KEY), LABEL > 0)
     values = LABEL.copy()
     values[0] = 255
     found = labels(tmp_path, save(tmp_path / "a.png", values))
     np.testing.assert_array_equal(found.label, LABEL)
     assert found.left_out[0].all() and not found.left_out[1:].any()
-    assert not labels(tmp_path, {"red": save(tmp_path / "r.png", np.uint8(255) * (LABEL == 1))}).left_out.any()
-
-
-def test_a_soft_edge_is_cut_at_half(tmp_path):
     values = np.zeros((H, W), dtype=np.uint8)
     values[5], values[6], values[7] = 100, 200, 255
-    found = labels(tmp_path, {"white": save(tmp_path / "a.png", values)}).label
-    assert (found[5] == 0).all() and (found[6:8] == 2).all()
+    found = labels(tmp_path, {"white": save(tmp_path / "a.png", values)})
+    assert (found.label[5] == 0).all() and (found.label[6:8] == 2).all() and not found.left_out.any()
 
 
-# ---- RLE -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_rle_is_decoded_as_pycocotools_does(seed):
-    rng = np.random.default_rng(seed)
-    inside = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
-    encoded = compressed(inside)
-    assert runs_of(encoded, inside.size).tolist() == counts_of(inside)
-
-
-# ---- refused -------------------------------------------------------------------------------------------------
+def test_rle_is_decoded_as_pycocotools_does_and_millions_of_runs_in_their_own_time():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        inside = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
+        assert runs_of(compressed(inside), inside.size).tolist() == counts_of(inside)
+    began = time.process_time()
+    assert len(runs_of("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
+    assert time.process_time() - began < 10
 
 
 @pytest.mark.parametrize("form", ["label", "per material", "coco"])
@@ -164,14 +149,11 @@ def test_a_mask_whose_values_are_no_labels(tmp_path, values, words):
     assert all(word in message for word in [*words, "a.png", KEY]), message
 
 
-@pytest.mark.parametrize("masks", ["per material", "coco"])
-def test_empty(tmp_path, masks):
+def test_masks_that_are_empty_or_overlap(tmp_path):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
-    message = refusal(tmp_path, {"red": name, "wood": name} if masks == "per material" else coco(tmp_path, []))
-    assert "the mask is empty" in message and KEY in message
-
-
-def test_materials_that_overlap(tmp_path):
+    for masks in ({"red": name, "wood": name}, coco(tmp_path, [])):
+        message = refusal(tmp_path, masks)
+        assert "the mask is empty" in message and KEY in message
     masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(tmp_path / "r.png", RED)}
     message = refusal(tmp_path, masks)
     assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
@@ -199,51 +181,28 @@ def test_bad_annotations(tmp_path, category, segmentation, words):
     assert all(word in message for word in ["coco.json", *words]), message
 
 
-def test_coco_without_the_photo(tmp_path):
-    name = coco(tmp_path, [], images=[{"id": 7, "file_name": "kitchem.jpg"}])
-    assert "did you mean 'kitchem.jpg'" in refusal(tmp_path, name)
-
-
-def test_coco_goes_by_the_whole_path_first(tmp_path):
-    images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "other"), (7, "photos"))]
-    name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images)
+def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
+    images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
+    name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))
     assert labels(tmp_path, name).label.any()
-    images = [{"id": k, "file_name": f"{folder}/kitchen.jpg"} for k, folder in ((6, "a"), (7, "b"))]
-    assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images))
+    assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
+    assert "did you mean 'kitchem.jpg'" in refusal(tmp_path, coco(tmp_path, [], images=images("kitchem")))
 
 
-# ---- objects -------------------------------------------------------------------------------------------------
-
-
-def objects(folder, masks):
-    return read_objects(masks, lambda name: folder / name, (H, W), "photos[kitchen].objects")
-
-
-def test_objects_are_numbered_in_their_order(tmp_path):
+def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
+    objects = lambda *masks: read_objects(masks, lambda name: tmp_path / name, (H, W), "photos[kitchen].objects")  # noqa: E731
     one, three = (save(tmp_path / f"{k}.png", np.uint8(255) * (LABEL == k)) for k in (1, 3))
-    found = objects(tmp_path, [("a", None), ("b", three), ("c", one)])
+    found = objects(("a", None), ("b", three), ("c", one))
     np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
-
-
-@pytest.mark.parametrize(
-    "second, said", [(LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")]
-)
-def test_bad_object_masks(tmp_path, second, said):
-    masks = [("a", save(tmp_path / "a.png", LABEL == 1)), ("b", save(tmp_path / "b.png", second))]
-    with pytest.raises(InputError, match=said) as caught:
-        objects(tmp_path, masks)
-    assert "b.png" in str(caught.value) and "photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
+    for bad, said in ((LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")):
+        with pytest.raises(InputError, match=said) as caught:
+            objects(("a", one), ("b", save(tmp_path / "bad.png", bad)))
+        assert "bad.png: photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
 
 
 def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):
-    """Pillow's own limit warns, with a line of its source, at 89 megapixels, and refuses at 179."""
-    Image.fromarray(np.ones((14_000, 14_000), bool)).save(tmp_path / "mask.png")
-    with pytest.raises(InputError, match="the mask is 14000 × 14000"):
+    """Pillow's own limit warns, with a line of its source, at 89 megapixels."""
+    Image.fromarray(np.ones((9_500, 9_500), bool)).save(tmp_path / "mask.png")
+    with pytest.raises(InputError, match="the mask is 9500 × 9500"):
         read_labels("mask.png", lambda name: tmp_path / name, MATERIALS, (10, 10), "photo.png")
     assert not recwarn.list
-
-
-def test_compressed_run_lengths_of_millions_are_read_in_their_own_time():
-    began = time.process_time()
-    assert len(runs_of("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
-    assert time.process_time() - began < 10

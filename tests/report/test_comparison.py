@@ -12,7 +12,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.report.comparison import comparison
-from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.results.photos import PhotoFacts
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, Provider
@@ -29,7 +29,7 @@ def material(factor=1.0, roughness=0.3):
 def result(folder, roughness=0.3, factor=1.0, light=1.0, names=("red", EVIL), photo="kitchen"):
     materials = {name: material(factor, roughness) for name in names}
     write_json(folder / "masks" / "photos.json", {photo: PhotoFacts(8, 8, 1, (8, 8), illumination=photo)})
-    write_materials(folder / "export" / "materials.json", MaterialTable(materials))
+    write_json(folder / "export" / "materials.json", MaterialTable(materials))
     for place in ("export/illumination", "render/resynthesis"):
         (folder / place).mkdir(parents=True, exist_ok=True)
         write_rgb_exr(folder / place / f"{photo}.exr", np.full((8, 16, 3), light), LAT_LONG)
@@ -69,7 +69,7 @@ def test_differences_are_in_standard_errors_after_the_free_factor(folders):
 def with_components(folder, factors, component):
     result(folder, names=tuple(factors))
     table = MaterialTable({name: material(factor) for name, factor in factors.items()}, Gauge(component=component))
-    write_materials(folder / "export" / "materials.json", table)
+    write_json(folder / "export" / "materials.json", table)
     return folder
 
 

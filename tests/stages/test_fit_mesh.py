@@ -11,10 +11,10 @@ import pytest
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
-from factorlib.jsonfile import read_json
+from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.meshes.mesh import scaled
-from factorlib.results.poses import PhotoPoses, write_poses
+from factorlib.results.poses import PhotoPoses
 from factorlib.stage import Inputs, silent
 from stages import align, export, fit_mesh, urm
 from tests.align.scenes import chair, photo_of
@@ -37,7 +37,7 @@ def made(tmp_path, given, source="found"):
         obj = entry_of(pose, source=source, silhouette_iou=0.9, runner_up=None, left_out=False)
         facts = {"focal_px": camera.focal, "focal_source": "dataset", "principal_point": list(camera.centre)}
         poses[photo] = {"camera": facts, "objects": {"chair": obj}}
-    write_poses(aligned / "poses.json", msgspec.convert(poses, dict[str, PhotoPoses]))
+    write_json(aligned / "poses.json", msgspec.convert(poses, dict[str, PhotoPoses]))
     facts = {"dataset.materials": ["white"], "dataset.objects": dict.fromkeys(PHOTOS, chair_facts())}
     return Inputs({"masks": masks, "align": aligned}, facts, {"chair.ply": tmp_path / "chair.ply"}), truth
 

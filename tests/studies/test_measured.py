@@ -8,7 +8,8 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved, write_materials
+from factorlib.jsonfile import write_json
+from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from studies.measured import results
 from studies.measured.eames_like import MAPS, drawn, folder_of
 from studies.measured.standard_errors import light_deviations, material_deviations
@@ -63,7 +64,7 @@ def written(folder, roughness, scale, light, names=("one", "two")):
     two = solved(Reflectance((0.2 * scale,) * 3, (0.04 * scale,) * 3, 0.5), stderr)
     for kind in ("illumination", "coverage"):
         (folder / "export" / kind).mkdir(parents=True)
-    write_materials(folder / "export/materials.json", MaterialTable(dict(zip(names, (one, two), strict=True))))
+    write_json(folder / "export/materials.json", MaterialTable(dict(zip(names, (one, two), strict=True))))
     write_rgb_exr(folder / "export/illumination/room.exr", light, LAT_LONG)
     write_rgb_exr(folder / "export/coverage/room.exr", 0.1 * light / light.mean(), LAT_LONG)
     return folder

@@ -10,8 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from factorlib.dataset.check import check_rotation
-from factorlib.dataset.paths import Refusal, file_of
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import Number, Pose, Vec3
 from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
 
@@ -38,7 +37,7 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The images of the scene in the dataset's folder `path`, by id; each is taken to be twice its principal point large."""
-    camera_file, pose_file = (file_of(KEY, path, name, refuse) for name in (CAMERAS, POSES))
+    camera_file, pose_file = (refuse.file_of(KEY, path, name) for name in (CAMERAS, POSES))
     if camera_file is None:
         refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
     cameras = read_source(camera_file, dict[ImageId, SceneCamera], KEY)
@@ -52,15 +51,10 @@ def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
             of_cameras(f"{image}.cam_K", "is not the camera of square axes", cure)
         size, params = (2 * cx + 1, 2 * cy + 1), [fx, fy, cx + 0.5, cy + 0.5]
         pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, of_cameras)
-        instances = _poses(image, poses.get(image, []), of_poses)
+        instances: dict[int, list[Pose]] = {}
+        for index, obj in enumerate(poses.get(image, [])):
+            rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
+            of_poses.rotation(f"{image}[{index}].cam_R_m2c", rows)
+            instances.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
         shots.append(Shot(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
     return shots
-
-
-def _poses(image: str, objects: list[SceneObject], refuse: Refusal) -> dict[int, list[Pose]]:
-    result: dict[int, list[Pose]] = {}
-    for index, obj in enumerate(objects):
-        rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
-        check_rotation(f"{image}[{index}].cam_R_m2c", rows, refuse)
-        result.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
-    return result

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pycolmap
 
-from factorlib.dataset.paths import Refusal, check_folder, file_of
+from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import LARGEST
 from factorlib.dataset.sources.shot import DAMAGED, Shot, colmap_camera
 from factorlib.reading import one_line, reading
@@ -33,15 +33,23 @@ ImageLine = tuple[
 
 def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     """The registered images of the model in the dataset's folder `path`, by name."""
-    check_folder(KEY, path, refuse)
-    (camera_file, cameras_in), (image_file, images_in) = _files(path, refuse)
+    refuse.subfolder(KEY, path)
+    models = {suffix: [refuse.file_of(KEY, path, f"{name}{suffix}") for name in ("cameras", "images")]
+              for suffix in (".bin", ".txt")}  # fmt: skip
+    suffix = next((suffix for suffix, files in models.items() if all(files)), None)
+    if suffix is None:
+        fault = f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)"
+        refuse(KEY, fault, CURE)
+    (camera_file, image_file), is_text = models[suffix], suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):
-        cameras = {number: entry for number, *entry in cameras_in(camera_file)}
+        lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
+        cameras = {number: entry for number, *entry in lines}
         for model, _, _, params in cameras.values():
             if len(params) != _count_of(model):
                 raise ValueError(f"a {model} camera has {_count_of(model)} parameters, not {len(params)}")
     with reading("a COLMAP model", image_file, KEY, CURE):
-        images = sorted(images_in(image_file), key=lambda line: line[0])
+        lines = _text_images(image_file) if is_text else _records(image_file, _binary_image)
+        images = sorted(lines, key=lambda line: line[0])
         for name, camera_id, _ in images:
             if camera_id not in cameras:
                 raise ValueError(f"image {name!r} has camera {camera_id}, which {camera_file.name} lacks")
@@ -57,15 +65,6 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     return shots
 
 
-def _files(path: str, refuse: Refusal) -> list[tuple[Path, Callable]]:
-    """Cameras and images of the model, each with its reader."""
-    for suffix, readers in ((".bin", (_binary_cameras, _binary_images)), (".txt", (_text_cameras, _text_images))):
-        files = [file_of(KEY, path, f"{name}{suffix}", refuse) for name in ("cameras", "images")]
-        if all(files):
-            return list(zip(files, readers))
-    refuse(KEY, f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)", CURE)
-
-
 def _count_of(model: str) -> int:
     """How many parameters a camera model has."""
     if model not in MODELS.values():
@@ -73,51 +72,35 @@ def _count_of(model: str) -> int:
     return len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
 
 
-class _Records:
-    """The bytes of a file, taken one record after the other; ValueError or struct.error where they end too early."""
-
-    def __init__(self, content: mmap.mmap):
-        self.content, self.place = content, 0
-
-    def take(self, layout: str) -> tuple:
-        """The next values of a `struct` layout, little-endian."""
-        values = struct.unpack_from(f"<{layout}", self.content, self.place)
-        self.place += struct.calcsize(f"<{layout}")
-        return values
-
-    def image(self) -> ImageLine:
-        """The next image: its pose, its name, which a zero byte ends, and its points, which are passed over."""
-        _, *pose, camera_id = self.take("I7dI")
-        end = self.content.find(b"\0", self.place, self.place + MOST_NAME)
-        if end < 0:
-            raise ValueError("the name of an image does not end")
-        name, self.place = self.content[self.place : end].decode("utf-8"), end + 1
-        (points,) = self.take("Q")
-        self.place += points * struct.calcsize("<2dQ")
-        if self.place > len(self.content):
-            raise ValueError("it ends in the middle of an image")
-        return name, camera_id, tuple(pose)
-
-
-def _records(file: Path) -> Iterator[_Records]:
-    """One for each of the records that the file announces."""
+def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[tuple, int]]) -> Iterator[tuple]:
+    """What `record` makes of each that the file announces: of its bytes, from a place on, with the place where it ends."""
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        records = _Records(content)
-        for _ in range(records.take("Q")[0]):
-            yield records
+        (count,), at = struct.unpack_from("<Q", content), 8
+        for _ in range(count):
+            entry, at = record(content, at)
+            yield entry
 
 
-def _binary_cameras(file: Path) -> Iterator[CameraLine]:
-    for records in _records(file):
-        number, model, width, height = records.take("IiQQ")
-        if model not in MODELS:
-            raise ValueError(f"{model} is no camera model")
-        yield number, MODELS[model], width, height, records.take(f"{_count_of(MODELS[model])}d")
+def _binary_camera(content: mmap.mmap, at: int) -> tuple[CameraLine, int]:
+    number, model, width, height = struct.unpack_from("<IiQQ", content, at)
+    if model not in MODELS:
+        raise ValueError(f"{model} is no camera model")
+    count = _count_of(MODELS[model])
+    params = struct.unpack_from(f"<{count}d", content, at + 24)
+    return (number, MODELS[model], width, height, params), at + 24 + 8 * count
 
 
-def _binary_images(file: Path) -> Iterator[ImageLine]:
-    for records in _records(file):
-        yield records.image()
+def _binary_image(content: mmap.mmap, at: int) -> tuple[ImageLine, int]:
+    """A pose, a name, which a zero byte ends, and points, which are passed over."""
+    _, *pose, camera_id = struct.unpack_from("<I7dI", content, at)
+    end = content.find(b"\0", at + 64, at + 64 + MOST_NAME)
+    if end < 0:
+        raise ValueError("the name of an image does not end")
+    (points,) = struct.unpack_from("<Q", content, end + 1)
+    behind = end + 9 + points * struct.calcsize("<2dQ")
+    if behind > len(content):
+        raise ValueError("it ends in the middle of an image")
+    return (content[at + 64 : end].decode("utf-8"), camera_id, tuple(pose)), behind
 
 
 def _text_cameras(file: Path) -> Iterator[CameraLine]:

@@ -12,7 +12,7 @@ import msgspec
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, ObjectEntry, PhotoEntry, Pose
+from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, PhotoEntry, Pose
 from factorlib.dataset.sources.bop import bop_shots
 from factorlib.dataset.sources.colmap import colmap_shots
 from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
@@ -39,7 +39,13 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
             log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name "
                         "it: cameras.images: {%s: …}", file, kind, photo.name, photo.name)  # fmt: skip
         else:
-            external[photo.name] = _external(kind, photo, shot, source, refuse)
+            poses, given = _poses(photo, shot, source, refuse), photo.camera
+            if given is not None and given.focal_px is not None and given.principal_point is not None:
+                camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
+            else:
+                focal, centre = pinhole(shot.camera, shot.key, refuse)
+                camera = ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
+            external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
                 world_from_camera = as_rows(shot.cam_from_world.inverse().rotation)
                 photo = msgspec.structs.replace(photo, world_from_camera=world_from_camera)
@@ -80,43 +86,31 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
     return result
 
 
-def _external(kind: str, photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> ExternalCamera:
-    poses, given = _poses(photo, shot, source, refuse), photo.camera
-    if given is not None and given.focal_px is not None and given.principal_point is not None:
-        return ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
-    focal, centre = pinhole(shot.camera, shot.key, refuse)
-    return ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
-
-
 def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> dict[str, Pose]:
     """object -> pose, of those whose place the source gives and dataset.yaml does not."""
     objects = [obj for obj in photo.objects if obj.pose is None and not obj.keypoints]
-    if source.bop is not None:
-        poses = {obj.name: _instance(photo, obj, shot, source, refuse) for obj in objects if obj.mesh in source.obj_ids}
-        return {name: pose for name, pose in poses.items() if pose is not None}
+    poses = {}
+    if source.bop is not None:  # the one instance of the object's mesh, in units of the mesh
+        for obj in (obj for obj in objects if obj.mesh in source.obj_ids):
+            obj_id = source.obj_ids[obj.mesh]
+            instances = shot.poses.get(obj_id, [])
+            if len(instances) > 1:
+                fault = f"image {shot.image} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times"
+                cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
+                refuse(f"cameras.obj_ids.{obj.mesh}", fault, cure)
+            if not instances:
+                log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
+                            refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip
+            for pose in instances:
+                poses[obj.name] = Pose(pose.rotation, tuple(x / source.mesh_unit_mm for x in pose.translation))
+        return poses
     placed = {obj.name: source.world_from_object[obj.name] for obj in objects if obj.name in source.world_from_object}
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
         refuse("cameras.world_from_object", fault, "objects of one photo share its unit: scale the meshes' files alike")
-    poses = {}
     for name, similarity in placed.items():  # of scale 1: the camera's unit becomes the mesh's, which no picture shows
         cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
         translation = tuple(float(x) / similarity.scale for x in cam_from_object.translation)
         poses[name] = Pose(as_rows(cam_from_object.rotation), translation)
     return poses
-
-
-def _instance(photo: PhotoEntry, obj: ObjectEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> Pose | None:
-    """The one instance of the object's mesh, in units of the mesh; None, with a warning, where the scene names none."""
-    obj_id = source.obj_ids[obj.mesh]
-    poses = shot.poses.get(obj_id, [])
-    if len(poses) > 1:
-        fault = f"image {shot.image} of photo {photo.name!r} shows obj_id {obj_id} {len(poses)} times"
-        cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
-        refuse(f"cameras.obj_ids.{obj.mesh}", fault, cure)
-    if not poses:
-        log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
-                    refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip
-        return None
-    return Pose(poses[0].rotation, tuple(x / source.mesh_unit_mm for x in poses[0].translation))

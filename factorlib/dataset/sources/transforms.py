@@ -11,7 +11,6 @@ from typing import Annotated
 import msgspec
 import pycolmap
 
-from factorlib.dataset.check import check_rotation
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import FOCAL_PX, Centre, Focal, Number
 from factorlib.dataset.sources.shot import SIDE_PX, Shot, colmap_camera, read_source, rigid
@@ -67,17 +66,14 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
         lens = Lens(**{name: getattr(content, name) if own[name] is None else own[name] for name in names})
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
-        cam_from_world = _cam_from_world(f"{key}.transform_matrix", frame.transform_matrix, refuse)
+        of, rows = f"{key}.transform_matrix", frame.transform_matrix
+        if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
+            refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+        refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
+        opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
+        cam_from_world = rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
         shots.append(Shot(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
     return shots
-
-
-def _cam_from_world(key: str, rows: list[Row4], refuse: Refusal) -> pycolmap.Rigid3d:
-    if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
-        refuse(key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
-    check_rotation(key, tuple(row[:3] for row in rows[:3]), refuse)
-    opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
-    return rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
 
 
 def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
@@ -98,19 +94,16 @@ def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tup
     size = (lens.w, lens.h) if lens.w is not None and lens.h is not None else None
     width, height = size or (2 * max(lens.cx or focal, 1.0), 2 * max(lens.cy or focal, 1.0))
     cx, cy = width / 2 if lens.cx is None else lens.cx, height / 2 if lens.cy is None else lens.cy
-    model, params = _model(key, lens, [focal, focal if lens.fl_y is None else lens.fl_y, cx, cy], refuse)
-    return colmap_camera(key, model, min(width, SIDE_PX), min(height, SIDE_PX), params, refuse), size
-
-
-def _model(key: str, lens: Lens, pinhole: list[float], refuse: Refusal) -> tuple[str, list[float]]:
-    """COLMAP's model and its parameters."""
+    pinhole = [focal, focal if lens.fl_y is None else lens.fl_y, cx, cy]
     k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2))
     is_perspective = lens.camera_model in (None, *PERSPECTIVE)
     if not any((k1, k2, k3, k4, p1, p2)) and not lens.is_fisheye and is_perspective:
-        return "PINHOLE", pinhole
-    if lens.is_fisheye or lens.camera_model == FISHEYE:
-        return FISHEYE, [*pinhole, k1, k2, k3, k4]
-    if is_perspective and k4 == 0:
-        return "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
-    fault = f"the camera model {one_line(repr(lens.camera_model))} with k4 = {k4} is not read here"
-    refuse(f"{key}.camera_model", fault, f"undistort the photos, or give {', '.join((*PERSPECTIVE, FISHEYE))}")
+        model, params = "PINHOLE", pinhole
+    elif lens.is_fisheye or lens.camera_model == FISHEYE:
+        model, params = FISHEYE, [*pinhole, k1, k2, k3, k4]
+    elif is_perspective and k4 == 0:
+        model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
+    else:
+        fault = f"the camera model {one_line(repr(lens.camera_model))} with k4 = {k4} is not read here"
+        refuse(f"{key}.camera_model", fault, f"undistort the photos, or give {', '.join((*PERSPECTIVE, FISHEYE))}")
+    return colmap_camera(key, model, min(width, SIDE_PX), min(height, SIDE_PX), params, refuse), size
