@@ -27,8 +27,7 @@ def names(requirements):
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
 OF_CLUSTERS = {
-    ROOT / "factorlib" / name
-    for name in ("parcel.py", *(f"runner/{module}.py" for module in ("blocks", "child", "cluster")))
+    ROOT / "factorlib" / name for name in ("parcel.py", *(f"runner/{module}.py" for module in ("child", "cluster")))
 }
 
 

@@ -238,7 +238,7 @@ class Sources:
     def _source(self, name: str, file: Path) -> Source:
         if file not in self._read:
             of_folder, parse = Source("", [], Names({}, {}, {}), [], {}), partial(self._parse, name, file)
-            self._read[file] = of_folder if file.is_dir() else self.hashes.source(file, parse, Source)
+            self._read[file] = of_folder if file.is_dir() else self.hashes.remembered("source", file, parse, Source)
         return self._read[file]
 
     @staticmethod

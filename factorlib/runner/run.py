@@ -12,21 +12,21 @@ import json
 import time
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
+from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
-from factorlib.runner.executors import Pools
 from factorlib.runner.gc import tenant
-from factorlib.runner.home import claim, label, remember, sound_lines, view_of
+from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
 from factorlib.runner.pipeline import DASK, DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey
-from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
+from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
 if TYPE_CHECKING:
@@ -34,10 +34,6 @@ if TYPE_CHECKING:
 
 POLL = 0.1  # seconds between two looks at what the workers say
 DIED = "its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume"
-
-
-class Refused(Exception):
-    """Parameters that no stage takes; each has been shown."""
 
 
 @dataclass
@@ -51,16 +47,7 @@ class Running:
     read: int = 0
 
 
-@dataclass
-class Tally:
-    """What a run came to."""
-
-    ran: list[Step] = field(default_factory=list)
-    failed: dict[Step, Outcome] = field(default_factory=dict)
-    held_up: list[Step] = field(default_factory=list)
-
-
-def run(survey: Survey, display: Display) -> Tally:
+def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
@@ -72,7 +59,6 @@ def run(survey: Survey, display: Display) -> Tally:
             pools = Pools()
         work = Run(survey, display, pools, folder)
         try:
-            work.check()
             work.go()
         except BaseException:
             pools.close(kill=True)
@@ -80,44 +66,30 @@ def run(survey: Survey, display: Display) -> Tally:
         finally:
             for running in work.running.values():
                 running.lock.release()
-            remember(survey)
+            show(survey, survey.planned(frozenset()))
         pools.close()
-    return work.tally
+    return work
 
 
 class Run:
-    """The state of one run."""
+    """The state of one run.  ran, failed, held_up: the steps that it came to"""
 
     def __init__(self, survey: Survey, display: Display, pools: Pools | Cluster, folder: Path):
         self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
         self.store, self.outputs, self.shared = survey.store, survey.outputs, shared_store(survey.store.root)
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
-        self.tally = Tally()
+        self.ran: list[Step] = []
+        self.failed: dict[Step, Outcome] = {}
+        self.held_up: list[Step] = []
         self.planned: dict[Step, Planned] = {}
         self.stale = False  # there are results that the plan does not know
         self.made: set[str] = set()  # keys
         self.edited: set[str] = set()  # stages whose code is no longer that of their keys
 
-    def check(self) -> None:
-        """Refuse bad parameters before anything has run."""
-        self._plan()
-        stages = dict.fromkeys(p.step.stage for p in self.planned.values() if p.status != "current")
-        checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
-        running: dict[Future, str] = {}
-        while checks or running:
-            while checks and self.pools.free(checks[0].taken):
-                code = checks.pop(0)
-                running[self.pools.submit(code.taken, code.threads, check_params, code)] = code.stage
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                outcome, stage = self._outcome(future), running.pop(future)
-                if outcome.error:
-                    self._fail(Step(stage), outcome)
-        if self.tally.failed:
-            raise Refused(self.tally.failed)
-
     def go(self) -> None:
         """Run all that can run; returns when nothing is running, and what is left waits for a step that failed."""
+        self._plan()
         while True:
             self.waiting = set()
             self._start_planned()
@@ -128,12 +100,12 @@ class Run:
                 break
             self._wait()
         left = (p.step for p in self.planned.values() if p.status != "current")
-        self.tally.held_up = [step for step in left if step not in self.tally.failed]
+        self.held_up = [step for step in left if step not in self.failed]
 
     # ── starting ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
     def _plan(self) -> None:
-        planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        planned = self.survey.planned(self.survey.spec.forced - set(self.ran) - set(self.failed))
         self.planned, self.stale = {p.step: p for p in planned}, False
         self.display.plan(planned)
 
@@ -142,7 +114,7 @@ class Run:
             step = planned.step
             if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
-            if step in self.running or step in self.tally.failed or step.stage in self.edited:
+            if step in self.running or step in self.failed or step.stage in self.edited:
                 continue
             if not self.pools.free(1):
                 return
@@ -178,36 +150,31 @@ class Run:
 
     def _task(self, planned: Planned) -> Task:
         step, survey, record = planned.step, self.survey, planned.record
-        stage, forced = survey.spec.pipeline.stages[step.stage], "forced" in planned.reasons
+        stage, given = survey.spec.pipeline.stages[step.stage], survey.spec.pipeline.stages[step.stage].folders
         slices = {name: survey.data.slice(name, step.photo) for name in stage.slices}
         facts = {DATASET + name: slice_.facts for name, slice_ in slices.items()}
         files = {file: survey.data.folder / file for slice_ in slices.values() for file in slice_.files}
-        hashes = {file: record[f"file:{file}"] for file in files}
-        given = stage.folders
         read = {f"given:{param}/{file}": given[param] / file for param in given for file in stage.given[param]}
         if step.recipe is not None:
             recipe = survey.recipes[step.recipe]
             facts["recipe"] = recipe.facts
             read |= {f"recipe file:{name}": path for name, path in recipe.files.items()}
-        name = self.folder / label(step)
+        temporary = self.folder / label(step)
         return Task(
             code=self._code(step.stage),
-            photo=step.photo,
-            makes=stage.makes,
-            gather=stage.gather,
+            stage=stage,
             folders={name: self._folder(step, name) for name in stage.upstream} | given,
             facts=facts,
             files=files | read,
-            hashes=hashes | {file: record[file] for file in read},
-            log=self._log_above(step, name.with_name(f"{name.name}.log.jsonl")) if stage.logs else None,
+            hashes={file: record[f"file:{file}"] for file in files} | {file: record[file] for file in read},
+            log=self._log_above(step, temporary.with_name(f"{temporary.name}.log.jsonl")) if stage.logs else None,
             store=self.store.root,
             key=planned.key,
             record=record,
-            temporary=name,
-            events=name.with_name(f"{name.name}.events.jsonl"),
-            shipped=stage.shipped,
+            temporary=temporary,
+            events=temporary.with_name(f"{temporary.name}.events.jsonl"),
             shared=self.shared,
-            forced=forced,
+            forced="forced" in planned.reasons,
         )
 
     def _folder(self, step: Step, name: str) -> Path:
@@ -216,7 +183,7 @@ class Run:
         if not stage.over or step.photo is not None:
             return self.store.tree(self.planned[Step(name, step.photo if stage.over else None)].output)
         outputs = {each.photo: self.planned[each].output for each in spec.steps_of(name)}
-        return view_of(self.store, self.outputs.inspector, outputs, stage.gather)
+        return view_of(self.store, self.outputs, outputs, stage.gather)
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""
@@ -274,24 +241,24 @@ class Run:
             where = self.survey.project.shown(outcome.damaged)
             self.display.warn(step, f"its kept result was damaged and is replaced; what was there: {where}")
         self.survey.previous[str(step)] = work.task.record
-        self.tally.ran.append(step)
+        self.ran.append(step)
         self.made.add(key)
         self._log(self.store.log(key).read_text(encoding="utf-8"))
         remember(self.survey, {str(step): key})
         self.display.finish(step, outcome.seconds)
 
     def _outcome(self, future: Future) -> Outcome:
-        """How it ended; its worker is free again."""
-        self.pools.done(future)
         try:
             return future.result()
-        except (BrokenProcessPool, CancelledError):
-            return Outcome(error=DIED)
         except Exception as error:
-            return Outcome(error=f"{type(error).__name__}: {error}", traceback=repr(error))
+            name = type(error).__name__
+            died = (
+                isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker"
+            )  # the latter is Dask's
+            return Outcome(error=DIED) if died else Outcome(error=f"{name}: {error}", traceback=repr(error))
 
     def _fail(self, step: Step, outcome: Outcome) -> None:
-        self.tally.failed[step] = outcome
+        self.failed[step] = outcome
         self.edited |= {step.stage} if outcome.code_changed else set()
         where = None
         if outcome.traceback:

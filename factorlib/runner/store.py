@@ -26,7 +26,7 @@ import shutil
 import stat
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -86,7 +86,7 @@ class Store:
         for name in files:
             (folder / name).chmod(0o444)
         sync_tree(folder)
-        return entry, self.put(folder, self.tree(entry.output), lambda: holds(self.tree(entry.output), files))
+        return entry, self.put(folder, self.tree(entry.output), lambda: not damage_of(self.tree(entry.output), files))
 
     def keep(self, key: str, entry: Entry) -> None:
         """From now on `key` has that result."""
@@ -129,23 +129,19 @@ def output_of(files: dict[str, str]) -> str:
 # ── whether results are as they were kept ────────────────────────────────────────────────────────────────────────────
 
 
-def stamps_of(folder: Path) -> dict[str, Stamp]:
-    """{relative path: stamp} of what lies below a folder; empty where there is none."""
-    return dict(_stamps(folder, ""))
-
-
-def _stamps(folder: str | Path, above: str) -> Iterator[tuple[str, Stamp]]:
-    try:
-        entries = [entry for entry in os.scandir(folder) if not left_over(entry.name)]
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _stamps(entry.path, f"{above}{entry.name}/")
-            continue
-        with contextlib.suppress(FileNotFoundError):
-            facts = entry.stat(follow_symlinks=False)
-            yield above + entry.name, (facts.st_size, facts.st_mtime_ns) if stat.S_ISREG(facts.st_mode) else NO_FILE
+def stamps_of(folder: str | Path, above: str = "") -> dict[str, Stamp]:
+    """{relative path: stamp} of what lies below a folder, with `above` before each path; empty where there is none."""
+    stamps: dict[str, Stamp] = {}
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        for entry in [entry for entry in os.scandir(folder) if not left_over(entry.name)]:
+            if entry.is_dir(follow_symlinks=False):
+                stamps |= stamps_of(entry.path, f"{above}{entry.name}/")
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                facts = entry.stat(follow_symlinks=False)
+                is_file = stat.S_ISREG(facts.st_mode)
+                stamps[above + entry.name] = (facts.st_size, facts.st_mtime_ns) if is_file else NO_FILE
+    return stamps
 
 
 def hashes_of_tree(folder: Path) -> dict[str, str]:
@@ -156,52 +152,76 @@ def hashes_of_tree(folder: Path) -> dict[str, str]:
     return {name: hash_of_file(folder / name) for name, _ in stamps}
 
 
-def holds(tree: Path, files: dict[str, str]) -> bool:
-    """Whether a folder has exactly those files, every content read."""
-    try:
-        return hashes_of_tree(tree) == files
-    except (OSError, InputError):
-        return False
-
-
-def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]) -> list[str]:
+def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
     """How a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
-    now = stamps_of(folder)
-    lines = [(name, _fault(folder / name, files[name], now.get(name), right.get(name))) for name in sorted(files)]
-    lines += [(name, "no file of this result") for name in sorted(now.keys() - files.keys())]
-    return [f"{name}: {words}" for name, words in lines if words]
-
-
-def _fault(path: Path, hash_: str, now: Stamp | None, right: Stamp | None) -> str:
-    if now is None or now == NO_FILE:
-        return "a link, or no file" if now else "missing"
-    try:
-        return "" if now == right or hash_of_file(path) == hash_ else "other content"
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
+    lines, now = [], stamps_of(folder)
+    for name in sorted(files):
+        if (stamp := now.get(name)) in (None, NO_FILE):
+            lines.append(f"{name}: {'a link, or no file' if stamp else 'missing'}")
+        elif stamp != (right or {}).get(name):
+            try:
+                lines += [] if hash_of_file(folder / name) == files[name] else [f"{name}: other content"]
+            except OSError as error:
+                lines.append(f"{name}: cannot be read ({error.strerror})")
+    return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
 
 
 class Inspector:
-    """Looks at the trees and views of a store.  known: by tree or view, the stamps of its files when contents were right."""
+    """Output hash by key (`get`), and whether trees and views of a store are as they were kept.
 
-    def __init__(self, root: Path):
-        self.root, self.cache, self._changed = root, root / "cache" / "trees.json", False
+    known: by tree or view, the stamps of its files when contents were right
+    damaged: by key, what is wrong with its tree, so that it has no output
+    """
+
+    def __init__(self, store: Store):
+        self.store, self.cache, self._changed = store, store.cache / "trees.json", False
         self.known = read_cache(self.cache, dict[str, dict[str, Stamp]]) or {}
+        self.damaged: dict[str, list[str]] = {}
+        self._outputs: dict[str, str] = {}
+        self._entries: dict[str, Entry | None] = {}
         self._wrong: dict[str, tuple[dict[str, Stamp], list[str]]] = {}
+
+    def get(self, key: str) -> str | None:
+        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
+        if key not in self._outputs and (entry := self.entry(key)):
+            self.damaged.pop(key, None)
+            if damage := self.damage(entry.output, entry.files):
+                self.damaged[key] = damage
+            else:
+                self._outputs[key] = entry.output
+        return self._outputs.get(key)
+
+    def entry(self, key: str) -> Entry | None:
+        """`Store.entry`, read once."""
+        if self._entries.get(key) is None:  # what is not there yet may come
+            self._entries[key] = self.store.entry(key)
+        return self._entries[key]
+
+    def forget(self, key: str) -> None:
+        """Look `key` up again when it is asked for next."""
+        self._outputs.pop(key, None)
+        self._entries.pop(key, None)
+
+    def still(self, keys: Iterable[str]) -> bool:
+        """Whether those keys have the outputs they had, looked up again."""
+        before = {key: self._outputs.get(key) for key in keys}
+        for key in before:
+            self.forget(key)
+        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
 
     def damage(self, output: str, files: Mapping[str, str]) -> list[str]:
         """What is wrong with a tree that should hold `files` (relative path -> hash), a line each; empty where nothing is."""
-        now = stamps_of(self.root / "trees" / output)
+        now = stamps_of(self.store.tree(output))
         if now and now == self.known.get(output):
             return []
-        if output not in self._wrong or self._wrong[output][0] != now:
+        if self._wrong.get(output, (None,))[0] != now:
             self._wrong[output] = now, self.thorough(output, files, self.known.get(output, {}))
         return self._wrong[output][1]
 
     def thorough(self, output: str, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
         """The same, with every content read, but for files whose stamps are in `right`."""
-        tree = self.root / "trees" / output
-        now, damage = stamps_of(tree), damage_of(tree, files, right or {})
+        tree = self.store.tree(output)
+        now, damage = stamps_of(tree), damage_of(tree, files, right)
         if damage:
             self._changed |= self.known.pop(output, None) is not None
         else:
@@ -216,50 +236,9 @@ class Inspector:
     def save(self) -> None:
         """Write the cache, where there is anything new to write."""
         if self._changed:
-            places = (self.root / "trees", self.root / "views")
+            places = self.store.trees, self.store.views
             write_cache(self.cache, {n: s for n, s in self.known.items() if any((p / n).is_dir() for p in places)})
             self._changed = False
-
-
-class Outputs:
-    """Output hash by key, each looked up once; none of a key whose tree is not as it was kept.
-
-    damaged: by key, what is wrong with its tree
-    """
-
-    def __init__(self, store: Store):
-        self.store, self.inspector = store, Inspector(store.root)
-        self.damaged: dict[str, list[str]] = {}
-        self._known: dict[str, str] = {}
-        self._entries: dict[str, Entry | None] = {}
-
-    def get(self, key: str) -> str | None:
-        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
-        if key not in self._known and (entry := self.entry(key)):
-            self.damaged.pop(key, None)
-            if damage := self.inspector.damage(entry.output, entry.files):
-                self.damaged[key] = damage
-            else:
-                self._known[key] = entry.output
-        return self._known.get(key)
-
-    def entry(self, key: str) -> Entry | None:
-        """`Store.entry`, read once."""
-        if self._entries.get(key) is None:  # what is not there yet may come
-            self._entries[key] = self.store.entry(key)
-        return self._entries[key]
-
-    def forget(self, key: str) -> None:
-        """Look `key` up again when it is asked for next."""
-        self._known.pop(key, None)
-        self._entries.pop(key, None)
-
-    def still(self, keys: Iterable[str]) -> bool:
-        """Whether those keys have the outputs they had, looked up again."""
-        before = {key: self._known.get(key) for key in keys}
-        for key in before:
-            self.forget(key)
-        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
 
 
 # ── what killed writers left ─────────────────────────────────────────────────────────────────────────────────────────
@@ -278,8 +257,8 @@ def is_alive(pid: int) -> bool:
     """Whether there is such a process on this machine, whoever's it is."""
     try:
         os.kill(pid, 0)
+        return True
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        pass
-    return True
+        return True

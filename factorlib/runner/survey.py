@@ -26,7 +26,7 @@ from factorlib.runner.pipeline import (
 )
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import Data, Project, Recipe
-from factorlib.runner.store import Outputs, Store
+from factorlib.runner.store import Inspector, Store
 from factorlib.runner.worker import Code, check_params
 
 READ = (
@@ -52,7 +52,7 @@ class Survey:
     store: Store
     spec: Spec
     records: dict[Step, Record]
-    outputs: Outputs
+    outputs: Inspector
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
     words: dict[str, str]
@@ -92,12 +92,21 @@ class Survey:
     def wrong_values(self, planned: list[Planned]) -> list[str]:
         """Of the parameters that steps would run with: one out of its range, or of another kind.
 
-        Only a stage that is given any is imported, which takes seconds where it computes.
+        Only a stage that is given any is imported, in a process of its own: that takes seconds where it computes.
         """
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
-        codes = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values]
-        outcomes = map(check_params, codes)  # a stage that cannot be loaded says so when it is run
-        return [outcome.error for outcome in outcomes if outcome.error and not outcome.traceback]
+        codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
+        if codes:
+            from factorlib.runner.child import Pools
+
+            pools = Pools()
+            try:
+                for future in [pools.submit(1, code.threads, check_params, code) for code in codes]:
+                    if future.exception() is None and not (outcome := future.result()).traceback:
+                        faults += filter(None, [outcome.error])  # a stage that cannot be loaded says so when it is run
+            finally:
+                pools.close(kill=True)
+        return faults
 
 
 def survey(
@@ -130,8 +139,8 @@ def survey(
         records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
-    outputs = Outputs(store)
-    entries = {step: outputs.entry(key) for step, key in home.last_keys(warn=True).items()}
+    outputs = Inspector(store)
+    entries = {step: outputs.entry(key) for step, key in home.keys(lenient=True).items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
     return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
 

@@ -15,10 +15,10 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.home import Home, claim, label, made_home, made_homes, remember, sound_lines
+from factorlib.runner.home import Home, claim, label, made_home, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
-from factorlib.runner.plan import Planned, difference
-from factorlib.runner.project import ALL, RESERVED, Project, check_name, is_path
+from factorlib.runner.plan import Planned, Step, difference
+from factorlib.runner.project import ALL, RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
@@ -93,10 +93,12 @@ def make(project: Project, wish: Wish) -> int:
         planned = seen.planned()
         todo = [p.step for p in planned if p.status != "current"]
         if not todo:
-            remember(seen, planned=planned)
+            show(seen, planned)
             _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
         elif faults := seen.faults(todo, new=True):
             return _refused(seen, faults)
+        elif faults := seen.wrong_values(planned):
+            return _refused(seen, faults, "parameters")
         elif code := _run(seen, started):
             return code
         _name_results(seen, wish.targets is None)
@@ -105,25 +107,24 @@ def make(project: Project, wish: Wish) -> int:
 
 def _run(seen: Survey, started: float) -> int:
     from factorlib.runner.display import display_for
-    from factorlib.runner.run import Refused, run
+    from factorlib.runner.run import run
 
     display = display_for()
     try:
-        tally = run(seen, display)
-    except Refused:
-        return 1
+        ran = run(seen, display)
     except (KeyboardInterrupt, Stopped) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
         return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
-    if failed := list(tally.failed):
-        _say(seen, f"{words.count(failed)} failed: {words.listed(failed)}")
-        if tally.held_up:
-            print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
+    if failed := list(ran.failed):
+        more = [f"{len(failed) - words.NAMED} more"] if len(failed) > words.NAMED else []
+        _say(seen, f"{words.count(failed)} failed: {', '.join([*map(str, failed[: words.NAMED]), *more])}")
+        if ran.held_up:
+            print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in ran.held_up))}")
         return 1
-    current, seconds = len(seen.records) - len(tally.ran), time.perf_counter() - started
-    _say(seen, f"{words.count(tally.ran)} run, {current} current, {seconds:.1f} s")
+    current, seconds = len(seen.records) - len(ran.ran), time.perf_counter() - started
+    _say(seen, f"{words.count(ran.ran)} run, {current} current, {seconds:.1f} s")
     return 0
 
 
@@ -151,17 +152,8 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
 # ── looking ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def show_plan(project: Project, wish: Wish) -> int:
-    """Print what would run; 1 where a value of a parameter would not do."""
-    return _shown(project, wish, words.plan_lines)
-
-
-def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run; 1 where a value of a parameter would not do."""
-    return _shown(project, wish, words.why_lines)
-
-
-def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]]) -> int:
+def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]] = words.plan_lines) -> int:
+    """Print what would run; 1 where a value of a parameter would not do.  lines: how a plan is told"""
     seen = surveyed(project, wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
@@ -174,31 +166,35 @@ def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[s
     return 0
 
 
+def show_why(project: Project, wish: Wish) -> int:
+    """Print why each step would run; 1 where a value of a parameter would not do."""
+    return show_plan(project, wish, words.why_lines)
+
+
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
     seen = surveyed(project, wish, look=True)
+
+    def running(planned: Planned) -> bool:
+        """Whether a run holds the lock on a step's key."""
+        try:
+            descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
 
     def warned(planned: Planned) -> list[str]:
         """What a step said when its present result was made."""
         return [event["text"] for event in _events(seen, planned) if event["event"] == "warning"]
 
-    print("\n".join(words.status_lines(seen.planned(), lambda p: _is_running(seen, p), warned)))
+    print("\n".join(words.status_lines(seen.planned(), running, warned)))
     return 0
-
-
-def _is_running(seen: Survey, planned: Planned) -> bool:
-    """Whether a run holds the lock on a step's key."""
-    try:
-        descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        return False
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
 
 
 def _events(seen: Survey, planned: Planned) -> list[dict]:
@@ -249,19 +245,26 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     counts = f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
     _say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
     if sheet:
-        from factorlib.runner.display import shown_if_long
+        from factorlib.runner.display import display_for
 
         claim(project, seen.home, seen.data.folder)
-        path = seen.home.folder / "sheet.png"
-        with shown_if_long("sheet") as report:
-            _science("sheet").write_sheet(seen.data.folder, path, report)
+        path, step, started, display = seen.home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
+
+        def report(done: float, total: float) -> None:
+            """Note how much of the sheet is drawn."""
+            display.progress(step, done, total, "")
+            display.tick()
+
+        display.start(step)
+        try:
+            import_module("factorlib.sheet").write_sheet(
+                seen.data.folder, path, report
+            )  # science, by its name as stages
+            display.finish(step, time.monotonic() - started)
+        finally:
+            display.close()
         print(f"  contact sheet: {project.shown(path)}")
     return 0
-
-
-def _science(name: str) -> object:
-    """A module that the runner does not know: found by its name, as stages are, when it is needed."""
-    return import_module(f"factorlib.{name}")
 
 
 # ── datasets and results ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -272,9 +275,9 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     if photos is None:
         cure = "add PHOTOS=<folder>, and MASKS=… and MESHES=… where there are some"
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
-    folder = Path(os.path.abspath(dataset)) if is_path(dataset) else project.root / "data" / dataset
+    folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
-    missing = _science("newset").new_dataset(folder, photos, masks, meshes)
+    missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
     where = ", with `?` where you must say more:" if missing else ""
     print(f"{project.shown(folder)}/dataset.yaml is written{where}")
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
@@ -290,7 +293,7 @@ def compare(project: Project, first: Path, second: Path) -> int:
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
     changes = _changes(Store(project.build / "store"), *(Home(folder).keys() for folder in folders))
-    page = _science("report.comparison").comparison(*folders, changes)
+    page = import_module("factorlib.report.comparison").comparison(*folders, changes)
     path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
@@ -324,10 +327,9 @@ def clean(project: Project, dataset: str | None) -> int:
 
     homes = _homes(project, dataset, "delete")
     if homes or dataset is None:
-        deleted, left = forget_all(project) if dataset is None else forget(project, homes[0])
-        print("\n".join([f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]))
-        for path in left:
-            print(f"left    {project.shown(path)}")
+        deleted, left = forget_all(project) if dataset is None else forget(project, homes)
+        lines = [f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]
+        print("\n".join([*lines, *(f"left    {project.shown(path)}" for path in left)]))
     return 0
 
 

@@ -21,8 +21,8 @@ pytest.importorskip("distributed", reason="make setup EXTRAS=dask")
 from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner import cluster, verbs
-from factorlib.runner.blocks import Site
 from factorlib.runner.child import TRIM
+from factorlib.runner.cluster import Site
 from factorlib.runner.pipeline import read_pipeline, with_settings
 from factorlib.runner.project import LIBRARY
 from tests.runner import toy

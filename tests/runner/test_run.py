@@ -14,7 +14,7 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.executors import Pools
+from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
 from factorlib.runner.project import LIBRARY
 from tests.faults.test_many_photos import own_modules
@@ -331,7 +331,6 @@ def test_pools_that_are_closed_have_no_threads_left(kill):
     if not kill:
         for future in futures:
             future.result()
-            pools.done(future)
     pools.close(kill)
     assert set(threading.enumerate()) == before  # one that closes while Python ends is a traceback after "stopped"
 
@@ -362,7 +361,7 @@ def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machin
 def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(
     tmp_path, monkeypatch, cores, expected
 ):
-    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 2)
+    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 2)
     project = make_project(tmp_path)
     many = "len(set(inputs.map(lambda _: (__import__('time').sleep(0.1), __import__('threading').get_ident())[1], range(6))))"
     write(tmp_path / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", f"str({many})"))

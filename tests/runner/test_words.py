@@ -90,7 +90,7 @@ def test_fields_of_bases_and_of_fields_are_there(capsys):
         ("inner.size", "1 … 9", "3", "Of what is inside."),
         ("mute", "true, false", "false", ""),
     ]
-    assert [(p.name, p.allowed, p.default, p.text) for p in parameters(Outer)] == expected
+    assert parameters(Outer) == expected
     assert verbs.show_params(Project(LIBRARY, photo_sets()), ["urm"]) == 0
     assert "urm.directions = 512    (0 … 4,096)\n    Directions of the sphere" in capsys.readouterr().out
 
@@ -98,4 +98,4 @@ def test_fields_of_bases_and_of_fields_are_there(capsys):
 @pytest.mark.parametrize("stage", read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).order())
 def test_every_parameter_of_a_stage_says_what_it_means(stage):
     params = importlib.import_module(f"stages.{stage}").Params
-    assert not [one.name for one in parameters(params) if not one.text.endswith(".")]
+    assert not [name for name, *_, text in parameters(params) if not text.endswith(".")]
