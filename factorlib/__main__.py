@@ -36,9 +36,6 @@ def project() -> Project:
     return Project(Path(root).resolve(), photo_sets())
 
 
-# ── options ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def _option(*flags: str, key: str | None = None, **more: Any) -> tuple[tuple[str, ...], str | None, dict[str, Any]]:
     return flags, key, more
 
@@ -107,9 +104,6 @@ def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
     recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
     force = switched_on("FORCE", getattr(asked, "force", False))
     return verbs.Wish(dataset_of(asked), stages or None, settings_of(asked), force, recipes)
-
-
-# ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _stages(asked: Namespace) -> list[str] | None:

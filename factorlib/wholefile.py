@@ -51,7 +51,8 @@ def replace_file(path: str | Path, data: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """`text` at the end of the file, all of it or nothing."""
+    """`text` at the end of the file, all of it or nothing; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
         before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
         try:

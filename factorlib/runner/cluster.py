@@ -39,7 +39,7 @@ from factorlib.runner.pipeline import ADDRESS
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
-from factorlib.runner.worker import Meter, Outcome, Task, heard_by, load_from, run_step
+from factorlib.runner.worker import Heard, Meter, Outcome, Task, run_step
 
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
@@ -359,11 +359,10 @@ def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
     """
     if fault := site.fault():
         raise fault
-    load_from(work[0])
-    meter, values, texts, error = Meter(), [], [], None
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: texts.append(record.getMessage())
-    with heard_by(handler):
+    if str(work[0]) not in sys.path:
+        sys.path.insert(0, str(work[0]))
+    meter, values, error = Meter(), [], None
+    with Heard() as heard:
         function, items = parcel().unpack(work[1])
         try:
             for item in items:
@@ -371,7 +370,7 @@ def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
         except Exception as caught:
             caught.add_note(traceback.format_exc())
             error = that_travels(caught)
-    return parcel().pack((values, texts, error, meter.read()))
+    return parcel().pack((values, heard.warnings, error, meter.read()))
 
 
 def parcel() -> ModuleType:

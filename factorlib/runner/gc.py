@@ -82,9 +82,6 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         door.release()
 
 
-# ── what nothing needs ───────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def unneeded(project: Project) -> dict[str, list[tuple[float, int]]]:
     """What `collect` would delete now, by stage, the largest first; what has no stage any more is `left over`.
 
@@ -162,9 +159,6 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-# ── what is damaged ──────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> tuple[int, list[Damage]]:
     """Read the results that `homes` name, or everything in the store; how many there are, and what is damaged.
 
@@ -206,9 +200,6 @@ def _of_view(store: Store, view: Path, photos: dict[str, Entry], gather: str | N
             table = gathered(store, {photo: entry.output for photo, entry in there.items()})
             files[gather] = hashlib.sha256(table.encode()).hexdigest()[:32]
     return damage_of(view, files)
-
-
-# ── forgetting ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def forget(project: Project, homes: list[Home]) -> Gone:

@@ -69,9 +69,6 @@ class Home(msgspec.Struct, frozen=True):
             return {}
 
 
-# ── which home is whose ──────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def home_of(project: Project, dataset: Path) -> Home:
     """build/<name of the dataset's folder>; refused where a folder of that name elsewhere has it."""
     home = _home_named(project, dataset.name, dataset)
@@ -143,9 +140,6 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
         replace_file(home.mark, f"{words}\n".encode("utf-8", "surrogateescape"))
 
 
-# ── after a run, or where there was nothing to run ───────────────────────────────────────────────────────────────────
-
-
 def remember(survey: Survey, made: dict[str, str]) -> None:
     """Write down the keys that steps have now; steps of photos and stages that are no more are dropped."""
     stages, before = survey.spec.pipeline.stages, survey.home.keys(lenient=True)
@@ -208,9 +202,6 @@ def point(link: Path, target: Path) -> None:
     os.replace(draft, link)
 
 
-# ── views ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather: str | None) -> Path:
     """One folder with the files of all photos ({photo: output}), and `<photo>.json` of each gathered into `gather`."""
     target = store.views / hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
@@ -257,9 +248,6 @@ def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather:
 def gathered(store: Store, outputs: dict[str, str]) -> str:
     """One JSON text of the `<photo>.json` of every tree: {photo: content}."""
     return json_text({photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
-
-
-# ── logs: a JSON object on each line ─────────────────────────────────────────────────────────────────────────────────
 
 
 def sound_lines(path: Path) -> list[bytes]:

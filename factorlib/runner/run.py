@@ -8,8 +8,10 @@ what depends on it; one that fails because its stage's code was edited meanwhile
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
+import traceback
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -102,26 +104,24 @@ class Run:
         left = (p.step for p in self.planned.values() if p.status != "current")
         self.held_up = [step for step in left if step not in self.failed]
 
-    # ── starting ─────────────────────────────────────────────────────────────────────────────────────────────────────
-
     def _plan(self) -> None:
         planned = self.survey.planned(self.survey.spec.forced - set(self.ran) - set(self.failed))
         self.planned, self.stale = {p.step: p for p in planned}, False
         self.display.plan(planned)
 
     def _start_planned(self) -> None:
-        for planned in self.planned.values():
-            step = planned.step
+        for step, planned in self.planned.items():
             if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
             if step in self.running or step in self.failed or step.stage in self.edited:
                 continue
             if not self.pools.free(1):
                 return
-            if self.pools.free(self._code(step.stage).taken):
-                self._start(step, planned)
+            code = self.survey.code(step.stage, self.pools.cores)
+            if self.pools.free(max(code.threads, code.cores)):
+                self._start(step, planned, code)
 
-    def _start(self, step: Step, planned: Planned) -> None:
+    def _start(self, step: Step, planned: Planned, code: Code) -> None:
         if planned.key in self.made:
             words = f"{planned.reasons[0]}, and was made just now: is the disk failing?"
             return self._fail(step, Outcome(error=words))
@@ -132,23 +132,19 @@ class Run:
             self.waiting.add(step)
             return self.display.waits(step)
         self.outputs.forget(planned.key)
-        above = [self.planned[each].key for each in self.survey.spec.above(step)]
         if self.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
             lock.release()  # another run has made it meanwhile
             self.stale = True
-        elif not self.outputs.still(above):
+        elif not self.outputs.still([self.planned[each].key for each in self.survey.spec.above(step)]):
             lock.release()  # a run takes hours, and what is used only now is damaged by now
             self.waiting.add(step)
         else:
             self.display.start(step)
-            task = self._task(planned)
-            future = self.pools.submit(task.code.taken, task.code.threads, run_step, task)
+            task = self._task(planned, code)
+            future = self.pools.submit(max(code.threads, code.cores), code.threads, run_step, task)
             self.running[step] = Running(planned, task, lock, future)
 
-    def _code(self, stage: str) -> Code:
-        return self.survey.code(stage, self.pools.cores)
-
-    def _task(self, planned: Planned) -> Task:
+    def _task(self, planned: Planned, code: Code) -> Task:
         step, survey, record = planned.step, self.survey, planned.record
         stage, given = survey.spec.pipeline.stages[step.stage], survey.spec.pipeline.stages[step.stage].folders
         slices = {name: survey.data.slice(name, step.photo) for name in stage.slices}
@@ -161,7 +157,7 @@ class Run:
             read |= {f"recipe file:{name}": path for name, path in recipe.files.items()}
         temporary = self.folder / label(step)
         return Task(
-            code=self._code(step.stage),
+            code=code,
             stage=stage,
             folders={name: self._folder(step, name) for name in stage.upstream} | given,
             facts=facts,
@@ -192,14 +188,12 @@ class Run:
         write_bytes(path, b"".join(line + b"\n" for log in logs for line in sound_lines(log)))
         return path
 
-    # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
-
     def _wait(self) -> None:
-        if futures := {work.future: step for step, work in self.running.items()}:
+        futures, done = {work.future: step for step, work in self.running.items()}, set()
+        if futures:
             done = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done
         else:
             time.sleep(POLL)
-            done = set()
         for work in self.running.values():
             self._listen(work)
         for future in done:
@@ -211,26 +205,29 @@ class Run:
 
     def _listen(self, work: Running) -> None:
         """Pass on what a worker has said since the last look."""
-        try:
-            with open(work.task.events, "rb") as stream:
-                stream.seek(work.read)
-                text = stream.read()
-        except OSError:
-            return
+        text = b""
+        with contextlib.suppress(OSError), open(work.task.events, "rb") as stream:
+            stream.seek(work.read)
+            text = stream.read()
         lines = text[: text.rfind(b"\n") + 1]
         work.read += len(lines)
         for line in lines.splitlines():
-            try:
+            with contextlib.suppress(ValueError):  # cut where a try of the step was killed
                 event = json.loads(line)
-            except ValueError:  # cut where a try of the step was killed
-                continue
-            if "warning" in event:
-                self.display.warn(work.planned.step, event["warning"])
-            else:
-                self.display.progress(work.planned.step, event["done"], event["total"], event["text"])
+                if "warning" in event:
+                    self.display.warn(work.planned.step, event["warning"])
+                else:
+                    self.display.progress(work.planned.step, event["done"], event["total"], event["text"])
 
     def _take(self, work: Running) -> None:
-        step, key, outcome = work.planned.step, work.task.key, self._outcome(work.future)
+        step, key = work.planned.step, work.task.key
+        try:
+            outcome = work.future.result()
+        except Exception as error:
+            name = type(error).__name__
+            outcome = Outcome(error=f"{name}: {error}", traceback="".join(traceback.format_exception(error)))
+            if isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker":  # which is Dask's
+                outcome = Outcome(error=DIED)
         work.lock.release()
         if outcome.error is not None:
             return self._fail(step, outcome)
@@ -243,33 +240,18 @@ class Run:
         self.survey.previous[str(step)] = work.task.record
         self.ran.append(step)
         self.made.add(key)
-        self._log(self.store.log(key).read_text(encoding="utf-8"))
+        append_text(self.survey.home.log, self.store.log(key).read_text(encoding="utf-8"))
         remember(self.survey, {str(step): key})
         self.display.finish(step, outcome.seconds)
 
-    def _outcome(self, future: Future) -> Outcome:
-        try:
-            return future.result()
-        except Exception as error:
-            name = type(error).__name__
-            died = (
-                isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker"
-            )  # the latter is Dask's
-            return Outcome(error=DIED) if died else Outcome(error=f"{name}: {error}", traceback=repr(error))
-
     def _fail(self, step: Step, outcome: Outcome) -> None:
-        self.failed[step] = outcome
+        self.failed[step], home, where = outcome, self.survey.home, None
         self.edited |= {step.stage} if outcome.code_changed else set()
-        where = None
         if outcome.traceback:
-            path = self.survey.home.errors / f"{label(step)}.txt"
+            path = home.errors / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
         event = {"event": "failed", "stage": step.stage, "photo": step.of, "text": outcome.error}
-        self._log(json.dumps(event, sort_keys=True) + "\n")
-
-    def _log(self, lines: str) -> None:
-        self.survey.home.folder.mkdir(parents=True, exist_ok=True)
-        append_text(self.survey.home.log, lines)
+        append_text(home.log, json.dumps(event, sort_keys=True) + "\n")

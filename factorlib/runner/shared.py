@@ -121,9 +121,6 @@ def _copy_log(source: Store, target: Store, key: str) -> None:
         replace_file(target.log(key), b"".join(line + b"\n" for line in lines))
 
 
-# ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
-
-
 class Shipped(msgspec.Struct, frozen=True):
     """What made_from.json says: the part of the record that the result depends on, and the hash of each file."""
 

@@ -126,9 +126,6 @@ def output_of(files: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
 
 
-# ── whether results are as they were kept ────────────────────────────────────────────────────────────────────────────
-
-
 def stamps_of(folder: str | Path, above: str = "") -> dict[str, Stamp]:
     """{relative path: stamp} of what lies below a folder, with `above` before each path; empty where there is none."""
     stamps: dict[str, Stamp] = {}
@@ -239,9 +236,6 @@ class Inspector:
             places = self.store.trees, self.store.views
             write_cache(self.cache, {n: s for n, s in self.known.items() if any((p / n).is_dir() for p in places)})
             self._changed = False
-
-
-# ── what killed writers left ─────────────────────────────────────────────────────────────────────────────────────────
 
 
 def sweep_drafts(folder: Path) -> None:

@@ -7,9 +7,10 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -18,7 +19,7 @@ from factorlib.runner import words
 from factorlib.runner.home import Home, claim, label, made_home, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
 from factorlib.runner.plan import Planned, Step, difference
-from factorlib.runner.project import ALL, RESERVED, Project, check_name
+from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
@@ -27,7 +28,6 @@ from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
 
-RENDER = "render"  # the stage whose pictures a recipe replaces
 RESULTS = {  # what a user looks at first
     "report": "report/index.html",
     "materials": "export/materials.json",
@@ -36,8 +36,8 @@ RESULTS = {  # what a user looks at first
 }
 
 
-class Wish(msgspec.Struct, frozen=True):
-    """What the command line asks for.
+class Wish(NamedTuple):
+    """What the command line asks for, as `survey` takes it.
 
     targets:  stages; None for all but those that run only when asked for
     settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
@@ -46,26 +46,9 @@ class Wish(msgspec.Struct, frozen=True):
 
     dataset: str
     targets: list[str] | None = None
-    settings: list[str] = []
+    settings: Sequence[str] = ()
     force: bool = False
-    recipes: list[str] = []
-
-
-def surveyed(project: Project, wish: Wish, look: bool = False) -> Survey:
-    """The survey of what is wanted.  Recipes add the stages over them; with the target `render` they are all that is wanted.
-
-    look: without running it: where recipes are named and no stage, of the recipes alone
-    """
-    stages, targets, recipes = _pipeline(project).stages, wish.targets, wish.recipes
-    over_recipes = [name for name, stage in stages.items() if stage.over == "recipe"]
-    if recipes and (targets == [RENDER] or (look and targets is None)):
-        targets = over_recipes
-    elif recipes:
-        usual = [name for name, stage in stages.items() if not stage.optional]
-        targets = [*(usual if targets is None else targets), *over_recipes]
-    elif any(name in over_recipes for name in targets or []):
-        recipes = [ALL]
-    return survey(project, wish.dataset, targets, wish.settings, wish.force, recipes)
+    recipes: Sequence[str] = ()
 
 
 def check_stage(project: Project, name: str, verbs: list[str]) -> None:
@@ -83,13 +66,10 @@ def _say(seen: Survey, text: str) -> None:
     print(f"{seen.data.folder.name}: {text}")
 
 
-# ── running ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def make(project: Project, wish: Wish) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
     with heed_stops():
-        started, seen = time.perf_counter(), surveyed(project, wish)
+        started, seen = time.perf_counter(), survey(project, *wish)
         planned = seen.planned()
         todo = [p.step for p in planned if p.status != "current"]
         if not todo:
@@ -149,12 +129,9 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     return 1
 
 
-# ── looking ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]] = words.plan_lines) -> int:
     """Print what would run; 1 where a value of a parameter would not do.  lines: how a plan is told"""
-    seen = surveyed(project, wish, look=True)
+    seen = survey(project, *wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
         return _refused(seen, faults, "parameters")
@@ -173,7 +150,7 @@ def show_why(project: Project, wish: Wish) -> int:
 
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = surveyed(project, wish, look=True)
+    seen = survey(project, *wish, look=True)
 
     def running(planned: Planned) -> bool:
         """Whether a run holds the lock on a step's key."""
@@ -211,7 +188,7 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 
 def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
     """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
-    seen, logged = surveyed(project, wish, look=True), []
+    seen, logged = survey(project, *wish, look=True), []
     for p in seen.planned():
         if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of):
             error = seen.home.errors / f"{label(p.step)}.txt"
@@ -267,9 +244,6 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     return 0
 
 
-# ── datasets and results ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
     """Make a new dataset of folders of files, and say what is left to do."""
     if photos is None:
@@ -286,31 +260,26 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
 
 def compare(project: Project, first: Path, second: Path) -> int:
     """Write a page that shows two results, folders such as build/eames, side by side."""
-    folders = [path if path.is_dir() else project.build / path for path in (first, second)]
-    for folder, named in zip(folders, (first, second), strict=True):
-        if not Home(folder).keys_file.is_file():
+    homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]
+    for home, named in zip(homes, (first, second), strict=True):
+        if not home.keys_file.is_file():
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    changes = _changes(Store(project.build / "store"), *(Home(folder).keys() for folder in folders))
-    page = import_module("factorlib.report.comparison").comparison(*folders, changes)
-    path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
+    (one, other), store = (home.keys() for home in homes), Store(project.build / "store")
+    entries = {step: (store.entry(one[step]), store.entry(other[step])) for step in one.keys() & other.keys()}
+    changes = None if any(None in pair for pair in entries.values()) else set()
+    for step, pair in entries.items() if changes is not None else ():  # results of other steps left out
+        records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in pair]
+        changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
+    page = import_module("factorlib.report.comparison").comparison(
+        *(home.folder for home in homes), None if changes is None else sorted(changes)
+    )
+    path = project.build / "compare" / "-".join(home.folder.name for home in homes) / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
     print(f"comparison: {project.shown(path)}")
     return 0
-
-
-def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> list[str] | None:
-    """What differs between the records of the steps that both have, results of other steps left out; None where one is gone."""
-    changes: set[str] = set()
-    for step in first.keys() & second.keys():
-        entries = [store.entry(keys[step]) for keys in (first, second)]
-        if None in entries:
-            return None
-        records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in entries]
-        changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
-    return sorted(changes)
 
 
 def _homes(project: Project, dataset: str | None, otherwise: str) -> list[Home]:

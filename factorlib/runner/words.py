@@ -19,9 +19,6 @@ SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
 
 
-# ── plans ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = [
@@ -107,9 +104,6 @@ def count(items: list, one: str = "step") -> str:
     return f"{len(items)} {one}{'' if len(items) == 1 else 's'}"
 
 
-# ── logs ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
     """What each step cost, what it was made with where that is not as for the step above, and what it warned of.
 
@@ -165,9 +159,6 @@ def _age(seconds: float) -> str:
     """
     hours = int(max(0.0, seconds) // 3600)
     return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
-
-
-# ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def parameter_lines(stage: str, params: type) -> list[str]:

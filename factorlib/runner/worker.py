@@ -19,12 +19,12 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
@@ -33,14 +33,14 @@ from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
 from factorlib.runner.filehash import FileHashes, is_file_of
 from factorlib.runner.home import sound_lines
-from factorlib.runner.pipeline import Stage, said_of_settings
+from factorlib.runner.pipeline import Stage
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import copy_shipped, fetch, offer, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Stamp, Store, stamps_of
 from factorlib.stage import Inputs
-from factorlib.wholefile import replace_file
+from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
 LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
@@ -52,7 +52,6 @@ class Code(msgspec.Struct, frozen=True):
     """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
-    words: settings of the command line, by the keys that they stand for
     """
 
     root: Path
@@ -62,12 +61,6 @@ class Code(msgspec.Struct, frozen=True):
     settings: Path
     threads: int = 1
     cores: int = 1
-    words: dict[str, str] = {}
-
-    @property
-    def taken(self) -> int:
-        """Cores that it keeps busy."""
-        return max(self.threads, self.cores)
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -120,7 +113,7 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
                  and whatever else is worth a log; without, threads of this process
     """
     meter, code, store, fetched, made = Meter(), task.code, Store(task.store), None, None
-    with Events(task) as events:
+    with Events(task.events) as events:
         try:
             if task.shared and not task.forced:
                 fetched = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
@@ -150,35 +143,26 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
             return _failed(error, task.temporary.parent, meter.read()["seconds"])
 
 
-def check_params(code: Code) -> Outcome:
-    """Only whether the parameters are good."""
-    try:
-        params_of(load_stage(code), code)
-        return Outcome()
-    except Exception as error:
-        return _failed(error, code.root)
-
-
-def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
+def _failed(error: BaseException, folder: Path, seconds: float) -> Outcome:
     """What the user can mend says how; the rest is a defect, and comes with its traceback."""
     if known := error if isinstance(error, InputError) else disk_error(error, folder):
         return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged), seconds=seconds)
     return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc(), seconds=seconds)
 
 
-def load_from(root: Path) -> None:
-    """Let modules of the project at `root` be imported."""
-    if str(root) not in sys.path:
-        sys.path.insert(0, str(root))
-
-
 def load_stage(code: Code) -> ModuleType:
     """Import a stage's module from the project and limit the process to the stage's threads."""
-    load_from(code.root)
+    if str(code.root) not in sys.path:
+        sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
     take_sigterm_back()
     limit_threads(code.threads)
     return module
+
+
+def params_of(code: Code) -> msgspec.Struct:
+    """The stage's parameters as its own struct.  Raises InputError where one is out of its bounds."""
+    return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:
@@ -187,14 +171,6 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
         return [function(item) for item in items]
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(function, items))
-
-
-def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
-    """The stage's parameters as its own struct, every bound checked."""
-    try:
-        return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
-    except InputError as error:
-        raise said_of_settings(error, code.words) from None
 
 
 def limit_threads(threads: int) -> None:
@@ -208,8 +184,8 @@ def limit_threads(threads: int) -> None:
 
 def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
     """Run the step; its tree is in the store afterwards, its key is not."""
-    module, photo, out = load_stage(task.code), task.record["photo"], task.temporary  # to load it takes seconds
-    params = params_of(module, task.code)
+    module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
+    photo, out = task.record["photo"], task.temporary
     out.mkdir(parents=True)
     hashes = FileHashes(store.cache / "files.json")
     _check_code(task, hashes)
@@ -247,15 +223,12 @@ def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
-    now, before = closure.record(), {n: value for n, value in task.record.items() if n.startswith(CODE)}
+    now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
     if now != before:
         changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
         files = [str(closure.files[name]) for name in changed if name in closure.files]
         words = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
         raise CodeChanged(words, file=", ".join(files) or None, cure="run again")
-
-
-# ── what it costs and says ───────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Meter:
@@ -299,39 +272,44 @@ def _write_log(task: Task, events: Events, cost: dict) -> None:
     replace_file(path, "".join(json.dumps(where | line, sort_keys=True) + "\n" for line in lines).encode())
 
 
-@contextlib.contextmanager
-def heard_by(handler: logging.Handler) -> Iterator[None]:
-    """Within, what the library and Python warn of goes to a handler alone."""
-    loggers = [logging.getLogger(name) for name in ("factorlib", "py.warnings")]
-    logging.captureWarnings(True)
-    warnings.simplefilter("ignore", DeprecationWarning)
-    for logger in loggers:
-        logger.addHandler(handler)
-        logger.propagate = False
-    try:
-        yield
-    finally:
-        for logger in loggers:
-            logger.removeHandler(handler)
+class Heard(logging.Handler):
+    """Within, what the library and Python warn of comes here alone.  warnings: each text once"""
 
+    LOGGERS = ("factorlib", "py.warnings")
 
-class Events(logging.Handler):
-    """Progress and warnings of one step, as JSON lines that the parent reads while it runs."""
-
-    def __init__(self, task: Task):
+    def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.path, self.warnings, self._last, self._heard = task.events, [], 0.0, heard_by(self)
+        self.warnings: list[str] = []
 
-    def __enter__(self) -> Events:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._stream = open(self.path, "a", encoding="utf-8")  # of events
-        self._heard.__enter__()
+    def __enter__(self) -> Self:
+        logging.captureWarnings(True)
+        warnings.simplefilter("ignore", DeprecationWarning)
+        for logger in map(logging.getLogger, self.LOGGERS):
+            logger.addHandler(self)
+            logger.propagate = False
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._heard.__exit__(None, None, None)
-        with contextlib.suppress(OSError):  # what could not be said, see `_write`
-            self._stream.close()
+        for logger in map(logging.getLogger, self.LOGGERS):
+            logger.removeHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take note of a warning (as a `logging.Handler`)."""
+        text = record.getMessage().strip()
+        if text not in self.warnings:
+            self.warnings.append(text)
+            self.say(text)
+
+    def say(self, text: str) -> None:
+        """Pass a warning on."""
+
+
+class Events(Heard):
+    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path, self._last = path, 0.0
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
@@ -339,18 +317,10 @@ class Events(logging.Handler):
             self._last = now
             self._write({"done": float(done), "total": float(total), "text": text})
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Report a warning of the log, each text once (as a `logging.Handler`)."""
-        text = record.getMessage().strip()
-        if text not in self.warnings:
-            self.warnings.append(text)
-            self.say(text)
-
     def say(self, text: str) -> None:
-        """Report a warning that is no part of the result's log."""
+        """Report a warning, whether or not it is part of the result's log."""
         self._write({"warning": text})
 
     def _write(self, event: dict) -> None:
         with contextlib.suppress(OSError):  # on a full disk: the step itself fails there, or finds room again
-            self._stream.write(json.dumps(event) + "\n")
-            self._stream.flush()
+            append_text(self.path, json.dumps(event) + "\n")

@@ -37,7 +37,10 @@ def test_every_form_of_import_is_followed(tmp_path):
         toy.write(tmp_path / name, text)
     closure = Sources([tmp_path], FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
     assert set(closure.modules) == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
-    assert set(closure.data) == {"p:w.safetensors", "p.sub:templates/page.html"}
+    assert {n for n in closure.record if n.startswith("data:")} == {
+        "data:p:w.safetensors",
+        "data:p.sub:templates/page.html",
+    }
     assert closure.external == ["numpy"]
 
 
