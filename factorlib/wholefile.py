@@ -64,10 +64,9 @@ def append_text(path: Path, text: str) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Every file and folder below a folder, and itself."""
-    for path in folder.rglob("*"):
+    """Every file and folder below a folder, and itself, on disk."""
+    for path in (*folder.rglob("*"), folder):
         sync(path)
-    sync(folder)
 
 
 def sync(path: Path) -> None:

@@ -35,6 +35,7 @@ from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
+_taking = threading.Lock()
 MAIN = f"import sys; sys.path.insert(0, {str(LIBRARY)!r}); from factorlib.runner.child import main; main()"
 
 
@@ -81,22 +82,18 @@ class Child:
         self.process.wait()
 
 
-class Children:
-    """The children of this process.  One that is free is taken again by the next call for the same run and threads."""
+def taken(children: list[Child], threads: int, run: Path) -> Child:
+    """Of these children one that is alive and free, of that run and number of threads, or a new one among them.
 
-    def __init__(self) -> None:
-        self.all: list[Child] = []
-        self._lock = threading.Lock()
-
-    def take(self, threads: int, run: Path) -> Child:
-        """A child that is alive and free, or a new one; it is busy until a call of it has returned."""
-        with self._lock:
-            self.all = [child for child in self.all if child.process.poll() is None]
-            free = (child for child in self.all if not child.busy and (child.threads, child.run) == (threads, run))
-            if (child := next(free, None)) is None:
-                self.all.append(child := Child(threads, run))
-            child.busy = True
-            return child
+    It is busy until a call of it has returned.
+    """
+    with _taking:
+        children[:] = [child for child in children if child.process.poll() is None]
+        free = (child for child in children if not child.busy and (child.threads, child.run) == (threads, run))
+        if (child := next(free, None)) is None:
+            children.append(child := Child(threads, run))
+        child.busy = True
+        return child
 
 
 class Pools:
@@ -109,28 +106,28 @@ class Pools:
 
     def __init__(self, cores: int | None = None):
         self.cores = cores or machine_cores()
-        self._children, self._threads = Children(), ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
+        self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
         self._busy: dict[Future, int] = {}
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
-        self._busy = {future: taken for future, taken in self._busy.items() if not future.done()}
+        self._busy = {future: count for future, count in self._busy.items() if not future.done()}
         return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
         with whole():
-            future = self._threads.submit(self._children.take(threads, Path("/")).call, function, argument)
+            future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
             self._busy[future] = cores
             return future
 
     def close(self, kill: bool = False) -> None:
         """End all processes; `kill`: at once, whatever they do."""
         if kill:
-            for child in self._children.all:
+            for child in self.children:
                 child.process.kill()
         self._threads.shutdown()
-        for child in self._children.all:
+        for child in self.children:
             child.end(kill)
 
 

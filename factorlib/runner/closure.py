@@ -284,6 +284,8 @@ def _data_files(folder: Path) -> Iterator[Path]:
 def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """The parameters that are not what they would be without being set; of a table those of its fields.
 
+    A whole number will do for any number, but 1 is not true, nor -0.0 0.0; what is unknown equals no value.
+
     >>> other_than({"lobes": 72, "gain": 0.5, "limits": {"faces": 9}}, {"lobes": 72, "gain": 0.25, "limits": {"faces": 9}})
     {'gain': 0.25}
     >>> other_than({"lobes": 72, "gain": 1.0, "size": Unknown("3")}, {"lobes": 72.0, "gain": 1, "size": "3"})
@@ -293,9 +295,11 @@ def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, An
     for name, value in values.items():
         default = defaults.get(name, Unknown())
         if isinstance(value, dict) and isinstance(default, dict):
-            value = other_than(default, value)
-            others |= {name: value} if value else {}
-        elif not _same(value, default):
+            inner = other_than(default, value)
+            others |= {name: inner} if inner else {}
+            continue
+        as_default = float(value) if type(default) is float and type(value) is int and abs(value) < 1 << 53 else value
+        if isinstance(default, Unknown) or json.dumps(as_default) != json.dumps(default):
             others[name] = value
     return others
 
@@ -309,15 +313,6 @@ def recorded(default: Any) -> Any:
     if isinstance(default, dict):
         return {name: recorded(value) for name, value in default.items()}
     return {"text": str(default)} if isinstance(default, Unknown) else default
-
-
-def _same(value: Any, default: Any) -> bool:
-    """Whether they are one value to a field with that default: a whole number will do for any number, 1 is not true, -0.0 not 0.0."""
-    if isinstance(value, list) and isinstance(default, list):
-        return len(value) == len(default) and all(map(_same, value, default))
-    if type(default) is float and type(value) is int:
-        value = float(value) if abs(value) < 1 << 53 else value
-    return type(value) is type(default) and repr(value) == repr(default)
 
 
 class Packages:

@@ -34,7 +34,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.child import Children, Pools, machine_cores, that_travels
+from factorlib.runner.child import Child, Pools, machine_cores, taken, that_travels
 from factorlib.runner.pipeline import ADDRESS
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
@@ -242,7 +242,7 @@ def _check_protocol(address: str, role: str, key: str) -> None:
 
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
-_children = Children()
+_children: list[Child] = []
 
 
 def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: Any) -> Any:
@@ -263,13 +263,13 @@ def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: 
 
     if waits:
         secede()
-    child = _children.take(threads, site.run)
+    child = taken(_children, threads, site.run)
     return child.call(function, worker.scheduler.address, site, argument, wanted=wanted)
 
 
 def at_work(run: Path) -> bool:
     """Whether a task of that run has a child here."""
-    return any(child.busy and child.run == run and child.process.poll() is None for child in _children.all)
+    return any(child.busy and child.run == run and child.process.poll() is None for child in _children)
 
 
 def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:

@@ -16,7 +16,6 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
@@ -30,9 +29,6 @@ from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey
 from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
-
-if TYPE_CHECKING:
-    from factorlib.runner.cluster import Cluster
 
 POLL = 0.1  # seconds between two looks at what the workers say
 DIED = "its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume"
@@ -53,31 +49,35 @@ def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
+        work = Run(survey, display, folder)
+        if work.refused:
+            return work
         if survey.spec.pipeline.executor == DASK:
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
-            pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
-        else:
-            pools = Pools()
-        work = Run(survey, display, pools, folder)
+            work.pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
         try:
             work.go()
         except BaseException:
-            pools.close(kill=True)
+            work.pools.close(kill=True)
             raise
         finally:
             for running in work.running.values():
                 running.lock.release()
             show(survey, survey.planned(frozenset()))
-        pools.close()
+        work.pools.close()
     return work
 
 
 class Run:
-    """The state of one run.  ran, failed, held_up: the steps that it came to"""
+    """The state of one run.
 
-    def __init__(self, survey: Survey, display: Display, pools: Pools | Cluster, folder: Path):
-        self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
+    refused: faults of parameters, for which nothing runs;  ran, failed, held_up: the steps that it came to
+    """
+
+    def __init__(self, survey: Survey, display: Display, folder: Path):
+        self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
+        self.refused = survey.wrong_values(survey.planned())
         self.store, self.outputs, self.shared = survey.store, survey.outputs, shared_store(survey.store.root)
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again

@@ -92,8 +92,6 @@ class Store:
         """From now on `key` has that result."""
         path = self.keys / f"{key}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            self._set_aside(path)
         replace_file(path, json_text(entry).encode())
 
     def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
@@ -111,14 +109,10 @@ class Store:
             if is_right():
                 shutil.rmtree(folder)
                 return aside
-            aside = self._set_aside(target)
-
-    def _set_aside(self, target: Path) -> Path:
-        self.damaged.mkdir(parents=True, exist_ok=True)
-        aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
-        with contextlib.suppress(FileNotFoundError):  # another run was quicker
-            os.rename(target, aside)
-        return aside
+            self.damaged.mkdir(parents=True, exist_ok=True)
+            aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
+            with contextlib.suppress(FileNotFoundError):  # another run was quicker
+                os.rename(target, aside)
 
 
 def output_of(files: dict[str, str]) -> str:

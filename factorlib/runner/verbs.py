@@ -77,8 +77,6 @@ def make(project: Project, wish: Wish) -> int:
             _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
         elif faults := seen.faults(todo, new=True):
             return _refused(seen, faults)
-        elif faults := seen.wrong_values(planned):
-            return _refused(seen, faults, "parameters")
         elif code := _run(seen, started):
             return code
         _name_results(seen, wish.targets is None)
@@ -97,6 +95,8 @@ def _run(seen: Survey, started: float) -> int:
         return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
+    if ran.refused:
+        return _refused(seen, ran.refused, "parameters")
     if failed := list(ran.failed):
         more = [f"{len(failed) - words.NAMED} more"] if len(failed) > words.NAMED else []
         _say(seen, f"{words.count(failed)} failed: {', '.join([*map(str, failed[: words.NAMED]), *more])}")
@@ -226,17 +226,10 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
 
         claim(project, seen.home, seen.data.folder)
         path, step, started, display = seen.home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
-
-        def report(done: float, total: float) -> None:
-            """Note how much of the sheet is drawn."""
-            display.progress(step, done, total, "")
-            display.tick()
-
+        draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
         display.start(step)
         try:
-            import_module("factorlib.sheet").write_sheet(
-                seen.data.folder, path, report
-            )  # science, by its name as stages
+            draw(seen.data.folder, path, lambda done, all_: (display.progress(step, done, all_, ""), display.tick()))
             display.finish(step, time.monotonic() - started)
         finally:
             display.close()
@@ -266,15 +259,16 @@ def compare(project: Project, first: Path, second: Path) -> int:
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    (one, other), store = (home.keys() for home in homes), Store(project.build / "store")
-    entries = {step: (store.entry(one[step]), store.entry(other[step])) for step in one.keys() & other.keys()}
-    changes = None if any(None in pair for pair in entries.values()) else set()
-    for step, pair in entries.items() if changes is not None else ():  # results of other steps left out
+    (one, other), store, changes = (home.keys() for home in homes), Store(project.build / "store"), set()
+    for step in one.keys() & other.keys():
+        pair = store.entry(one[step]), store.entry(other[step])
+        if None in pair:
+            changes = None  # which is not known
+            break
         records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in pair]
         changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
-    page = import_module("factorlib.report.comparison").comparison(
-        *(home.folder for home in homes), None if changes is None else sorted(changes)
-    )
+    folders, changes = [home.folder for home in homes], changes if changes is None else sorted(changes)
+    page = import_module("factorlib.report.comparison").comparison(*folders, changes)
     path = project.build / "compare" / "-".join(home.folder.name for home in homes) / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
