@@ -7,7 +7,6 @@ that was killed, so a folder whose lock can be taken is rubbish, and no command 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import shutil
 import uuid
@@ -17,11 +16,10 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from factorlib.errors import InputError
-from factorlib.runner.home import Home, gathered, made_homes
-from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.home import Home, made_homes
 from factorlib.runner.plan import Step, key_of
 from factorlib.runner.project import Project
-from factorlib.runner.store import Entry, Inspector, Store, damage_of, is_alive, stamps_of, sweep_drafts
+from factorlib.runner.store import Inspector, Store, is_alive, sweep_drafts
 
 Gone = tuple[list[Path], list[Path]]  # what was deleted, and what is left beside it, for the runner did not make it
 Damage = tuple[Path, list[str], list[str]]  # where; a line for each fault; whose result, as `masks/kitchen (eames)`
@@ -124,10 +122,8 @@ def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[
     homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
     keys = _needed(store, {key for home in homes for key in home.keys().values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
-    views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    rest = [p for p in store.views.glob("*") if p.name not in views]  # they only link to trees
-    rest += [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
+    rest = [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
     rest += [*store.locks.glob("*"), *store.unfinished.glob("*")]
     return unused, [p for p in store.trees.glob("*") if p.name not in trees] + list(store.damaged.glob("*")), rest
 
@@ -159,7 +155,7 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> tuple[int, list[Damage]]:
+def verify(store: Store, homes: list[Home], everything: bool) -> tuple[int, list[Damage]]:
     """Read the results that `homes` name, or everything in the store; how many there are, and what is damaged.
 
     What is damaged is no longer taken for right by its size and time: the next run makes it again.
@@ -179,27 +175,8 @@ def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool
             damaged.append((store.keys / f"{key}.json", ["its record is not the one that made the key"], names))
     for output, (files, names) in trees.items():  # every tree once, whichever keys gave it
         damaged.append((store.tree(output), inspector.thorough(output, files), names))
-    for home in homes:
-        for link in map(home.folder.joinpath, pipeline.stages):
-            if link.is_dir() and link.resolve().parent == store.views.resolve():
-                steps = {step: key for step, key in home.keys().items() if step.startswith(f"{link.name}/")}
-                photos = {step.partition("/")[2]: e for step, key in steps.items() if (e := inspector.entry(key))}
-                faults = _of_view(store, link.resolve(), photos, pipeline.stages[link.name].gather)
-                damaged.append((link, faults, [f"{link.name} ({home.folder.name})"]))
     inspector.save()
     return len(keys), [damage for damage in damaged if damage[1]]
-
-
-def _of_view(store: Store, view: Path, photos: dict[str, Entry], gather: str | None) -> list[str]:
-    """A photo of which there is any file must be there in whole; one that failed in the last run is not."""
-    names = stamps_of(view).keys()
-    there = {photo: entry for photo, entry in photos.items() if names & entry.files.keys()}
-    files = {name: hash_ for entry in there.values() for name, hash_ in entry.files.items()}
-    if gather:
-        with contextlib.suppress(OSError, InputError):  # of a tree that is damaged
-            table = gathered(store, {photo: entry.output for photo, entry in there.items()})
-            files[gather] = hashlib.sha256(table.encode()).hexdigest()[:32]
-    return damage_of(view, files)
 
 
 def forget(project: Project, homes: list[Home]) -> Gone:

@@ -1,21 +1,19 @@
 """The folders that a user sees: build/<dataset>, with links to the current results, marks, and the log of all runs.
 
-    <stage>       link to the current result of a stage, in build/store: its tree, or for a stage over photos a view
-    current.json  which key each step has
+    <stage>       link to the current result of a stage, in build/store; for a stage over photos, to a view
+    current.json  which key each step and each view has
     log.jsonl     what all runs did
     errors/       where a step failed by a defect, its traceback
     recipes/      links to the current pictures of each recipe
     dataset.txt   whose results these are: only a folder with this mark is a home that the runner made
 
-A view has the results of all photos of a stage in one folder, by hard links.  It is right if its files have the stamps of
-the trees' own; one that is not, because somebody put another file in, or a tree was replaced, is made anew.
+A view is one more result: those of all photos of a stage in one folder, by hard links.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import logging
 import os
 import shlex
@@ -27,9 +25,10 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
-from factorlib.runner.plan import Planned, Step
+from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.plan import Planned, Step, key_of
 from factorlib.runner.project import RESERVED, Project, check_name
-from factorlib.runner.store import Inspector, Store, stamps_of, sweep_drafts
+from factorlib.runner.store import Entry, Inspector, damage_of, output_of, stamps_of, sweep_drafts
 from factorlib.wholefile import replace_file, write_text
 
 if TYPE_CHECKING:
@@ -143,7 +142,7 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
 def remember(survey: Survey, made: dict[str, str]) -> None:
     """Write down the keys that steps have now; steps of photos and stages that are no more are dropped."""
     stages, before = survey.spec.pipeline.stages, survey.home.keys(lenient=True)
-    names = {str(step) for stage in stages for step in survey.spec.steps_of(stage)}
+    names = {*stages, *(str(step) for stage in stages for step in survey.spec.steps_of(stage))}
     asked_for_before = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
     keys = {name: key for name, key in before.items() if name in names or name.startswith(asked_for_before)} | made
     if keys != before:
@@ -154,16 +153,16 @@ def remember(survey: Survey, made: dict[str, str]) -> None:
 def show(survey: Survey, planned: list[Planned]) -> None:
     """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
     current, home, stages = [p for p in planned if p.status == "current"], survey.home, survey.spec.pipeline.stages
-    remember(survey, {str(p.step): p.key for p in current})
-    of_stages: dict[str, dict[str | None, str]] = {}
+    keys, of_photos = {str(p.step): p.key for p in current}, {}
     for p in current:
-        if p.step.recipe:
-            point(home.folder / p.step.stage / p.step.recipe, survey.store.tree(p.output))
+        if p.step.photo:
+            of_photos.setdefault(p.step.stage, {})[p.step.photo] = p.key
         else:
-            of_stages.setdefault(p.step.stage, {})[p.step.photo] = p.output
-    for name, outputs in of_stages.items():
-        view = stages[name].over and view_of(survey.store, survey.outputs, outputs, stages[name].gather)
-        point(home.folder / name, view or survey.store.tree(outputs[None]))
+            point(home.folder / str(p.step), survey.store.tree(p.output))
+    for name, of in of_photos.items():
+        keys[name] = view_of(survey.outputs, name, of, stages[name].gather)
+        point(home.folder / name, survey.store.tree(survey.outputs.get(keys[name])))
+    remember(survey, keys)
     for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in stages:
             link.unlink(missing_ok=True)
@@ -202,52 +201,44 @@ def point(link: Path, target: Path) -> None:
     os.replace(draft, link)
 
 
-def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather: str | None) -> Path:
-    """One folder with the files of all photos ({photo: output}), and `<photo>.json` of each gathered into `gather`."""
-    target = store.views / hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
-    wanted = {}
-    for output in outputs.values():
-        wanted |= inspector.known.get(output) or stamps_of(store.tree(output))
+def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | None) -> str:
+    """The key of one folder with the files of all photos of a stage ({photo: key}), and each `<photo>.json` in `gather`.
 
-    def is_right() -> bool:
-        """Whether the folder has the trees' own files, and the table that is gathered from them."""
-        now = stamps_of(target)
-        table = {gather: now.pop(gather)} if gather and gather in now else {}
-        if now != wanted or bool(table) != bool(gather):
-            return False
-        if gather and table != inspector.known.get(target.name):
-            if (target / gather).read_bytes() != gathered(store, outputs).encode():
-                return False
-            inspector.remember(target.name, table)
-        return True
-
-    if is_right():
-        return target
-    draft = store.tmp / f"view-{os.getpid()}-{target.name}"
+    The folder is a result as those of steps are.  Its files are hard links to theirs.
+    """
+    store, entries = outputs.store, {photo: outputs.entry(key) for photo, key in sorted(keys.items())}
+    record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
+    record |= {"stage": stage, "photo": None, "view": gather}
+    if outputs.get(key := key_of(record)) is not None:
+        return key
+    draft, files = store.tmp / f"view-{os.getpid()}-{key}", {}
     shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
     try:
-        for photo, output in sorted(outputs.items()):
-            for name in sorted(stamps_of(store.tree(output))):
-                if (file := draft / name).exists():
-                    words = f"two photos write the same file {file.name!r}"
+        for photo, entry in entries.items():
+            for name in entry.files:
+                if name in files:
+                    words = f"two photos write the same file {name!r}"
                     raise InputError(words, key=photo, cure="put the photo's name into it")
-                file.parent.mkdir(parents=True, exist_ok=True)
+                (draft / name).parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    os.link(store.tree(output) / name, file)
+                    os.link(store.tree(entry.output) / name, draft / name)
                 except OSError:  # no hard links on this file system
-                    shutil.copy2(store.tree(output) / name, file)
+                    shutil.copy2(store.tree(entry.output) / name, draft / name)
+            files |= entry.files
         if gather:
-            write_text(draft / gather, gathered(store, outputs))
+            table = {photo: read_json(draft / f"{photo}.json") for photo in entries}
+            write_text(draft / gather, json_text(table))
             (draft / gather).chmod(0o444)
-        store.put(draft, target, is_right)
+            files[gather] = hash_of_file(draft / gather)
+        view = Entry(output_of(files), record, files)
+        store.put(draft, store.tree(view.output), lambda: not damage_of(store.tree(view.output), files))
+        store.keep(key, view)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    return target
-
-
-def gathered(store: Store, outputs: dict[str, str]) -> str:
-    """One JSON text of the `<photo>.json` of every tree: {photo: content}."""
-    return json_text({photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
+    outputs.forget(key)
+    outputs.remember(view.output, stamps_of(store.tree(view.output)))
+    return key
 
 
 def sound_lines(path: Path) -> list[bytes]:

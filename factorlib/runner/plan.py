@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -153,7 +153,7 @@ _KIND = {
 _ABSENT = object()
 _HASHED = ("source", "file", "recipe file", "given", "input", "data")
 _LONGEST = 80  # characters of a value that are shown
-_NAMED, _FILES = 4, 3  # names that came or went; files of one result that are named
+_NAMED = 4  # names that came or went
 
 
 def difference(before: Record, after: Record) -> list[str]:
@@ -186,12 +186,13 @@ def _shown(value: Any, record: Record, kind: str, what: str) -> str:
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
-def in_short(damage: list[str]) -> str:
-    """
+def in_short(lines: Sequence[object], most: int = 3, between: str = "; ") -> str:
+    """The first lines, and how many more there are.
+
     >>> in_short(["a: missing", "b: missing", "c: missing", "d: missing"])
     'a: missing; b: missing; c: missing; 1 more'
     """
-    return "; ".join([*damage[:_FILES], *([f"{len(damage) - _FILES} more"] if len(damage) > _FILES else [])])
+    return between.join([*map(str, lines[:most]), *([f"{len(lines) - most} more"] if len(lines) > most else [])])
 
 
 def names(steps: Iterable[Step]) -> str:
@@ -200,10 +201,8 @@ def names(steps: Iterable[Step]) -> str:
     >>> names([Step("masks", "a"), Step("masks", "b"), Step("train")])
     'masks (2 photos), train'
     """
-    counts: dict[str, list[Step]] = {}
+    groups: dict[str, list[Step]] = {}
     for step in steps:
-        counts.setdefault(step.stage, []).append(step)
-    return ", ".join(
-        str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} {'recipes' if found[0].recipe else 'photos'})"
-        for stage, found in counts.items()
-    )
+        groups.setdefault(step.stage, []).append(step)
+    kinds = {stage: "recipes" if found[0].recipe else "photos" for stage, found in groups.items()}
+    return ", ".join(str(f[0]) if len(f) == 1 else f"{s} ({len(f)} {kinds[s]})" for s, f in groups.items())

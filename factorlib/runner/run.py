@@ -178,8 +178,8 @@ class Run:
         stage, spec = self.survey.spec.pipeline.stages[name], self.survey.spec
         if not stage.over or step.photo is not None:
             return self.store.tree(self.planned[Step(name, step.photo if stage.over else None)].output)
-        outputs = {each.photo: self.planned[each].output for each in spec.steps_of(name)}
-        return view_of(self.store, self.outputs, outputs, stage.gather)
+        keys = {each.photo: self.planned[each].key for each in spec.steps_of(name)}
+        return self.store.tree(self.outputs.get(view_of(self.outputs, name, keys, stage.gather)))
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""

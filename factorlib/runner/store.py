@@ -3,7 +3,6 @@
     build/store/trees/<output>/   the files of a result, read-only
     build/store/keys/<key>.json   {"output", "record", "files"}: what the key gave
     build/store/logs/<key>.jsonl  what making it cost and said (times and machine facts are only here)
-    build/store/views/<hash>/     the results of all photos of a stage in one folder
     build/store/unfinished/<key>/ what lets a step that was killed go on
     build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
     build/store/locks, tmp, cache
@@ -55,7 +54,7 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs, self.views = map(root.joinpath, ("trees", "keys", "logs", "views"))
+        self.trees, self.keys, self.logs = root / "trees", root / "keys", root / "logs"
         self.unfinished, self.damaged = root / "unfinished", root / "damaged"
         self.locks, self.tmp, self.cache = root / "locks", root / "tmp", root / "cache"
 
@@ -158,9 +157,9 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
 
 
 class Inspector:
-    """Output hash by key (`get`), and whether trees and views of a store are as they were kept.
+    """Output hash by key (`get`), and whether the trees of a store are as they were kept.
 
-    known: by tree or view, the stamps of its files when contents were right
+    known: by tree, the stamps of its files when contents were right
     damaged: by key, what is wrong with its tree, so that it has no output
     """
 
@@ -220,15 +219,16 @@ class Inspector:
         return damage
 
     def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
-        """Note the stamps of a tree or view whose contents were right."""
+        """Note the stamps of a tree whose contents were right."""
         if self.known.get(name) != stamps:
             self.known[name], self._changed = stamps, True
 
     def save(self) -> None:
         """Write the cache, where there is anything new to write."""
         if self._changed:
-            places = self.store.trees, self.store.views
-            write_cache(self.cache, {n: s for n, s in self.known.items() if any((p / n).is_dir() for p in places)})
+            write_cache(
+                self.cache, {name: stamps for name, stamps in self.known.items() if self.store.tree(name).is_dir()}
+            )
             self._changed = False
 
 

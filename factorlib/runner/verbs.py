@@ -18,7 +18,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
 from factorlib.runner.home import Home, claim, label, made_home, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
-from factorlib.runner.plan import Planned, Step, difference
+from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
@@ -79,7 +79,15 @@ def make(project: Project, wish: Wish) -> int:
             return _refused(seen, faults)
         elif code := _run(seen, started):
             return code
-        _name_results(seen, wish.targets is None)
+        home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
+        for what, path in RESULTS.items() if whole else ():
+            if (home / path).exists():
+                print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
+        for name in seen.spec.targets or ():
+            over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
+            if over_recipes or not whole:
+                one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
+                print(f"  {name}: {project.shown(home / name / one)}")
         return 0
 
 
@@ -98,27 +106,13 @@ def _run(seen: Survey, started: float) -> int:
     if ran.refused:
         return _refused(seen, ran.refused, "parameters")
     if failed := list(ran.failed):
-        more = [f"{len(failed) - words.NAMED} more"] if len(failed) > words.NAMED else []
-        _say(seen, f"{words.count(failed)} failed: {', '.join([*map(str, failed[: words.NAMED]), *more])}")
+        _say(seen, f"{words.count(failed)} failed: {in_short(failed, words.NAMED, ', ')}")
         if ran.held_up:
             print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in ran.held_up))}")
         return 1
     current, seconds = len(seen.records) - len(ran.ran), time.perf_counter() - started
     _say(seen, f"{words.count(ran.ran)} run, {current} current, {seconds:.1f} s")
     return 0
-
-
-def _name_results(seen: Survey, whole: bool) -> None:
-    """Print, of the whole pipeline what a user looks at first, else each stage's folder; pictures of recipes either way."""
-    home = seen.home.folder
-    for what, path in RESULTS.items() if whole else ():
-        if (home / path).exists():
-            print(f"  {what}: {seen.project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
-    for name in seen.spec.targets or ():
-        over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
-        if over_recipes or not whole:
-            one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
-            print(f"  {name}: {seen.project.shown(home / name / one)}")
 
 
 def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
@@ -318,7 +312,7 @@ def verify(project: Project, dataset: str | None) -> int:
     homes = _homes(project, dataset, "read")
     if dataset is not None and not homes:
         return 0
-    results, damaged = read_all(Store(project.build / "store"), homes, _pipeline(project), dataset is None)
+    results, damaged = read_all(Store(project.build / "store"), homes, dataset is None)
     for where, faults, steps in damaged:
         lines = [f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {fault}" for fault in faults)]
         print("\n".join(lines))

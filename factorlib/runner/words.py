@@ -13,7 +13,7 @@ import msgspec
 from msgspec import inspect as types
 
 from factorlib.runner.pipeline import Pipeline
-from factorlib.runner.plan import Planned, Step
+from factorlib.runner.plan import Planned, Step, in_short
 
 SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
@@ -22,7 +22,8 @@ NAMED = 20  # steps that have failed
 def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = [
-        f"{stage:<10} {status:<7} {items:<24} {_short(why)}".rstrip() for stage, status, why, items in _alike(planned)
+        f"{stage:<10} {status:<7} {items:<24} {in_short(why, SHOWN)}".rstrip()
+        for stage, status, why, items in _alike(planned)
     ]
     current = sum(p.status == "current" for p in planned)
     return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
@@ -61,11 +62,6 @@ def _of_any_photo(reason: str, step: Step) -> str:
     if step.photo and reason.startswith("dataset.yaml:"):
         return reason.replace(f" photos.{step.photo}.", " photos.*.", 1)
     return reason
-
-
-def _short(reasons: tuple[str, ...] | list[str]) -> str:
-    more = f"; {len(reasons) - SHOWN} more" if len(reasons) > SHOWN else ""
-    return "; ".join(reasons[:SHOWN]) + more
 
 
 def status_lines(
@@ -124,7 +120,7 @@ def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]
 def _cost(planned: Planned, events: list[dict]) -> str:
     done = next((event for event in reversed(events) if event["event"] == "done"), None)
     if planned.status != "current":
-        return f"{planned.status}: {_short(planned.reasons)}"
+        return f"{planned.status}: {in_short(planned.reasons, SHOWN)}"
     if done is None or done.get("shared"):
         return "its log is not there" if done is None else "from the shared store, without its log"
     cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"

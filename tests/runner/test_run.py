@@ -65,7 +65,7 @@ def test_all_results_stand_under_the_datasets_name_read_only_and_their_costs_in_
     assert json.loads((home / "upper" / "sizes.json").read_text()) == {"a": {"size": 5}, "b": {"size": 4}}
     assert sorted(p.name for p in (home / "upper").iterdir()) == ["a.json", "a.txt", "b.json", "b.txt", "sizes.json"]
     assert not list((project.build / "store" / "tmp").iterdir()), "something is left behind"
-    files = [p for folder in ("trees", "views") for p in (project.build / "store" / folder).rglob("*") if p.is_file()]
+    files = [p for p in (project.build / "store" / "trees").rglob("*") if p.is_file()]
     assert files and not any(p.stat().st_mode & 0o222 for p in files)
     event = json.loads((home / "log.jsonl").read_text().splitlines()[0])
     assert event["seconds"] > 0 and event["memory_mb"] > 1 and event["threads"] == 1 and event["key"]
