@@ -164,10 +164,10 @@ def copy_shipped(folder: Path, out: Path) -> None:
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
     """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
-    target, files = root / shipping.folder, {path.name: path.read_bytes() for path in sorted(result.iterdir())}
+    target, hashes = root / shipping.folder, {}
     target.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        replace_file(target / name, content)
-    shipped = Shipped(made_from(record, shipping.made_by), {name: hash_of_file(target / name) for name in files})
-    replace_file(target / MADE_FROM, json_text(shipped).encode())
+    for path in sorted(result.iterdir()):
+        replace_file(target / path.name, path.read_bytes())
+        hashes[path.name] = hash_of_file(target / path.name)
+    replace_file(target / MADE_FROM, json_text(Shipped(made_from(record, shipping.made_by), hashes)).encode())
     return target

@@ -126,13 +126,19 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
                 made = store.take_in(task.record, task.temporary)
             entry, damaged = fetched or made or _made(task, store, events, spread_over or partial(spread, code.cores))
             cost = meter.read(code.threads, code.cores)
-            if fetched is None:
-                if spread_over is not None and made is None:
-                    cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
-                    cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
-                _write_log(task, events, cost)
-            elif not store.log(task.key).exists():
-                _write_log(task, events, {"seconds": 0.0, "shared": True})
+            if spread_over is not None and fetched is None and made is None:
+                cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
+                cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
+            if fetched is None or not store.log(task.key).exists():  # a line for each warning, one for the step
+                done = (
+                    {"event": "done", **cost} if fetched is None else {"event": "done", "seconds": 0.0, "shared": True}
+                )
+                where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+                where |= {"stage": code.stage, "key": task.key}
+                lines = [where | {"event": "warning", "text": text} for text in events.warnings] + [where | done]
+                store.logs.mkdir(parents=True, exist_ok=True)
+                text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
+                replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
             if task.shared and fetched is None:
@@ -260,16 +266,6 @@ class Meter:
 def _cpu_seconds() -> float:
     usage = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(one.ru_utime + one.ru_stime for one in usage)
-
-
-def _write_log(task: Task, events: Events, cost: dict) -> None:
-    """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
-    where = {"stage": task.code.stage, "photo": task.record["photo"], "key": task.key}
-    where |= {"recipe": task.record["recipe"]} if "recipe" in task.record else {}
-    lines = [*({"event": "warning", "text": text} for text in events.warnings), {"event": "done", **cost}]
-    path = Store(task.store).log(task.key)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, "".join(json.dumps(where | line, sort_keys=True) + "\n" for line in lines).encode())
 
 
 class Heard(logging.Handler):
