@@ -1,6 +1,7 @@
 """The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
 
-It is read by `argparse`, for a run with nothing to do must not wait for a library that reads it more comfortably.
+It is read by `argparse`, for a run with nothing to do must not wait for a library that reads it more comfortably.  What the
+command line leaves out the environment may say: make passes NAME=value on so, untouched by any shell.
 """
 
 from __future__ import annotations
@@ -35,7 +36,12 @@ def project() -> Project:
     return Project(Path(root).resolve(), photo_sets())
 
 
-# ── options ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+def _option(*flags: str, key: str | None = None, **more: Any) -> tuple[tuple[str, ...], str | None, dict[str, Any]]:
+    return flags, key, more
+
+
+def _path(word: str) -> Path:
+    return Path(word).expanduser()
 
 
 def _cores(word: str) -> int:
@@ -44,26 +50,20 @@ def _cores(word: str) -> int:
     return int(word)
 
 
-def _option(*flags: str, **more: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    return flags, more
-
-
 ON, MANY, FEW = {"action": "store_true"}, {"action": "append"}, {"nargs": "*"}
-OPTIONS = {  # as `ArgumentParser.add_argument` takes them
+OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environment, where it is not given
     "dataset": _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET"),
     "set": _option("--set", dest="settings", metavar="X.Y=Z", help="stage.parameter=value; else SET", **MANY),
     "force": _option("--force", help="whatever the store holds, or without asking; as FORCE=1", **ON),
-    "recipe": _option(
-        "--recipe", dest="recipes", help="pictures: a path, a name in recipes/, or all; else RECIPE", **MANY
-    ),
+    "recipe": _option("--recipe", dest="recipes", help="a path, a name in recipes/, or all; else RECIPE", **MANY),
     "stages": _option("stages", help="stages; all without it", **FEW),
     "mermaid": _option("--mermaid", help="as a Mermaid diagram", **ON),
-    "photo": _option("--photo", help="its name, or a recipe's; else PHOTO"),
-    "photos": _option("--photos", type=Path, help="folder; else PHOTOS"),
-    "masks": _option("--masks", type=Path, help="folder; else MASKS"),
-    "meshes": _option("--meshes", type=Path, help="folder; else MESHES"),
-    "first": _option("first", nargs="?", help="folder of a result, as build/eames; else A"),
-    "second": _option("second", nargs="?", help="another; else B"),
+    "photo": _option("--photo", key="PHOTO", help="its name, or a recipe's; else PHOTO"),
+    "photos": _option("--photos", key="PHOTOS", type=_path, help="folder; else PHOTOS"),
+    "masks": _option("--masks", key="MASKS", type=_path, help="folder; else MASKS"),
+    "meshes": _option("--meshes", key="MESHES", type=_path, help="folder; else MESHES"),
+    "first": _option("first", key="A", type=_path, nargs="?", help="folder of a result, as build/eames; else A"),
+    "second": _option("second", key="B", type=_path, nargs="?", help="another; else B"),
     "sheet": _option("--sheet", help="also draw photos, labels and meshes; as SHEET=1", **ON),
     "scheduler": _option("scheduler", help="its address, as tcp://10.0.0.1:8786"),
     "cores": _option("--cores", type=_cores, help="that it computes on; default: all of this machine"),
@@ -71,21 +71,13 @@ OPTIONS = {  # as `ArgumentParser.add_argument` takes them
 }
 
 
-# ── what the environment says where the command line does not: make passes NAME=value on so, untouched by any shell ──
-
-
-def named(dataset: str | None, optional: bool = False) -> str | None:
+def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
     """The dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
-    dataset = os.environ.get("DATASET") if dataset is None else dataset  # an empty one is not none
+    dataset = os.environ.get("DATASET") if asked.dataset is None else asked.dataset  # an empty one is not none
     if dataset is None and not optional:
         cure = "add DATASET=<a name in data/, or a path to a folder>"
         raise InputError("no dataset is named", key="DATASET", cure=cure)
     return dataset
-
-
-def chosen(settings: list[str] | None) -> list[str]:
-    """Parameters `stage.name=value` as they were written: the options', else the environment's SET."""
-    return settings or [os.environ.get("SET", "")]
 
 
 def switched_on(key: str, option: bool) -> bool:
@@ -96,28 +88,22 @@ def switched_on(key: str, option: bool) -> bool:
     return option or word == "1"
 
 
-def forced(force: bool) -> bool:
-    """Whether to run again what is current: --force or FORCE=1."""
-    return switched_on("FORCE", force)
-
-
 def agreed(force: bool) -> bool:
     """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
-    return forced(force) or not sys.stdin.isatty() or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
+    asks = not switched_on("FORCE", force) and sys.stdin.isatty()
+    return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
+
+
+def settings_of(asked: Namespace) -> list[str]:
+    """Parameters `stage.name=value` as they were written: the options', else the environment's SET."""
+    return asked.settings or [os.environ.get("SET", "")]
 
 
 def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
     """What is asked for; without `stages` all of them."""
     recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
-    force = forced(getattr(asked, "force", False))
-    return verbs.Wish(named(asked.dataset), stages or None, chosen(asked.settings), force, recipes)
-
-
-def _path(given: Path | None, key: str) -> Path | None:
-    return given or (Path(os.environ[key]).expanduser() if os.environ.get(key) else None)
-
-
-# ── verbs ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+    force = switched_on("FORCE", getattr(asked, "force", False))
+    return verbs.Wish(dataset_of(asked), stages or None, settings_of(asked), force, recipes)
 
 
 def _stages(asked: Namespace) -> list[str] | None:
@@ -129,16 +115,14 @@ def _stage(asked: Namespace) -> int:
     return verbs.make(project(), wish(asked, [asked.name]))
 
 
-def _new(asked: Namespace) -> int:
-    folders = (_path(getattr(asked, word), word.upper()) for word in ("photos", "masks", "meshes"))
-    return verbs.begin(project(), named(asked.dataset), *folders)
-
-
 def _compare(asked: Namespace) -> int:
-    folders = [given or os.environ.get(key) for given, key in ((asked.first, "A"), (asked.second, "B"))]
-    if not all(folders):
+    if not (asked.first and asked.second):
         raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
-    return verbs.compare(project(), *map(Path, folders))
+    return verbs.compare(project(), asked.first, asked.second)
+
+
+def _validate(asked: Namespace) -> int:
+    return verbs.validate(project(), dataset_of(asked), settings_of(asked), switched_on("SHEET", asked.sheet))
 
 
 def _worker(asked: Namespace) -> int:
@@ -149,77 +133,58 @@ def _worker(asked: Namespace) -> int:
 
 
 ASKED = "dataset set force recipe"
-RUN: dict[str, Callable[[Namespace], int]] = {
-    "all": lambda a: verbs.make(project(), wish(a)),
-    "stage": _stage,
-    "plan": lambda a: verbs.show_plan(project(), wish(a, a.stages)),
-    "why": lambda a: verbs.show_why(project(), wish(a, a.stages)),
-    "status": lambda a: verbs.show_status(project(), wish(a, a.stages)),
-    "graph": lambda a: verbs.show_graph(project(), a.mermaid),
-    "logs": lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo or os.environ.get("PHOTO") or None),
-    "params": lambda a: verbs.show_params(project(), _stages(a)),
-    "new": _new,
-    "compare": _compare,
-    "validate": lambda a: verbs.validate(
-        project(), named(a.dataset), chosen(a.settings), switched_on("SHEET", a.sheet)
-    ),
-    "verify": lambda a: verbs.verify(project(), named(a.dataset, True)),
-    "clean": lambda a: verbs.clean(project(), named(a.dataset, True)),
-    "gc": lambda a: verbs.collect(project(), lambda: agreed(a.force)),
-    "worker": _worker,
-    "ship": lambda a: verbs.ship(project(), a.name, named(a.dataset)),
-}
-VERBS = {  # in the order of `--help`: options, help
-    "all": (ASKED, "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
-    "stage": (f"name {ASKED}", "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),
-    "plan": (f"stages {ASKED}", "What would run; with a recipe and no stage, for its pictures alone."),
-    "why": (f"stages {ASKED}", "Every reason why it would run."),
-    "status": ("stages dataset set recipe", "How far each stage is, and what the current results warned of."),
-    "graph": ("mermaid dataset", "The stages and what they take, as text or as a Mermaid diagram."),
-    "logs": (
-        "stages dataset set recipe photo",
-        "What current results cost and were made with: time, memory, versions.",
-    ),
-    "params": ("stages", "Every parameter of stages with default, range and meaning (make params STAGE=…)."),
-    "new": (
-        "dataset photos masks meshes",
-        "Begin data/<name> of your own photos, masks and meshes, with a dataset.yaml.",
-    ),
-    "compare": ("first second", "A page that shows two results side by side: parameters, numbers, materials, lights."),
-    "validate": ("dataset set sheet", "Check pipeline.yaml, settings and dataset without running anything."),
-    "verify": ("dataset", "Read every kept result, of a dataset or of all, and name what is damaged."),
-    "clean": ("dataset", "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
-    "gc": ("force", "Show which results are current for no dataset, and delete them; a terminal is asked first."),
-    "worker": (
-        "scheduler cores",
-        "Work for a Dask scheduler until it ends; further options are those of `dask worker`.",
-    ),
-    "ship": ("name dataset", "Put a stage's current result into the package (for those who change the stage)."),
-}
-
-
-def parser(program: str) -> argparse.ArgumentParser:
-    """Reads the words of every verb; `verb` in what it returns is its name."""
-    text = "Any other word is the name of a stage: it is run, and what it needs."
-    whole = argparse.ArgumentParser(program, description=text)
-    verbs_ = whole.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
-    for name, (options, text) in VERBS.items():
-        one = verbs_.add_parser(name, help=text, description=text, allow_abbrev=False)
-        for flags, more in (OPTIONS[option] for option in options.split()):
-            one.add_argument(*flags, **more)
-    return whole
+VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, what it does, help
+    "all": (ASKED, lambda a: verbs.make(project(), wish(a)),
+            "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
+    "stage": (f"name {ASKED}", _stage,
+              "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),
+    "plan": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages)),
+             "What would run; with a recipe and no stage, for its pictures alone."),
+    "why": (f"stages {ASKED}", lambda a: verbs.show_why(project(), wish(a, a.stages)),
+            "Every reason why it would run."),
+    "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), wish(a, a.stages)),
+               "How far each stage is, and what the current results warned of."),
+    "graph": ("mermaid dataset", lambda a: verbs.show_graph(project(), a.mermaid),
+              "The stages and what they take, as text or as a Mermaid diagram."),
+    "logs": ("stages dataset set recipe photo", lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo),
+             "What current results cost and were made with: time, memory, versions."),
+    "params": ("stages", lambda a: verbs.show_params(project(), _stages(a)),
+               "Every parameter of stages with default, range and meaning (make params STAGE=…)."),
+    "new": ("dataset photos masks meshes", lambda a: verbs.begin(project(), dataset_of(a), a.photos, a.masks, a.meshes),
+            "Begin data/<name> of your own photos, masks and meshes, with a dataset.yaml."),
+    "compare": ("first second", _compare,
+                "A page that shows two results side by side: parameters, numbers, materials, lights."),
+    "validate": ("dataset set sheet", _validate,
+                 "Check pipeline.yaml, settings and dataset without running anything."),
+    "verify": ("dataset", lambda a: verbs.verify(project(), dataset_of(a, True)),
+               "Read every kept result, of a dataset or of all, and name what is damaged."),
+    "clean": ("dataset", lambda a: verbs.clean(project(), dataset_of(a, True)),
+              "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
+    "gc": ("force", lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+           "Show which results are current for no dataset, and delete them; a terminal is asked first."),
+    "worker": ("scheduler cores", _worker,
+               "Work for a Dask scheduler until it ends; further options are those of `dask worker`."),
+    "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, dataset_of(a)),
+             "Put a stage's current result into the package (for those who change the stage)."),
+}  # fmt: skip
 
 
 def run(words: list[str], program: str) -> int:
     """What the verb of the command line returns.  A first word that is neither an option nor a verb is a stage."""
+    text = "Any other word is the name of a stage: it is run, and what it needs."
+    parser = argparse.ArgumentParser(program, description=text)
+    parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
+    for name, (options, _, text) in VERBS.items():
+        one = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
+        for flags, key, more in (OPTIONS[option] for option in options.split()):
+            one.add_argument(*flags, **more, **({"default": os.environ.get(key) or None} if key else {}))
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
-    known = parser(program)
-    asked, further = known.parse_known_args(words or ["--help"])
+    asked, further = parser.parse_known_args(words or ["--help"])
     if further and asked.verb != "worker":
-        known.error(f"unrecognized arguments: {' '.join(further)}")
+        parser.error(f"unrecognized arguments: {' '.join(further)}")
     asked.further = further
-    return RUN[asked.verb](asked)
+    return VERBS[asked.verb][1](asked)
 
 
 def main() -> NoReturn:

@@ -23,19 +23,21 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
 
     folder: what was being written to, where the error itself does not say
     """
-    each, behind = error, []
-    while each is not None and each not in behind:  # those that it was raised from or while handling
-        behind.append(each)
-        each = each.__cause__ or each.__context__
+    behind = [error]
+    while (cause := behind[-1].__cause__ or behind[-1].__context__) is not None and cause not in behind:
+        behind.append(cause)
     full = next((each for each in behind if _code(each) in FULL), None)
     words = FULL[_code(full)] if full else CLOSED.get(_code(error))
     if words is None:
         return None
-    name = getattr(error, "filename", None)
+    of, name = full or error, getattr(error, "filename", None)
     if not full and isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
         return InputError(f"{words}: it may not be read", file=name, cure="give yourself the right to read it")
-    folders = _folders(full or error, folder)
-    place = next((path for path in folders if not os.access(path, os.W_OK)), folders[0]) if not full else folders[0]
+    names = [getattr(of, "filename", None), getattr(of, "filename2", None)]  # of a rename there are two
+    paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
+    # as far as they exist; `Path.is_dir` raises where it may not look
+    folders = [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]
+    place = folders[0] if full else next((path for path in folders if not os.access(path, os.W_OK)), folders[0])
     free = f"{shutil.disk_usage(place).free / 1e6:.1f} MB are free"
     if full:
         return InputError(f"{words}: {free}", file=place, cure=f"{ROOM}: what is finished is kept")
@@ -48,11 +50,3 @@ def _code(error: BaseException) -> int | None:
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     return next((code for code in (*FULL, errno.EROFS) if os.strerror(code) in str(error)), None)
-
-
-def _folders(error: BaseException, folder: Path) -> list[Path]:
-    """Those of the files that the error names (of a rename there are two), else the given one; as far as they exist."""
-    names = [getattr(error, "filename", None), getattr(error, "filename2", None)]
-    paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
-    # `Path.is_dir` raises where it may not look.
-    return [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]

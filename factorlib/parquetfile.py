@@ -65,11 +65,9 @@ def write_rows(path: str | Path, type_: type[msgspec.Struct], rows: Sequence[msg
 
 
 def _is_readable(kind: pa.DataType) -> bool:
-    """Whether a column holds numbers, text, bytes of a fixed length, or lists of three numbers."""
-    if pa.types.is_fixed_size_list(kind):
-        return kind.list_size == 3 and _is_readable(kind.value_type) and not pa.types.is_string(kind.value_type)
-    if pa.types.is_fixed_size_binary(kind):
-        return 0 < kind.byte_width <= MOST_BYTES
-    return any(
-        test(kind) for test in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_string)
-    )
+    """Whether a column holds numbers, lists of three of them, text, or bytes of a fixed length."""
+    is_list = pa.types.is_fixed_size_list(kind)
+    of = kind.value_type if is_list else kind
+    if pa.types.is_integer(of) or pa.types.is_floating(of) or pa.types.is_boolean(of):
+        return not is_list or kind.list_size == 3
+    return pa.types.is_string(kind) or (pa.types.is_fixed_size_binary(kind) and 0 < kind.byte_width <= MOST_BYTES)

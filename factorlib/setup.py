@@ -150,20 +150,25 @@ def check_system() -> None:
 
     Ends the program where one is missing still that is NEEDED; what makes it FASTER is only recommended.
     """
+    apt = shutil.which("apt-get")
     for libraries, why in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
         missing = [name for name in libraries if not loads(name)]
-        packages = [libraries[name] for name in missing]
-        if missing and os.geteuid() == 0 and shutil.which("apt-get"):
-            say(f"installing {' '.join(packages)}{f': {why}' if why else ''}")
+        packages = " ".join(libraries[name] for name in missing)
+        if missing and os.geteuid() == 0 and apt:
+            say(f"installing {packages}{f': {why}' if why else ''}")
             quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-            for words in (["update"], ["install", "-y", "--no-install-recommends", *packages]):
-                subprocess.run(["apt-get", "-qq", *words], env=quiet, check=False, stdout=subprocess.DEVNULL)
+            for words in ("update", f"install -y --no-install-recommends {packages}"):
+                command = ["apt-get", "-qq", *words.split()]
+                subprocess.run(command, env=quiet, check=False, stdout=subprocess.DEVNULL)
             missing = [name for name in missing if not loads(name)]
+        how = "(the packages of your system that hold these files)"
+        if apt or shutil.which("dnf"):
+            by_dnf = "sudo dnf install " + " ".join(f"'{name}()(64bit)'" for name in missing)
+            how = f"sudo apt-get update && sudo apt-get install -y {packages}" if apt else by_dnf
         if missing and why:
-            say(f"{', '.join(missing)} is not there, and {why}; to install it:\n  {command_for(missing, packages)}")
+            say(f"{', '.join(missing)} is not there, and {why}; to install it:\n  {how}")
         elif missing:
-            words = f"the system libraries {', '.join(missing)} are missing; install them"
-            sys.exit(f"set-up: {words}:\n  {command_for(missing, packages)}")
+            sys.exit(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {how}")
 
 
 def loads(library: str) -> bool:
@@ -172,14 +177,6 @@ def loads(library: str) -> bool:
         return sys.platform != "linux" or bool(ctypes.CDLL(library))
     except OSError:
         return False
-
-
-def command_for(missing: list[str], packages: list[str]) -> str:
-    """Return the command that installs missing libraries on this system."""
-    if shutil.which("apt-get"):
-        return f"sudo apt-get update && sudo apt-get install -y {' '.join(packages)}"
-    by_dnf = "sudo dnf install " + " ".join(f"'{name}()(64bit)'" for name in missing)
-    return by_dnf if shutil.which("dnf") else "(the packages of your system that hold these files)"
 
 
 if __name__ == "__main__":

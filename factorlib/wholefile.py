@@ -51,7 +51,8 @@ def replace_file(path: str | Path, data: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """`text` at the end of the file, all of it or nothing."""
+    """`text` at the end of the file, all of it or nothing; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
         before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
         try:
@@ -63,10 +64,9 @@ def append_text(path: Path, text: str) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Every file and folder below a folder, and itself."""
-    for path in folder.rglob("*"):
+    """Every file and folder below a folder, and itself, on disk."""
+    for path in (*folder.rglob("*"), folder):
         sync(path)
-    sync(folder)
 
 
 def sync(path: Path) -> None:

@@ -30,50 +30,36 @@ _Parser = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
 
 
-class Limits(msgspec.Struct, frozen=True):
-    """The most that a file may hold, far above a dataset of ten thousand photos.
-
-    values: scalars, lists and maps, those that aliases repeat counted each time;  depth: of lists and maps in each other
-    """
-
-    megabytes: float = 64.0
-    values: int = 2_000_000
-    depth: int = 64
-    digits: int = 300
+# The most that a file may hold, far above a dataset of ten thousand photos: values are scalars, lists and maps, those that
+# aliases repeat counted each time; the depth is that of lists and maps in each other; digits are those of a number.
+MOST_BYTES, MOST_VALUES, MOST_DEPTH, MOST_DIGITS = 64_000_000, 2_000_000, 64, 300
 
 
-LIMITS = Limits()
-
-
-def read_yaml(path: str | Path, type_: type[T], limits: Limits = LIMITS) -> T:
+def read_yaml(path: str | Path, type_: type[T], most_values: int = MOST_VALUES) -> T:
     """The file as a value of a msgspec type; InputError with file, line, key and cure for whatever does not fit."""
-    text = _text_of(path, limits)
-    return convert(parse_yaml(text, path, limits), type_, path, text=text)
+    text = read_text(path, "a YAML file", most_bytes=MOST_BYTES)
+    return convert(parse_yaml(text, path, most_values), type_, path, text=text)
 
 
 def load_yaml(path: str | Path) -> Any:
     """The file as dicts, lists and scalars; InputError with file, line, key and cure for what is not YAML."""
-    return parse_yaml(_text_of(path, LIMITS), path)
+    return parse_yaml(read_text(path, "a YAML file", most_bytes=MOST_BYTES), path)
 
 
-def _text_of(path: str | Path, limits: Limits) -> str:
-    return read_text(path, "a YAML file", most_bytes=round(limits.megabytes * 1e6))
-
-
-def parse_yaml(text: str, name: str | Path = "", limits: Limits = LIMITS) -> Any:
+def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES) -> Any:
     """The text's one document as dicts, lists and scalars; InputError names line, key and `name`, which errors call the text.
 
     >>> parse_yaml("{a: 1e-3, b: no, c: [1, ~, true]}")
     {'a': 0.001, 'b': 'no', 'c': [1, None, True]}
     """
-    return _Document(text, name, limits).value()
+    return _Document(text, name, most_values).value()
 
 
 class _Document:
     """One pass over the events of a text, which builds its value and counts it."""
 
-    def __init__(self, text: str, name: str | Path, limits: Limits):
-        self.name, self.limits, self.events = name, limits, _events(text, name)
+    def __init__(self, text: str, name: str | Path, most_values: int):
+        self.text, self.name, self.most_values, self.events = text, name, most_values, self._events()
         self.count, self.anchors, self.unfinished = 0, {}, set()
 
     def value(self) -> Any:
@@ -86,6 +72,16 @@ class _Document:
         if not isinstance(after := next(self.events), yaml.StreamEndEvent):
             self._refuse("there is a second document", after, (), "delete it, and the --- before it")
         return value
+
+    def _events(self) -> Iterator[yaml.Event]:
+        try:
+            yield from yaml.parse(self.text, Loader=_Parser)
+        except yaml.YAMLError as error:
+            mark, context = getattr(error, "problem_mark", None), getattr(error, "context", None)
+            words = [one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part]
+            cure = "look for a bracket, quote, colon or indent on or above this line"
+            file = f"{self.name}:{mark.line + 1}" if mark else self.name
+            raise InputError(f"not YAML: {' '.join(words)}", file=file, cure=cure) from error
 
     def _node(self, event: yaml.Event, keys: Keys) -> Any:
         if isinstance(event, yaml.AliasEvent):
@@ -135,11 +131,11 @@ class _Document:
 
     def _count(self, event: yaml.Event, keys: Keys, deeper: int) -> None:
         self.count += 1
-        if self.count > self.limits.values:
+        if self.count > self.most_values:
             cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
-            self._refuse(f"holds more than {self.limits.values:,} values", event, (), cure)
-        if len(keys) + deeper > self.limits.depth:
-            fault = f"lists and maps are nested more than {self.limits.depth} deep"
+            self._refuse(f"holds more than {self.most_values:,} values", event, (), cure)
+        if len(keys) + deeper > MOST_DEPTH:
+            fault = f"lists and maps are nested more than {MOST_DEPTH} deep"
             self._refuse(fault, event, keys[:4], "is a bracket missing, or an indent too much?")
 
     def _scalar(self, event: yaml.ScalarEvent, keys: Keys) -> Any:
@@ -152,8 +148,8 @@ class _Document:
             elif match is None or (match.lastgroup != kind and (match.lastgroup, kind) != ("int", "float")):
                 cure = "delete the tag, or correct the value"
                 self._refuse(f"{one_line(repr(text))} is no {kind}", event, keys, cure)
-        if kind in ("int", "float") and len(text) > self.limits.digits:
-            cure = f"write it with {self.limits.digits} at most"
+        if kind in ("int", "float") and len(text) > MOST_DIGITS:
+            cure = f"write it with {MOST_DIGITS} at most"
             self._refuse(f"a number of {len(text)} characters", event, keys, cure)
         if kind == "int":
             return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
@@ -169,17 +165,6 @@ class _Document:
         raise InputError(fault, file=f"{self.name}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)
 
 
-def _events(text: str, name: str | Path) -> Iterator[yaml.Event]:
-    try:
-        yield from yaml.parse(text, Loader=_Parser)
-    except yaml.YAMLError as error:
-        mark, context = getattr(error, "problem_mark", None), getattr(error, "context", None)
-        words = [one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part]
-        cure = "look for a bracket, quote, colon or indent on or above this line"
-        file = f"{name}:{mark.line + 1}" if mark else name
-        raise InputError(f"not YAML: {' '.join(words)}", file=file, cure=cure) from error
-
-
 def key_path(keys: Keys) -> str | None:
     """The way to a value as errors write it.
 
@@ -188,9 +173,6 @@ def key_path(keys: Keys) -> str | None:
     """
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{one_line(key)}" for key in keys)
     return text.removeprefix(".") or None
-
-
-# ── types ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text: str | None = None) -> T:
@@ -225,20 +207,16 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
 
 def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> tuple[str, Any, list, Keys]:
     """The fault's words, the innermost value at fault, the types that it may have, and the way to it."""
-    types = _alternatives(type_)
+    types = [type_]
+    for each in types:  # and, where one is a union or described by a `Meta`, all that it stands for
+        types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
+        types += get_args(each)[:1] if get_origin(each) is Annotated else ()
     for key, item, inner in (child for each in types for child in _children(value, each)):
         try:
             msgspec.convert(item, inner)
         except msgspec.ValidationError as below:
             return _innermost(below, item, inner, (*keys, key))
     return str(error), value, types, keys
-
-
-def _alternatives(type_: Any) -> list:
-    """A type and, where it is a union or described by a `Meta`, all that it stands for."""
-    inner = get_args(type_) if get_origin(type_) in (Union, UnionType) else ()
-    inner = get_args(type_)[:1] if get_origin(type_) is Annotated else inner
-    return [type_, *(one for each in inner for one in _alternatives(each))]
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import agreed, chosen, forced, switched_on
+from factorlib.__main__ import agreed, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.pipeline import executor_words
@@ -44,7 +44,7 @@ def run(
         studies(scale).dataset_folder(name)
     if clean:
         raise typer.Exit(forget(scale, named or list(STUDIES)))
-    code = make(scale, named or list(STUDIES), forced(force), executor_words(chosen(None)))
+    code = make(scale, named or list(STUDIES), switched_on("FORCE", force), executor_words([os.environ.get("SET", "")]))
     if docs and code == 0:
         from studies.run.page import refresh_docs
 

@@ -21,40 +21,24 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OURS = {"factorlib", "stages", "tests", "studies"}
 
 
-def names(requirements):
-    return {canonicalize_name(Requirement(text).name) for text in requirements}
-
-
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
 OF_CLUSTERS = {
-    ROOT / "factorlib" / name
-    for name in ("parcel.py", *(f"runner/{module}.py" for module in ("blocks", "child", "cluster")))
+    ROOT / "factorlib" / name for name in ("parcel.py", *(f"runner/{module}.py" for module in ("child", "cluster")))
 }
-
-
-def imported(files):
-    """Top-level modules that the files import."""
-    found = set()
-    for file in sorted(files):
-        for node in ast.walk(ast.parse(file.read_text())):
-            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                modules = [node.module]
-            found |= {module.split(".")[0] for module in modules}
-    return found - OURS - sys.stdlib_module_names
 
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])
 def test_every_import_is_a_dependency_that_is_declared(folder):
-    declared, files = names(PROJECT["dependencies"]), set((ROOT / folder).rglob("*.py"))
-    assert not undeclared(files - OF_CLUSTERS, declared)
-    assert not undeclared(files & OF_CLUSTERS, declared | names(PROJECT["optional-dependencies"]["dask"]))
-
-
-def undeclared(files, declared):
-    """Modules that the files import, of packages that are not `declared`."""
     of = {module: {canonicalize_name(name) for name in found} for module, found in packages_distributions().items()}
-    return {module for module in imported(files) - {"packaging"} if not of[module] & declared}
+    for file in sorted((ROOT / folder).rglob("*.py")):
+        extra = PROJECT["optional-dependencies"]["dask"] if file in OF_CLUSTERS else ["packaging"]
+        declared = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"] + extra}
+        found = set()
+        for node in ast.walk(ast.parse(file.read_text())):
+            found |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
+            found |= {node.module} if isinstance(node, ast.ImportFrom) and node.module and not node.level else set()
+        modules = {name.split(".")[0] for name in found} - OURS - sys.stdlib_module_names
+        assert not {module for module in modules if not of[module] & declared}, file
 
 
 def test_the_lock_is_what_pyproject_asks_for():

@@ -17,34 +17,21 @@ def lacking(monkeypatch):
     return monkeypatch
 
 
-def test_a_library_that_is_needed_is_one_message_with_the_command(lacking):
+def test_a_library_that_is_missing_is_one_message_with_the_command_and_root_installs_it(lacking, capsys):
     with pytest.raises(SystemExit, match=r"libnone.so.9(.|\n)*sudo apt-get update && sudo apt-get install -y libnone9"):
         setup.check_system()
-
-
-def test_a_library_that_makes_it_faster_is_recommended_and_silent_where_it_is_there(lacking, capsys):
-    lacking.setattr(setup, "NEEDED", {})
+    calls, there = [], {"libnone.so.9"}
+    lacking.setattr(setup, "loads", lambda name: name in there)
     setup.check_system()
     assert "three times faster" in (said := capsys.readouterr().out) and "install -y libfast1" in said
-    lacking.setattr(setup, "FASTER", {})
+    there.clear()
+    lacking.setattr(setup.os, "geteuid", lambda: 0)
+    install = lambda command, **_: calls.append(command[-1]) or there.update(setup.NEEDED, setup.FASTER)  # noqa: E731
+    lacking.setattr(setup.subprocess, "run", install)
+    setup.check_system()
+    assert calls == ["update", "libnone9"] and capsys.readouterr().out == "set-up: installing libnone9\n"
     setup.check_system()
     assert capsys.readouterr() == ("", "")
-
-
-def test_root_installs_what_is_missing_and_says_so(lacking, capsys):
-    calls, there = [], set()
-    lacking.setattr(setup.os, "geteuid", lambda: 0)
-    lacking.setattr(setup, "loads", lambda name: name in there)
-    lacking.setattr(
-        setup.subprocess, "run", lambda command, **_: calls.append(command) or there.update(setup.NEEDED, setup.FASTER)
-    )
-    setup.check_system()
-    assert calls[1][-1] == "libnone9" and "installing libnone9" in capsys.readouterr().out
-    there.remove("libfast.so.1")
-    setup.check_system()
-    assert (
-        calls[-1][-1] == "libfast1" and "installing libfast1: renders are three times faster" in capsys.readouterr().out
-    )
 
 
 def test_another_python_is_refused(monkeypatch, tmp_path):
@@ -53,10 +40,6 @@ def test_another_python_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(setup.sys, "version_info", (3, 9, 1))
     with pytest.raises(SystemExit, match=r"3\.11 or 3\.12"):
         setup.make_venv()
-
-
-def test_an_index_that_does_not_answer_is_not_used():
-    assert not setup.answers("http://localhost:9/none/") and not setup.answers("no address")
 
 
 @pytest.fixture
@@ -89,20 +72,18 @@ def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
         setup.install_extras()
 
 
-def test_the_lock_is_installed_by_pip_where_uv_cannot_be_had_and_torch_apart(called, tmp_path):
+def test_the_lock_is_installed_by_pip_where_uv_cannot_be_had_and_torch_apart_which_may_need_more(
+    called, monkeypatch, tmp_path
+):
     setup.install_packages()
     locked, torch = called[-1]
     assert all(command[1:3] == ["-m", "pip"] and "--no-deps" in command for command in (locked, torch))
     assert locked[-2:] == ["-r", str(setup.LOCK)] and torch[-3:] == [setup.TORCH, "--index-url", setup.TORCH_CPU]
     assert (tmp_path / "factorlib.pth").read_text() == "../../../..\n"
-
-
-def test_a_torch_of_another_index_is_asked_what_it_needs(called, monkeypatch):
     monkeypatch.setenv("TORCH_INDEX", "https://example.org/cuda")
     setup.install_packages()
-    assert called[-1] == [
-        setup.with_pip(["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"])
-    ]
+    more = ["-c", str(setup.LOCK), setup.TORCH, "--index-url", "https://example.org/cuda"]
+    assert called[-1] == [setup.with_pip(more)]
 
 
 @pytest.mark.parametrize("reached, torch_by", [(True, "/bin/uv"), (False, "pip")])

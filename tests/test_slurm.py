@@ -31,23 +31,15 @@ def cluster(example, tmp_path):
         yield found
 
 
-def without_address(script):
-    return re.sub(r"tcp://\S+", "tcp://<scheduler>", script).replace(str(LIBRARY), "<checkout>").strip()
-
-
-def test_the_job_script_asks_slurm_for_what_the_example_says_and_its_worker_declares_its_cores(cluster, example):
+def test_the_job_script_asks_slurm_for_what_the_example_and_the_docs_say(cluster):
     script = cluster.job_script()
     for line in ("#SBATCH -p compute", "#SBATCH -A my-project", "#SBATCH --cpus-per-task=16", "#SBATCH -t 08:00:00"):
         assert line in script.splitlines(), script
     command = script.strip().splitlines()[-1]
-    assert command.startswith(f"{LIBRARY}/.venv/bin/python -m distributed.cli.dask_worker {cluster.scheduler_address} ")
     assert "--nthreads 16" in command and "--resources cores=16" in command and "--memory-limit 0" in command
-
-
-def test_the_job_script_of_the_docs_is_the_one_that_is_generated(example):
-    with example["slurm_cluster"](scheduler_options={"dashboard_address": ":0", "host": "127.0.0.1"}) as found:
-        script = without_address(found.job_script())
-    assert script in (LIBRARY / "docs" / "distributed.md").read_text()
+    script = re.sub(r"tcp://\S+", "tcp://<scheduler>", script).replace(str(LIBRARY), "<checkout>").strip()
+    without_logs = re.sub("#SBATCH -[eo] .*\n", "", script)  # they lie where the test says
+    assert without_logs in (LIBRARY / "docs" / "distributed.md").read_text()
 
 
 def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(cluster, tmp_path):

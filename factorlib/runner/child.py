@@ -1,10 +1,13 @@
-"""A process that computes: whatever runs a step does so in one, whether on this machine or as a worker of a cluster.
+"""Processes that compute: whatever runs a step does so in a child, whether of a run on this machine or of a worker of a cluster.
 
 How many threads a library uses, which instructions it may use, and in which order sets are walked, is fixed when a
 process starts, and results depend on it.  So each child is started for one number of threads, in an environment of its
 own, with the modules that are on disk now.  A worker of a cluster was started by others, in whatever environment, and
 stays for days: it computes nothing itself.  A library that crashes, or a step that is killed for want of memory, ends the
 child alone.
+
+The number of threads is part of what is computed, for sums depend on it; how many steps run at once, and over how many
+cores a step spreads independent work, is the machine's affair.
 """
 
 from __future__ import annotations
@@ -17,18 +20,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
 from factorlib import arithmetic
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.stop import whole
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
+_taking = threading.Lock()
 MAIN = f"import sys; sys.path.insert(0, {str(LIBRARY)!r}); from factorlib.runner.child import main; main()"
 
 
@@ -75,26 +82,58 @@ class Child:
         self.process.wait()
 
 
-class Children:
-    """The children of this process.  One that is free is taken again by the next call for the same run and threads."""
+def taken(children: list[Child], threads: int, run: Path) -> Child:
+    """Of these children one that is alive and free, of that run and number of threads, or a new one among them.
 
-    def __init__(self) -> None:
-        self.all: list[Child] = []
-        self._lock = threading.Lock()
+    It is busy until a call of it has returned.
+    """
+    with _taking:
+        children[:] = [child for child in children if child.process.poll() is None]
+        free = (child for child in children if not child.busy and (child.threads, child.run) == (threads, run))
+        if (child := next(free, None)) is None:
+            children.append(child := Child(threads, run))
+        child.busy = True
+        return child
 
-    def take(self, threads: int, run: Path) -> Child:
-        """A child that is alive and free, or a new one; it is busy until a call of it has returned."""
-        with self._lock:
-            self.all = [child for child in self.all if child.process.poll() is None]
-            free = (child for child in self.all if not child.busy and (child.threads, child.run) == (threads, run))
-            if (child := next(free, None)) is None:
-                self.all.append(child := Child(threads, run))
-            child.busy = True
-            return child
 
-    def at_work(self, run: Path) -> bool:
-        """Whether a child of that run is busy."""
-        return any(child.busy and child.run == run and child.process.poll() is None for child in self.all)
+class Pools:
+    """The executor of this machine: children, each waited for by a thread.  cores: how many they may keep busy, default all.
+
+    `factorlib.runner.cluster.Cluster` has the same interface.
+    """
+
+    AHEAD = 1  # steps are handed out for so many times the cores
+
+    def __init__(self, cores: int | None = None):
+        self.cores = cores or machine_cores()
+        self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
+        self._busy: dict[Future, int] = {}
+
+    def free(self, cores: int) -> bool:
+        """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
+        self._busy = {future: count for future, count in self._busy.items() if not future.done()}
+        return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
+
+    def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
+        """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
+        with whole():
+            future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
+            self._busy[future] = cores
+            return future
+
+    def close(self, kill: bool = False) -> None:
+        """End all processes; `kill`: at once, whatever they do."""
+        if kill:
+            for child in self.children:
+                child.process.kill()
+        self._threads.shutdown()
+        for child in self.children:
+            child.end(kill)
+
+
+def machine_cores() -> int:
+    """The processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # ── in the child ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -106,20 +145,31 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent ends it
         signal.signal(number, signal.SIG_IGN)
     limit_threads(int(threads))
-    threading.Thread(target=_end_with, args=(int(parent), Path(run)), daemon=True).start()
+
+    def end_with_parent_and_run() -> None:
+        while os.getppid() == int(parent) and Path(run).is_dir():
+            time.sleep(WATCH)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent_and_run, daemon=True).start()
     connection = Connection(int(handle))
     with contextlib.suppress(EOFError, OSError):
         while True:
             function, arguments = connection.recv()
             try:
-                answer = True, function(*arguments)
+                answer = ForkingPickler.dumps((True, function(*arguments)))
             except BaseException as error:  # whatever it is, it is the caller's
-                answer = False, error
-            connection.send(answer)
+                answer = ForkingPickler.dumps((False, that_travels(error)))
+            connection.send_bytes(answer)
 
 
-def _end_with(parent: int, run: Path) -> None:
-    """Nobody waits for a child whose parent was killed, or whose run is over."""
-    while os.getppid() == parent and run.is_dir():
-        time.sleep(WATCH)
-    os._exit(1)
+def that_travels(error: BaseException) -> BaseException:
+    """An error that another process can raise: itself, or where it cannot be pickled and made again its type and text."""
+    try:
+        ForkingPickler.loads(ForkingPickler.dumps(error))
+        return error
+    except Exception:
+        told = RuntimeError(f"{type(error).__name__}: {error}")
+        for note in getattr(error, "__notes__", ()):
+            told.add_note(note)
+        return told

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import os
 import shlex
 import shutil
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,76 +38,71 @@ CODE = ("source:", "data:", "environment:", "program:")  # the fields of a recor
 DEEPEST = 16  # names that stand for names, structs in structs: one more is not followed
 
 
-class Names(msgspec.Struct, frozen=True):
-    """What the top level of a module defines and takes `from` others.
+class Source(msgspec.Struct, frozen=True):
+    """What one module's text says: a digest of its syntax tree, dotted names as it imports them, and the environment variables
+    and programs that it declares its numbers to depend on; of its top level what defaults of parameters may stand for.
 
     classes:  by name, the bases as they are written, and the fields with the text of their defaults
     imported: by name, the module and the name there
     assigned: by name, the text of what is assigned to it, of names that are bound once in the whole module
     """
 
-    classes: dict[str, tuple[list[str], dict[str, str]]]
-    imported: dict[str, tuple[str, str]]
-    assigned: dict[str, str]
-
-
-class Source(msgspec.Struct, frozen=True):
-    """What one module's text says: a digest of its syntax tree, dotted names as it imports them, what its top level defines,
-    and the environment variables and programs that it declares its numbers to depend on."""
-
-    digest: str
-    imports: list[str]
-    names: Names
-    environment: list[str]
-    programs: dict[str, str]
+    digest: str = ""
+    imports: list[str] = []
+    environment: list[str] = []
+    programs: dict[str, str] = {}
+    classes: dict[str, tuple[list[str], dict[str, str]]] = {}
+    imported: dict[str, tuple[str, str]] = {}
+    assigned: dict[str, str] = {}
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """modules: dotted name -> digest;  data: path in its package -> digest;  external: top-level names outside the project;
-    environment, programs: as the modules declare them;  files: where each module and each piece of data lies."""
+    """What a stage depends on besides its inputs.
 
-    modules: dict[str, str]
-    data: dict[str, str]
+    record:   the part of a step's record that is its code (`source:`, `data:`), and what of the environment the code declares
+    external: top-level names of imports from outside the project
+    files:    where what `record` names lies
+    """
+
+    record: dict[str, str]
     external: list[str]
-    environment: list[str]
-    programs: dict[str, str]
     files: dict[str, Path]
 
-    def record(self) -> dict[str, str]:
-        """The part of a step's record that is its code, and the environment variables that the code reads, as they are now."""
-        programs = {name: _program(name, default) for name, default in self.programs.items()}
-        return (
-            {f"source:{module}": digest for module, digest in self.modules.items()}
-            | {f"data:{file}": digest for file, digest in self.data.items()}
-            | {f"environment:{name}": os.environ[name] for name in self.environment if name in os.environ}
-            | {f"program:{name}": program for name, program in programs.items() if program}
-        )
-
-
-def _program(name: str, default: str) -> str | None:
-    """The words that name a program, without the folder it lies in; None where there is no such program."""
-    command = os.environ.get(name, default)
-    try:
-        words = shlex.split(command) or [""]
-    except ValueError as error:
-        cure = f"name a program, as in {name}={default}"
-        raise InputError(f"{command!r} is no command ({error})", key=name, cure=cure) from None
-    return " ".join([Path(words[0]).name, *words[1:]]) if shutil.which(words[0]) else None
-
-
-# ── one module ───────────────────────────────────────────────────────────────────────────────────────────────────────
+    @property
+    def modules(self) -> set[str]:
+        """Dotted names of the project's modules."""
+        return {name.removeprefix("source:") for name in self.files if name.startswith("source:")}
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
     """What a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
-    imports = sorted({name for node in ast.walk(tree) for name in _imported(node, module, is_package)})
-    names, environment = _names_of(tree), _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)')
-    programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}')
+    imports, classes, imported, assigned = set(), {}, {}, {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imports |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = module.split(".")[: None if is_package else -1] if node.level else []
+            base = ".".join([*above[: len(above) - node.level + 1], *([node.module] if node.module else [])])
+            imports |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and hasattr(item.target, "id")]
+            defaults = {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
+            classes[node.name] = [ast.unparse(base) for base in node.bases], defaults
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            imported |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+        elif isinstance(node, ast.Assign):
+            assigned |= {target.id: ast.unparse(value) for target, value in _pairs(node) if hasattr(target, "id")}
+    stored = (ast.Store, ast.Del)
+    bound = Counter(n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, stored))
+    environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
+    programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
         _drop_docstring(node)
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
-    return Source(digest, imports, names, environment or [], programs or {})
+    once = {name: text for name, text in assigned.items() if bound[name] == 1}
+    return Source(digest, sorted(imports), environment, programs, classes, imported, once)
 
 
 def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
@@ -122,18 +117,6 @@ def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
     return None
 
 
-def _imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    if isinstance(node, ast.ImportFrom):
-        base = node.module or ""
-        if node.level:
-            parts = module.split(".") if is_package else module.split(".")[:-1]
-            base = ".".join([*parts[: len(parts) - node.level + 1], *([base] if base else [])])
-        return [base, *(f"{base}.{alias.name}" for alias in node.names)]
-    return []
-
-
 def _drop_docstring(node: ast.AST) -> None:
     """The docstring of a module, class or function, and the strings that follow the fields of a class."""
     documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
@@ -145,22 +128,6 @@ def _drop_docstring(node: ast.AST) -> None:
         node.body = [item for item in node.body if item not in texts] or [ast.Pass()]
 
 
-def _names_of(tree: ast.Module) -> Names:
-    classes, imported, assigned = {}, {}, {}
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef):
-            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and hasattr(item.target, "id")]
-            defaults = {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
-            classes[node.name] = [ast.unparse(base) for base in node.bases], defaults
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            imported |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-        elif isinstance(node, ast.Assign):
-            assigned |= {target.id: ast.unparse(value) for target, value in _pairs(node) if hasattr(target, "id")}
-    stored = (ast.Store, ast.Del)
-    bound = Counter(n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, stored))
-    return Names(classes, imported, {name: text for name, text in assigned.items() if bound[name] == 1})
-
-
 def _pairs(node: ast.Assign) -> Iterator[tuple[ast.expr, ast.expr]]:
     """Targets and values that a default may be followed to; A, B = x, y are two assignments."""
     (target, *others), value = node.targets, node.value
@@ -170,9 +137,6 @@ def _pairs(node: ast.Assign) -> Iterator[tuple[ast.expr, ast.expr]]:
         made = isinstance(value, ast.Call) and not value.args and not value.keywords
         if made or isinstance(value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name):
             yield target, value
-
-
-# ── all modules ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Unknown(str):
@@ -209,15 +173,28 @@ class Sources:
                 places[part] = file
                 stack += self._source(part, file).imports
         sources = {name: self._source(name, file) for name, file in sorted(places.items()) if file.name.endswith(".py")}
-        data = self._data(places)
-        return Closure(
-            modules={name: source.digest for name, source in sources.items()},
-            data={name: self.hashes.content(path) for name, path in data.items()},
-            external=sorted(external - sys.stdlib_module_names - {""}),
-            environment=sorted({name for source in sources.values() for name in source.environment}),
-            programs={name: program for source in sources.values() for name, program in source.programs.items()},
-            files={f"source:{name}": places[name] for name in sources} | {f"data:{name}": data[name] for name in data},
-        )
+        packages = {n if places[n].name == "__init__.py" else n.rpartition(".")[0]: places[n].parent for n in sources}
+        packages.pop("", None)  # beside a module that is in no package lies anything
+        data = {}
+        for name, folder in packages.items():
+            if folder not in self._beside:
+                self._beside[folder] = list(_data_files(folder))
+            data |= {f"data:{name}:{path.relative_to(folder).as_posix()}": path for path in self._beside[folder]}
+        record = {f"source:{name}": source.digest for name, source in sources.items()}
+        record |= {name: self.hashes.content(path) for name, path in data.items()}
+        for source in sources.values():
+            record |= {f"environment:{name}": os.environ[name] for name in source.environment if name in os.environ}
+            for name, default in source.programs.items():
+                command = os.environ.get(name, default)
+                try:
+                    words = shlex.split(command) or [""]
+                except ValueError as error:
+                    cure = f"name a program, as in {name}={default}"
+                    raise InputError(f"{command!r} is no command ({error})", key=name, cure=cure) from None
+                if shutil.which(words[0]):  # without the folder it lies in
+                    record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
+        files = {f"source:{name}": places[name] for name in sources} | data
+        return Closure(record, sorted(external - sys.stdlib_module_names - {""}), files)
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
@@ -236,36 +213,18 @@ class Sources:
             raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
 
     def _source(self, name: str, file: Path) -> Source:
+        def parse() -> Source:
+            try:
+                return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
+            except SyntaxError as error:
+                where = f"{file}:{error.lineno}"
+                raise InputError(f"not Python: {error.msg}", file=where, cure="mend that line") from error
+            except InputError as error:
+                raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
+
         if file not in self._read:
-            of_folder, parse = Source("", [], Names({}, {}, {}), [], {}), partial(self._parse, name, file)
-            self._read[file] = of_folder if file.is_dir() else self.hashes.source(file, parse, Source)
+            self._read[file] = Source() if file.is_dir() else self.hashes.remembered("source", file, parse, Source)
         return self._read[file]
-
-    @staticmethod
-    def _parse(name: str, file: Path) -> Source:
-        try:
-            return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
-        except SyntaxError as error:
-            where = f"{file}:{error.lineno}"
-            raise InputError(f"not Python: {error.msg}", file=where, cure="mend that line") from error
-        except InputError as error:
-            raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
-
-    def _data(self, modules: dict[str, Path]) -> dict[str, Path]:
-        """Whatever is no Python beside the modules, or in folders beside them that are no packages."""
-        packages = {
-            name if file.name == "__init__.py" else name.rpartition(".")[0]: file.parent
-            for name, file in modules.items()
-            if not file.is_dir()
-        }
-        packages.pop("", None)  # beside a module that is in no package lies anything
-        for folder in packages.values():
-            if folder not in self._beside:
-                self._beside[folder] = list(_data_files(folder))
-        files = {f"{n}:{p.relative_to(f).as_posix()}": p for n, f in packages.items() for p in self._beside[f]}
-        return dict(sorted(files.items()))
-
-    # ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────
 
     def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, Any]:
         """A stage's parameters and their defaults as YAML would have them (a struct is a table), read without importing it.
@@ -275,40 +234,35 @@ class Sources:
         self._check_stage(package, stage, pipeline_file)
         return self._fields(f"{package}.{stage}", "Params", 0)
 
-    def _names(self, module: str) -> Names | None:
-        file = self.find(module)
-        return self._source(module, file).names if file else None
-
     def _fields(self, module: str, name: str, deep: int) -> dict[str, Any]:
         """Fields of a class with their defaults, those of its bases first; nothing of a class outside the project."""
-        names = self._names(module)
-        if names is None or deep > DEEPEST:
+        if deep > DEEPEST or not (file := self.find(module)):
             return {}
-        if name not in names.classes:
-            return self._fields(*names.imported[name], deep + 1) if name in names.imported else {}
-        bases, defaults = names.classes[name]
+        source = self._source(module, file)
+        if name not in source.classes:
+            return self._fields(*source.imported[name], deep + 1) if name in source.imported else {}
+        bases, defaults = source.classes[name]
         fields: dict[str, Any] = {}
         for base in reversed(bases):  # the first of two bases decides
             fields |= self._fields(module, base, deep + 1)
         return fields | {field: self._value(text, module, deep) for field, text in defaults.items()}
 
     def _value(self, text: str, module: str, deep: int) -> Any:
-        names, (of, _, attribute) = self._names(module), text.partition(".")
-        if names is None or deep > DEEPEST:
+        if deep > DEEPEST or not (file := self.find(module)):
             return Unknown(text)
+        source, (of, _, attribute) = self._source(module, file), text.partition(".")
         if text.endswith("()"):
             return self._fields(module, text.removesuffix("()"), deep + 1) or Unknown(text)
-        if text in names.assigned:
-            return self._value(names.assigned[text], module, deep + 1)
-        if text in names.imported:
-            source, name = names.imported[text]
-            return self._value(name, source, deep + 1)
-        if attribute and of in {*names.assigned, *names.imported}:
+        if text in source.assigned:
+            return self._value(source.assigned[text], module, deep + 1)
+        if text in source.imported:
+            return self._value(*reversed(source.imported[text]), deep + 1)
+        if attribute and (of in source.assigned or of in source.imported):
             struct = self._value(of, module, deep + 1)
             return struct.get(attribute, Unknown(text)) if isinstance(struct, dict) else Unknown(text)
         try:
-            return _listed(ast.literal_eval(text))
-        except (ValueError, SyntaxError):
+            return json.loads(json.dumps(ast.literal_eval(text)))  # a tuple is a list
+        except (ValueError, SyntaxError, TypeError):
             return Unknown(text)
 
 
@@ -327,12 +281,10 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _listed(value: Any) -> Any:
-    return [_listed(item) for item in value] if isinstance(value, tuple | list) else value
-
-
 def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """The parameters that are not what they would be without being set; of a table those of its fields.
+
+    A whole number will do for any number, but 1 is not true, nor -0.0 0.0; what is unknown equals no value.
 
     >>> other_than({"lobes": 72, "gain": 0.5, "limits": {"faces": 9}}, {"lobes": 72, "gain": 0.25, "limits": {"faces": 9}})
     {'gain': 0.25}
@@ -343,9 +295,11 @@ def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, An
     for name, value in values.items():
         default = defaults.get(name, Unknown())
         if isinstance(value, dict) and isinstance(default, dict):
-            value = other_than(default, value)
-            others |= {name: value} if value else {}
-        elif not _same(value, default):
+            inner = other_than(default, value)
+            others |= {name: inner} if inner else {}
+            continue
+        as_default = float(value) if type(default) is float and type(value) is int and abs(value) < 1 << 53 else value
+        if isinstance(default, Unknown) or json.dumps(as_default) != json.dumps(default):
             others[name] = value
     return others
 
@@ -359,15 +313,6 @@ def recorded(default: Any) -> Any:
     if isinstance(default, dict):
         return {name: recorded(value) for name, value in default.items()}
     return {"text": str(default)} if isinstance(default, Unknown) else default
-
-
-def _same(value: Any, default: Any) -> bool:
-    """Whether they are one value to a field with that default: a whole number will do for any number, 1 is not true, -0.0 not 0.0."""
-    if isinstance(value, list) and isinstance(default, list):
-        return len(value) == len(default) and all(map(_same, value, default))
-    if type(default) is float and type(value) is int:
-        value = float(value) if abs(value) < 1 << 53 else value
-    return type(value) is type(default) and repr(value) == repr(default)
 
 
 class Packages:

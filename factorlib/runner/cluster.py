@@ -3,6 +3,10 @@
 The cluster is that of a scheduler that is running, or one in this process that lives as long as the run.  A worker hands
 its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
 whose worker or child dies is tried again, on its own: nothing else is lost.
+
+A step's `Inputs.map` sends independent blocks of work in pieces, a few for each core, as tasks of the same cluster; their
+results come back in order.  What a block warns of is warned of in the step, and the first error in the blocks' order is the
+step's, as if it had computed them itself.
 """
 
 from __future__ import annotations
@@ -14,29 +18,77 @@ import os
 import sys
 import threading
 import time
+import traceback
+import uuid
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from importlib import import_module
+from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import msgspec
+
 from factorlib.errors import InputError
-from factorlib.runner.blocks import CORES, TRIES, Site, outcome_at, started_by
-from factorlib.runner.child import Children
-from factorlib.runner.executors import Pools, machine_cores
+from factorlib.runner.child import Child, Pools, machine_cores, taken, that_travels
 from factorlib.runner.pipeline import ADDRESS
+from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
+from factorlib.runner.worker import Heard, Meter, Outcome, Task, run_step
 
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
+PIECES = 4  # for each core: small enough that no core waits long for the last one
+TRIES = 3  # of a task whose process dies
+CORES = "cores"  # the resource that workers declare
+FIRST = 10  # priority of blocks: a step waits for them
+PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
 QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
 }
+
+
+class Site(msgspec.Struct, frozen=True):
+    """What a worker must share with a run: its folder in the store, the files of the library, the version of Python."""
+
+    run: Path
+    library: Path = LIBRARY
+    python: str = PYTHON
+
+    def fault(self, record: Record | None = None) -> InputError | None:
+        """What hinders this process from working for the run; a step's record asks for the versions that it names, too."""
+        here = f"the worker on {os.uname().nodename}"
+        if not self.run.is_dir():
+            cure = "keep build/ and the data on a file system that all machines mount at the same path"
+            return InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
+        start = started_by("<scheduler>", self.library)
+        if self.library != LIBRARY:
+            return InputError(f"{here} runs the code in {LIBRARY}", file=self.library, cure=start)
+        if self.python != PYTHON:
+            return InputError(f"{here} has Python {PYTHON}, the run has {self.python}", cure=start)
+        for package, wanted in (record or {}).items():
+            if package.startswith("package:"):
+                package = package.removeprefix("package:")
+                installed = next((each.version for each in distributions(name=package)), "none")
+                if installed != wanted:
+                    words = f"{here} has {package} {installed}, the run has {wanted}"
+                    return InputError(words, cure="make setup, in the same checkout")
+        return None
+
+
+def started_by(scheduler: str, library: Path = LIBRARY) -> str:
+    """The command line that starts a worker as it must be."""
+    return f"start the worker by: cd {library} && .venv/bin/python -m factorlib worker {scheduler}"
+
+
+# ── the run ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Cluster(Pools):
@@ -50,10 +102,8 @@ class Cluster(Pools):
 
     def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
         _require_dask("executor")
-        self.site = Site(run)
+        self.site, self._busy, self._over = Site(run), {}, threading.Event()
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
-        self._busy: dict[Future, int] = {}
-        self._over = threading.Event()
         with whole():
             self.client = _client(scheduler) if scheduler else _client_of_this_machine()
         try:
@@ -71,7 +121,7 @@ class Cluster(Pools):
         return max(1, sum(self._declared().values()))
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
-        """Hand out a step or a check of parameters, by its argument; its future.
+        """Hand out a step, by its task; its future.
 
         A step that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
         """
@@ -79,7 +129,7 @@ class Cluster(Pools):
         resources = {} if spreads else {CORES: min(threads, most)}
         with whole():
             task = hosted, self.site, threads, spreads, outcome_at, argument
-            future = _in_our_words(self._executor.submit(*task, resources=resources))
+            future = self._executor.submit(*task, resources=resources)
             self._busy[future] = cores
             return future
 
@@ -129,9 +179,8 @@ class Cluster(Pools):
 
 def _require_dask(key: str) -> None:
     if find_spec("distributed") is None:
-        raise InputError(
-            "Dask is not installed", key=key, cure="make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-        )
+        cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        raise InputError("Dask is not installed", key=key, cure=cure)
 
 
 def _client_of_this_machine() -> Any:
@@ -150,30 +199,28 @@ def _client_of_this_machine() -> Any:
 def _client(scheduler: str) -> Any:
     """A client of the scheduler at an address.  InputError where none answers there."""
     from distributed import Client
+    from distributed.core import rpc
+    from distributed.security import Security
+
+    async def answered() -> None:
+        """Ask what listens there who it is; TimeoutError where it says nothing, for which a client would wait without end."""
+        remote = rpc(scheduler, timeout=PATIENCE, connection_args=Security().get_connection_args("client"))
+        try:
+            await asyncio.wait_for(remote.identity(), PATIENCE)
+        finally:
+            await remote.close_rpc()
 
     _check_protocol(scheduler, "client", "scheduler")
     for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
     try:
         with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
-            beside.submit(asyncio.run, _answered(scheduler)).result()
+            beside.submit(asyncio.run, answered()).result()
         return Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # what answers there may be anything: an HTTP server, garbage
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
         words = str(error) or f"nothing in {PATIENCE} s"
         raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="scheduler", cure=cure) from error
-
-
-async def _answered(scheduler: str) -> None:
-    """Ask what listens there who it is; TimeoutError where it says nothing, for which a client would wait without end."""
-    from distributed.core import rpc
-    from distributed.security import Security
-
-    remote = rpc(scheduler, timeout=PATIENCE, connection_args=Security().get_connection_args("client"))
-    try:
-        await asyncio.wait_for(remote.identity(), PATIENCE)
-    finally:
-        await remote.close_rpc()
 
 
 def _check_protocol(address: str, role: str, key: str) -> None:
@@ -193,24 +240,9 @@ def _check_protocol(address: str, role: str, key: str) -> None:
         raise InputError(f"{protocol}:// asks for certificates, and there are none", key=key, cure=cure)
 
 
-def _in_our_words(asked: Future) -> Future:
-    """A future with what Dask says of dead workers in the words of `concurrent.futures`."""
-    answer: Future = Future()
-
-    def take_over(asked: Future) -> None:
-        """The outcome, once it is there."""
-        try:
-            answer.set_result(asked.result())
-        except BaseException as error:
-            answer.set_exception(BrokenProcessPool(str(error)) if type(error).__name__ == "KilledWorker" else error)
-
-    asked.add_done_callback(take_over)
-    return answer
-
-
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
-_children = Children()
+_children: list[Child] = []
 
 
 def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: Any) -> Any:
@@ -231,13 +263,13 @@ def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: 
 
     if waits:
         secede()
-    child = _children.take(threads, site.run)
+    child = taken(_children, threads, site.run)
     return child.call(function, worker.scheduler.address, site, argument, wanted=wanted)
 
 
 def at_work(run: Path) -> bool:
     """Whether a task of that run has a child here."""
-    return _children.at_work(run)
+    return any(child.busy and child.run == run and child.process.poll() is None for child in _children)
 
 
 def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
@@ -255,3 +287,92 @@ def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
     os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})
+
+
+# ── in the child of a step, and in that of a block ───────────────────────────────────────────────────────────────────
+
+
+def outcome_at(scheduler: str, site: Site, task: Task) -> Outcome:
+    """Run a step here; its independent work goes to the cluster.
+
+    Each try of a step has a temporary folder of its own: another may still be ending elsewhere.
+    """
+    if fault := site.fault(task.record):
+        return Outcome(error=str(fault))
+    temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
+    task = msgspec.structs.replace(task, temporary=temporary)
+    if task.code.cores == 1:
+        return run_step(task)
+    with contextlib.closing(Blocks(scheduler, site, task)) as blocks:
+        return run_step(task, blocks)
+
+
+class Blocks:
+    """An ordered map over the cluster at `scheduler`.  spent: what the blocks took elsewhere, for the step's log."""
+
+    def __init__(self, scheduler: str, site: Site, task: Task):
+        self.scheduler, self.site, self.code, self._client = scheduler, site, task.code, None
+        self.shelf = parcel().Shelf(task.temporary.with_name(f"{task.temporary.name}.shelf"))
+        sizes = dict.fromkeys(("maps", "tasks", "bytes_sent", "bytes_shelved", "bytes_back"), 0)
+        self.spent: dict[str, Any] = {**sizes, "cpu_seconds": 0.0, "memory_mb": 0.0}
+
+    def __call__(self, function: Callable, items: Iterable) -> list:
+        """The function of every item, in order.  Raises what the first of them raised."""
+        from distributed import Client
+
+        items = list(items)
+        if len(items) <= 1:
+            return list(map(function, items))
+        count = min(PIECES * self.code.cores, len(items))
+        cuts = [len(items) * k // count for k in range(count + 1)]
+        packed = self.shelf.pack([(function, items[start:end]) for start, end in zip(cuts, cuts[1:])])
+        self._client = self._client or Client(self.scheduler, set_as_default=False)
+        here = partial(hosted, self.site, self.code.threads, False, block_at)
+        options = {"priority": FIRST, "retries": TRIES - 1, "resources": {CORES: self.code.threads}, "pure": False}
+        answers = self._client.gather(self._client.map(here, [(self.code.root, data) for data in packed], **options))
+        for name, much in {"maps": 1, "tasks": count, "bytes_sent": sum(map(len, packed))}.items():
+            self.spent[name] += much
+        self.spent["bytes_shelved"] = self.shelf.written
+        return [value for back in answers for value in self._taken(back)]
+
+    def _taken(self, back: bytes) -> list:
+        values, texts, error, cost = parcel().unpack(back)
+        self.spent["bytes_back"] += len(back)
+        self.spent["cpu_seconds"] += cost["cpu_seconds"]
+        self.spent["memory_mb"] = max(self.spent["memory_mb"], cost["memory_mb"])
+        for text in texts:
+            logging.getLogger("factorlib").warning("%s", text)
+        if error is not None:
+            raise error
+        return values
+
+    def close(self) -> None:
+        """Leave the cluster; tasks that are still there are cancelled."""
+        if self._client is not None:
+            self._client.close()
+
+
+def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
+    """What the function gave of each item of a piece, what was warned of, the first error and the cost, packed.
+
+    work: the project's root, and the packed function and items
+    """
+    if fault := site.fault():
+        raise fault
+    if str(work[0]) not in sys.path:
+        sys.path.insert(0, str(work[0]))
+    meter, values, error = Meter(), [], None
+    with Heard() as heard:
+        function, items = parcel().unpack(work[1])
+        try:
+            for item in items:
+                values.append(function(item))
+        except Exception as caught:
+            caught.add_note(traceback.format_exc())
+            error = that_travels(caught)
+    return parcel().pack((values, heard.warnings, error, meter.read()))
+
+
+def parcel() -> ModuleType:
+    """`factorlib.parcel`, by its name as stages are: it imports science."""
+    return import_module("factorlib.parcel")

@@ -9,14 +9,13 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TextIO
 
 from factorlib.runner.plan import Planned, Step
 
 BEAT = 10.0  # seconds between two plain lines about the same step
-PATIENCE = 2.0  # seconds of work outside the pipeline that pass without a sign of life
 
 
 def printable(text: str) -> str:
@@ -67,8 +66,7 @@ class Display:
     def __init__(self) -> None:
         self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
         self.running: dict[Step, Live] = {}
-        self._begun: set[str] = set()
-        self._told: set[str | Step] = set()  # warnings, and steps that wait
+        self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait
 
     def plan(self, planned: list[Planned]) -> None:
         """Take over the state of the plan as it is now."""
@@ -85,23 +83,23 @@ class Display:
         """Print how far a stage is."""
         self.say(f"{stage:<10} {text}".rstrip())
 
-    def _once(self, what: str | Step, text: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
-            self.say(text)
+    def _first(self, what: str | Step) -> bool:
+        first = what not in self._told
+        self._told[what] = None
+        return first
 
     def start(self, step: Step) -> None:
         """A step begins; printed for the first step of a stage only."""
         self.running[step] = Live(time.monotonic(), time.monotonic())
-        if step.stage not in self._begun:
-            self._begun.add(step.stage)
-            _, left = self.stages.setdefault(step.stage, [1, 1])
+        _, left = self.stages.setdefault(step.stage, [1, 1])
+        if self._first(step.stage):
             kind = "photo" if step.photo else "recipe"
             self.line(step.stage, "…" if step.of is None else f"{left} {kind}{'s' * (left > 1)} …")
 
     def waits(self, step: Step) -> None:
         """A step waits for another run to make its result; printed once."""
-        self._once(step, f"{step}: waiting: another run is making it")
+        if self._first(step):
+            self.say(f"{step}: waiting: another run is making it")
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
         """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does; `tick` shows it."""
@@ -119,7 +117,8 @@ class Display:
 
     def warn(self, step: Step, text: str) -> None:
         """Print a warning; one that was printed before is left out."""
-        self._once(text, f"warning: {step}: {text}")
+        if self._first(f"warning: {text}"):
+            self.say(f"warning: {step}: {text}")
 
     def finish(self, step: Step, seconds: float) -> None:
         """A step is done, after `seconds`."""
@@ -164,7 +163,7 @@ class Bars(Display):
 
     def tick(self) -> None:
         """Draw every bar anew."""
-        for stage in self._begun:
+        for stage in (stage for stage in self._told if stage in self.stages):
             if stage not in self._rows:
                 self._rows[stage] = self.bars.add_task(stage, total=1.0, count="", words="")
             total, left = self.stages[stage]
@@ -184,26 +183,3 @@ class Bars(Display):
 def display_for() -> Display:
     """What fits standard error; bars, and what draws them, are loaded for a terminal only."""
     return Bars() if sys.stderr.isatty() else Display()
-
-
-@contextlib.contextmanager
-def shown_if_long(what: str) -> Iterator[Callable[[float, float], None]]:
-    """A report (done, total) for work outside the pipeline: shown as a step called `what` once PATIENCE is over."""
-    started, step, displays = time.monotonic(), Step(what), []
-
-    def report(done: float, total: float) -> None:
-        """Note how much is done; nothing is printed for short work."""
-        if not displays and time.monotonic() - started >= PATIENCE:
-            displays.append(display_for())
-            displays[0].start(step)
-        for display in displays:
-            display.progress(step, done, total, "")
-            display.tick()
-
-    try:
-        yield report
-        for display in displays:
-            display.finish(step, time.monotonic() - started)
-    finally:
-        for display in displays:
-            display.close()

@@ -15,16 +15,9 @@ import msgspec
 from factorlib.wholefile import replace_file
 
 T = TypeVar("T")
-Signature = tuple[int, int, int, int]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-FORMAT = 5  # of the cache; one of another format is made anew
+FORMAT = 6  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
-
-
-def signature(path: Path) -> Signature:
-    """What changes when the content does: size, times of content and of inode, inode."""
-    stat = os.stat(path)
-    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
 
 
 def hash_of_file(path: Path) -> str:
@@ -62,41 +55,34 @@ def write_cache(path: Path, tables: Any) -> None:
         replace_file(path, msgspec.json.encode(tables))
 
 
-class _Tables(msgspec.Struct):
-    format: int
-    contents: dict[str, Any]
-    sources: dict[str, Any]
-
-
 class FileHashes:
-    """A cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
+    """What was made of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
 
     def __init__(self, cache: Path | None):
         self.cache, self._changed = cache, False
-        tables = read_cache(cache, _Tables)
-        self._tables = tables if tables and tables.format == FORMAT else _Tables(FORMAT, {}, {})
+        format_, tables = read_cache(cache, tuple[int, dict[str, dict[str, Any]]]) or (0, {})
+        self._tables = tables if format_ == FORMAT else {}
 
     def content(self, path: Path) -> str:
         """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
-        return self._remembered(self._tables.contents, path, lambda: hash_of_file(path), Hash)
+        return self.remembered("content", path, lambda: hash_of_file(path), Hash)
 
-    def source(self, path: Path, parse: Callable[[], T], type_: type[T]) -> T:
-        """What `parse` makes of a file of source, remembered; type_: what that is."""
-        return self._remembered(self._tables.sources, path, parse, type_)
-
-    def _remembered(self, table: dict, path: Path, make: Callable, type_: type) -> Any:
-        now = signature(path)
+    def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
+        """What `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
+        stat, table = os.stat(path), self._tables.setdefault(kind, {})
+        now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
         with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
-            then, value = msgspec.convert(table[str(path)], tuple[Signature, Any])
+            then, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
             if then == now:
                 return msgspec.convert(value, type_)
-        value = make()
-        if signature(path) == now and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
+        value, stat = make(), os.stat(path)
+        unchanged = now == (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+        if unchanged and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
             table[str(path)], self._changed = (now, value), True
         return value
 
     def save(self) -> None:
         """Write the cache, where there is anything new to write."""
         if self._changed and self.cache is not None:
-            write_cache(self.cache, self._tables)
+            write_cache(self.cache, (FORMAT, self._tables))
             self._changed = False

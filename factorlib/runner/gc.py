@@ -7,22 +7,19 @@ that was killed, so a folder whose lock can be taken is rubbish, and no command 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import msgspec
 from filelock import FileLock, Timeout
 
 from factorlib.errors import InputError
-from factorlib.runner.home import Home, gathered, made_homes
-from factorlib.runner.pipeline import Pipeline
+from factorlib.runner.home import Home, made_homes
 from factorlib.runner.plan import Step, key_of
 from factorlib.runner.project import Project
-from factorlib.runner.store import Entry, Inspector, Store, damage_of, is_alive, stamps_of, sweep_drafts
+from factorlib.runner.store import Inspector, Store, is_alive, sweep_drafts
 
 Gone = tuple[list[Path], list[Path]]  # what was deleted, and what is left beside it, for the runner did not make it
 Damage = tuple[Path, list[str], list[str]]  # where; a line for each fault; whose result, as `masks/kitchen (eames)`
@@ -57,7 +54,7 @@ def alone(store: Store) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
-    """Only one command at a time is within; what dead runs left is gone."""
+    """Only one command at a time is within; what dead runs left in tmp, and their drafts of keys, logs and caches, is gone."""
     store.tmp.mkdir(parents=True, exist_ok=True)
     door = FileLock(store.root / "door.lock")
     try:
@@ -66,56 +63,38 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         say("waiting: the store is being cleaned by another command")
         door.acquire()
     try:
-        _sweep(store)
+        for lock_file in store.tmp.glob("run-*.lock"):
+            with contextlib.suppress(Timeout), FileLock(lock_file).acquire(timeout=0):
+                shutil.rmtree(lock_file.with_suffix(""), ignore_errors=True)
+                lock_file.unlink(missing_ok=True)
+        for folder in (store.keys, store.logs, store.cache):
+            sweep_drafts(folder)
+        alive = {path.stem for path in store.tmp.glob("run-*.lock")}
+        for path in store.tmp.iterdir():
+            kind, pid, *_ = f"{path.name}--".split("-")
+            in_use = kind == "view" and pid.isdigit() and is_alive(int(pid))  # view-<process>-…
+            if path.is_dir() and path.name not in alive and not in_use:
+                shutil.rmtree(path, ignore_errors=True)
         yield
     finally:
         door.release()
 
 
-def _sweep(store: Store) -> None:
-    """Delete what dead runs left in tmp, and their drafts of keys, logs and caches."""
-    for lock_file in store.tmp.glob("run-*.lock"):
-        with contextlib.suppress(Timeout), FileLock(lock_file).acquire(timeout=0):
-            shutil.rmtree(lock_file.with_suffix(""), ignore_errors=True)
-            lock_file.unlink(missing_ok=True)
-    for folder in (store.keys, store.logs, store.cache):
-        sweep_drafts(folder)
-    alive = {path.stem for path in store.tmp.glob("run-*.lock")}
-    for path in store.tmp.iterdir():
-        kind, pid, *_ = f"{path.name}--".split("-")
-        in_use = kind == "view" and pid.isdigit() and is_alive(int(pid))  # view-<process>-…
-        if path.is_dir() and path.name not in alive and not in_use:
-            shutil.rmtree(path, ignore_errors=True)
+def unneeded(project: Project) -> dict[str, list[tuple[float, int]]]:
+    """What `collect` would delete now, by stage, the largest first; what has no stage any more is `left over`.
 
-
-# ── what nothing needs ───────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Unneeded(msgspec.Struct, frozen=True):
-    """Results of one stage that no dataset's last run needs: how many, the bytes of files that nothing else needs, and when
-    the oldest and the newest were kept, in seconds since 1970."""
-
-    stage: str
-    results: int
-    bytes: int
-    oldest: float
-    newest: float
-
-
-def unneeded(project: Project) -> list[Unneeded]:
-    """What `collect` would delete now, by stage, the largest first; what has no stage any more is `left over`."""
+    Of each result when it was kept, in seconds since 1970, and the bytes of files that nothing else needs.
+    """
     store = Store(project.build / "store")
     keys, trees, _ = _dead(project, store)
-    sizes = {path.name: _size(path) for path in trees}
-    groups: dict[str, list[tuple[float, int]]] = {}
+    sizes, groups = {path.name: _size(path) for path in trees}, {}
     for path in keys:
         entry = store.entry(path.stem)
         stage = entry.record.get("stage", LEFT_OVER) if entry else LEFT_OVER
         groups.setdefault(stage, []).append((path.stat().st_mtime, sizes.pop(entry.output, 0) if entry else 0))
     for path in (path for path in trees if path.name in sizes):
         groups.setdefault(LEFT_OVER, []).append((path.stat().st_mtime, sizes[path.name]))
-    table = [Unneeded(s, len(r), sum(b for _, b in r), min(r)[0], max(r)[0]) for s, r in groups.items()]
-    return sorted(table, key=lambda group: (-group.bytes, group.stage))
+    return dict(sorted(groups.items(), key=lambda group: (-sum(size for _, size in group[1]), group[0])))
 
 
 def collect(project: Project) -> tuple[int, int]:
@@ -143,10 +122,8 @@ def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[
     homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
     keys = _needed(store, {key for home in homes for key in home.keys().values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
-    views = {Path(link.readlink()).name for home in homes for link in home.folder.glob("*") if link.is_symlink()}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    rest = [p for p in store.views.glob("*") if p.name not in views]  # they only link to trees
-    rest += [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
+    rest = [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
     rest += [*store.locks.glob("*"), *store.unfinished.glob("*")]
     return unused, [p for p in store.trees.glob("*") if p.name not in trees] + list(store.damaged.glob("*")), rest
 
@@ -178,61 +155,35 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-# ── what is damaged ──────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def verify(store: Store, homes: list[Home], pipeline: Pipeline, everything: bool) -> tuple[int, list[Damage]]:
+def verify(store: Store, homes: list[Home], everything: bool) -> tuple[int, list[Damage]]:
     """Read the results that `homes` name, or everything in the store; how many there are, and what is damaged.
 
     What is damaged is no longer taken for right by its size and time: the next run makes it again.
     """
-    inspector, users = Inspector(store.root), {}
+    inspector, users, damaged, trees = Inspector(store), {}, [], {}
     for home in homes:
         for step, key in home.keys().items():
             users.setdefault(key, []).append(f"{step} ({home.folder.name})")
     keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if everything else set()))
-    damaged, trees, entries = [], {}, {}
     for key in keys:
-        if (entry := store.entry(key)) is None:
+        if (entry := inspector.entry(key)) is None:
             damaged.append((store.keys / f"{key}.json", ["missing or not readable"], users.get(key, [])))
             continue
-        entries[key], names = entry, users.get(key) or [f"{_step(entry.record)} (of an earlier run)"]
+        names = users.get(key) or [f"{_step(entry.record)} (of an earlier run)"]
         trees.setdefault(entry.output, (entry.files, []))[1].extend(names)
         if key_of(entry.record) != key:
             damaged.append((store.keys / f"{key}.json", ["its record is not the one that made the key"], names))
     for output, (files, names) in trees.items():  # every tree once, whichever keys gave it
         damaged.append((store.tree(output), inspector.thorough(output, files), names))
-    for home in homes:
-        for stage in pipeline.stages:
-            link = home.folder / stage
-            if link.is_dir() and link.resolve().parent == store.views.resolve():
-                steps = {step: key for step, key in home.keys().items() if step.startswith(f"{stage}/")}
-                photos = {step.partition("/")[2]: entries[key] for step, key in steps.items() if key in entries}
-                faults = _of_view(store, link.resolve(), photos, pipeline.stages[stage].gather)
-                damaged.append((link, faults, [f"{stage} ({home.folder.name})"]))
     inspector.save()
     return len(keys), [damage for damage in damaged if damage[1]]
 
 
-def _of_view(store: Store, view: Path, photos: dict[str, Entry], gather: str | None) -> list[str]:
-    """A photo of which there is any file must be there in whole; one that failed in the last run is not."""
-    names = stamps_of(view).keys()
-    there = {photo: entry for photo, entry in photos.items() if names & entry.files.keys()}
-    files = {name: hash_ for entry in there.values() for name, hash_ in entry.files.items()}
-    if gather:
-        with contextlib.suppress(OSError, InputError):  # of a tree that is damaged
-            table = gathered(store, {photo: entry.output for photo, entry in there.items()})
-            files[gather] = hashlib.sha256(table.encode()).hexdigest()[:32]
-    return damage_of(view, files, {})
-
-
-# ── forgetting ───────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def forget(project: Project, home: Home) -> Gone:
-    """Delete a dataset's links and marks; what they led to in the store goes with the next gc."""
+def forget(project: Project, homes: list[Home]) -> Gone:
+    """Delete links and marks of datasets; what they led to in the store goes with the next gc."""
     with alone(Store(project.build / "store")):
-        return _forget(home)
+        parts = list(map(_forget, homes))
+    return [path for deleted, _ in parts for path in deleted], [path for _, left in parts for path in left]
 
 
 def forget_all(project: Project) -> Gone:
@@ -240,13 +191,12 @@ def forget_all(project: Project) -> Gone:
     if not project.build.is_dir():
         return [], []
     store = Store(project.build / "store")
-    with alone(store):
-        parts = [_forget(home) for home in made_homes(project)]
-        deleted, left = ([path for part in parts for path in part[which]] for which in (0, 1))
-        if not store.root.is_symlink():
+    deleted, left = forget(project, made_homes(project))
+    if not store.root.is_symlink():
+        with alone(store):
             shutil.rmtree(store.root)
-            deleted.append(store.root)
-        left += [path for path in sorted(project.build.iterdir()) if not any(path in below.parents for below in left)]
+        deleted.append(store.root)
+    left += [path for path in sorted(project.build.iterdir()) if not any(path in below.parents for below in left)]
     return deleted, left
 
 

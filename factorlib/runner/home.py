@@ -1,21 +1,19 @@
 """The folders that a user sees: build/<dataset>, with links to the current results, marks, and the log of all runs.
 
-    <stage>       link to the current result of a stage, in build/store: its tree, or for a stage over photos a view
-    current.json  which key each step has
+    <stage>       link to the current result of a stage, in build/store; for a stage over photos, to a view
+    current.json  which key each step and each view has
     log.jsonl     what all runs did
     errors/       where a step failed by a defect, its traceback
     recipes/      links to the current pictures of each recipe
     dataset.txt   whose results these are: only a folder with this mark is a home that the runner made
 
-A view has the results of all photos of a stage in one folder, by hard links.  It is right if its files have the stamps of
-the trees' own; one that is not, because somebody put another file in, or a tree was replaced, is made anew.
+A view is one more result: those of all photos of a stage in one folder, by hard links.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import logging
 import os
 import shlex
@@ -27,9 +25,10 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
-from factorlib.runner.plan import Planned, Step
-from factorlib.runner.project import RESERVED, Project, check_name, is_path
-from factorlib.runner.store import Inspector, Store, stamps_of, sweep_drafts
+from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.plan import Planned, Step, key_of
+from factorlib.runner.project import RESERVED, Project, check_name
+from factorlib.runner.store import Entry, Inspector, damage_of, output_of, stamps_of, sweep_drafts
 from factorlib.wholefile import replace_file, write_text
 
 if TYPE_CHECKING:
@@ -50,8 +49,11 @@ class Home(msgspec.Struct, frozen=True):
     mark = property(lambda self: self.folder / "dataset.txt")
     errors = property(lambda self: self.folder / "errors")
 
-    def keys(self) -> dict[str, str]:
-        """Step -> key of its current result, nothing where there is none; InputError where the file is damaged."""
+    def keys(self, lenient: bool = False) -> dict[str, str]:
+        """Step -> key of its current result, nothing where there is none; InputError where the file is damaged.
+
+        lenient: then a warning, and nothing
+        """
         try:
             return msgspec.json.decode(self.keys_file.read_bytes(), type=dict[str, Key])
         except FileNotFoundError:
@@ -59,19 +61,11 @@ class Home(msgspec.Struct, frozen=True):
         except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             words = f"does not say which results are current ({getattr(error, 'strerror', None) or error})"
             cure = "delete it: the next run writes it anew and finds the results that are in the store"
-            raise InputError(words, file=self.keys_file, cure=cure) from error
-
-    def last_keys(self, warn: bool = False) -> dict[str, str]:
-        """The same, nothing where the file is damaged."""
-        try:
-            return self.keys()
-        except InputError as error:
-            if warn:
-                log.warning("%s; nothing is lost, but it is not known what changed since the last run", error)
+            fault = InputError(words, file=self.keys_file, cure=cure)
+            if not lenient:
+                raise fault from error
+            log.warning("%s; nothing is lost, but it is not known what changed since the last run", fault)
             return {}
-
-
-# ── which home is whose ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def home_of(project: Project, dataset: Path) -> Home:
@@ -108,22 +102,20 @@ def made_home(project: Project, dataset: str) -> Home | None:
         known = [other.folder.name for other in made_homes(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
-    owner = owner_of(project, home)
-    lives = owner is not None and os.path.isdir(owner)
-    theirs = owner is not None and not (there and lives and owner.samefile(there)) and owner != folder
-    if theirs and (is_path(dataset) or (there and lives)):
-        word = shlex.quote(str(owner if lives else home.folder.name))
-        raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={word}")
+    if (owner := owner_of(project, home)) not in (None, folder):
+        lives = os.path.isdir(owner)
+        of_another = not (there and lives and owner.samefile(there))
+        if of_another and ("/" in dataset or (there and lives)):
+            word = shlex.quote(str(owner if lives else home.folder.name))
+            raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={word}")
     return home
 
 
 def made_homes(project: Project) -> list[Home]:
     """Every home that the runner made; links are not followed."""
-    if not project.build.is_dir():
-        return []
-    entries = sorted(entry.path for entry in os.scandir(project.build) if entry.is_dir(follow_symlinks=False))
-    homes = [Home(Path(path)) for path in entries]
-    return [home for home in homes if home.folder.name not in RESERVED and home.mark.is_file()]
+    entries = sorted(project.build.iterdir()) if project.build.is_dir() else []
+    homes = [Home(path) for path in entries if path.is_dir() and not path.is_symlink() and path.name not in RESERVED]
+    return [home for home in homes if home.mark.is_file()]
 
 
 def _other_owner(home: Home, owner: Path, dataset: Path, cure: str) -> InputError:
@@ -147,50 +139,42 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
         replace_file(home.mark, f"{words}\n".encode("utf-8", "surrogateescape"))
 
 
-# ── after a run, or where there was nothing to run ───────────────────────────────────────────────────────────────────
-
-
-def remember(survey: Survey, made: dict[str, str] | None = None, planned: list[Planned] | None = None) -> None:
-    """Write down which key each step has now; steps of photos and stages that are no more are dropped.
-
-    made: keys of steps that were just made, in the midst of a run;  planned: a plan that nothing has changed since
-    """
-    planned = [] if made is not None else survey.planned(frozenset()) if planned is None else planned
-    stages, before = survey.spec.pipeline.stages, survey.home.last_keys()
-    steps = [step for stage in stages for step in survey.spec.steps_of(stage)]
-    names, others = {*map(str, steps)}, tuple(f"{n}/" for n, stage in stages.items() if stage.over == "recipe")
-    keys = {name: key for name, key in before.items() if name in names or name.startswith(others)}  # asked for before
-    keys |= (made or {}) | {str(p.step): p.key for p in planned if p.status == "current"}
+def remember(survey: Survey, made: dict[str, str]) -> None:
+    """Write down the keys that steps have now; steps of photos and stages that are no more are dropped."""
+    stages, before = survey.spec.pipeline.stages, survey.home.keys(lenient=True)
+    names = {*stages, *(str(step) for stage in stages for step in survey.spec.steps_of(stage))}
+    asked_for_before = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
+    keys = {name: key for name, key in before.items() if name in names or name.startswith(asked_for_before)} | made
     if keys != before:
         claim(survey.project, survey.home, survey.data.folder)
         replace_file(survey.home.keys_file, json_text(keys).encode())
-    if made is None:
-        current = [p for p in planned if p.status == "current"]
-        _show(survey, current)
-        failed = {label(step) for step in steps} - {label(p.step) for p in current}
-        for path in (path for path in survey.home.errors.glob("*.txt") if path.stem not in failed):
-            path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
-        with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
-            survey.home.errors.rmdir()
-        sweep_drafts(survey.home.folder)
-        survey.outputs.inspector.save()
 
 
-def _show(survey: Survey, current: list[Planned]) -> None:
-    """Point the links at the current results; of a stage over photos, at one folder with all of them; one for each recipe."""
-    home, stages = survey.home.folder, survey.spec.pipeline.stages
-    of_stages: dict[str, dict[str | None, str]] = {}
+def show(survey: Survey, planned: list[Planned]) -> None:
+    """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
+    current, home, stages = [p for p in planned if p.status == "current"], survey.home, survey.spec.pipeline.stages
+    keys, of_photos = {str(p.step): p.key for p in current}, {}
     for p in current:
-        if p.step.recipe:
-            point(home / p.step.stage / p.step.recipe, survey.store.tree(p.output))
+        if p.step.photo:
+            of_photos.setdefault(p.step.stage, {})[p.step.photo] = p.key
         else:
-            of_stages.setdefault(p.step.stage, {})[p.step.photo] = p.output
-    for name, outputs in of_stages.items():
-        view = stages[name].over and view_of(survey.store, survey.outputs.inspector, outputs, stages[name].gather)
-        point(home / name, view or survey.store.tree(outputs[None]))
-    for link in home.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
+            point(home.folder / str(p.step), survey.store.tree(p.output))
+    for name, of in of_photos.items():
+        keys[name] = view_of(survey.outputs, name, of, stages[name].gather)
+        point(home.folder / name, survey.store.tree(survey.outputs.get(keys[name])))
+    remember(survey, keys)
+    for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in stages:
             link.unlink(missing_ok=True)
+    failed = {label(step) for stage in stages for step in survey.spec.steps_of(stage)} - {
+        label(p.step) for p in current
+    }
+    for path in (path for path in home.errors.glob("*.txt") if path.stem not in failed):
+        path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
+    with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
+        home.errors.rmdir()
+    sweep_drafts(home.folder)
+    survey.outputs.save()
 
 
 def label(step: Step) -> str:
@@ -217,63 +201,44 @@ def point(link: Path, target: Path) -> None:
     os.replace(draft, link)
 
 
-# ── views ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | None) -> str:
+    """The key of one folder with the files of all photos of a stage ({photo: key}), and each `<photo>.json` in `gather`.
 
-
-def view_of(store: Store, inspector: Inspector, outputs: dict[str, str], gather: str | None) -> Path:
-    """One folder with the files of all photos ({photo: output}), and `<photo>.json` of each gathered into `gather`."""
-    target = store.views / hashlib.sha256(json.dumps([outputs, gather], sort_keys=True).encode()).hexdigest()[:32]
-    wanted = {}
-    for output in outputs.values():
-        wanted |= inspector.known.get(output) or stamps_of(store.tree(output))
-
-    def is_right() -> bool:
-        """Whether the folder has the trees' own files, and the table that is gathered from them."""
-        now = stamps_of(target)
-        table = {gather: now.pop(gather)} if gather and gather in now else {}
-        if now != wanted or bool(table) != bool(gather):
-            return False
-        if gather and table != inspector.known.get(target.name):
-            if (target / gather).read_bytes() != gathered(store, outputs).encode():
-                return False
-            inspector.remember(target.name, table)
-        return True
-
-    if not is_right():
-        store.tmp.mkdir(parents=True, exist_ok=True)
-        draft = store.tmp / f"view-{os.getpid()}-{target.name}"
+    The folder is a result as those of steps are.  Its files are hard links to theirs.
+    """
+    store, entries = outputs.store, {photo: outputs.entry(key) for photo, key in sorted(keys.items())}
+    record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
+    record |= {"stage": stage, "photo": None, "view": gather}
+    if outputs.get(key := key_of(record)) is not None:
+        return key
+    draft, files = store.tmp / f"view-{os.getpid()}-{key}", {}
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    try:
+        for photo, entry in entries.items():
+            for name in entry.files:
+                if name in files:
+                    words = f"two photos write the same file {name!r}"
+                    raise InputError(words, key=photo, cure="put the photo's name into it")
+                (draft / name).parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(store.tree(entry.output) / name, draft / name)
+                except OSError:  # no hard links on this file system
+                    shutil.copy2(store.tree(entry.output) / name, draft / name)
+            files |= entry.files
+        if gather:
+            table = {photo: read_json(draft / f"{photo}.json") for photo in entries}
+            write_text(draft / gather, json_text(table))
+            (draft / gather).chmod(0o444)
+            files[gather] = hash_of_file(draft / gather)
+        view = Entry(output_of(files), record, files)
+        store.put(draft, store.tree(view.output), lambda: not damage_of(store.tree(view.output), files))
+        store.keep(key, view)
+    finally:
         shutil.rmtree(draft, ignore_errors=True)
-        try:
-            _fill(draft, store, outputs, gather)
-            store.put(draft, target, is_right)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
-    return target
-
-
-def gathered(store: Store, outputs: dict[str, str]) -> str:
-    """One JSON text of the `<photo>.json` of every tree: {photo: content}."""
-    return json_text({photo: read_json(store.tree(output) / f"{photo}.json") for photo, output in outputs.items()})
-
-
-def _fill(draft: Path, store: Store, outputs: dict[str, str], gather: str | None) -> None:
-    draft.mkdir()
-    for photo, output in sorted(outputs.items()):
-        for name in sorted(stamps_of(store.tree(output))):
-            if (target := draft / name).exists():
-                words = f"two photos write the same file {target.name!r}"
-                raise InputError(words, key=photo, cure="put the photo's name into it")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(store.tree(output) / name, target)
-            except OSError:  # no hard links on this file system
-                shutil.copy2(store.tree(output) / name, target)
-    if gather:
-        write_text(draft / gather, gathered(store, outputs))
-        (draft / gather).chmod(0o444)
-
-
-# ── logs: a JSON object on each line ─────────────────────────────────────────────────────────────────────────────────
+    outputs.forget(key)
+    outputs.remember(view.output, stamps_of(store.tree(view.output)))
+    return key
 
 
 def sound_lines(path: Path) -> list[bytes]:

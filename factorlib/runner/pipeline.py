@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
 
@@ -80,15 +79,16 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def folders(self) -> dict[str, Path]:
         """The folders that parameters name, from where the user stands; links are followed now, for results move on."""
-        return {name: _folder(name, str(self.params[name])) for name in self.given if self.params.get(name) is not None}
-
-
-def _folder(param: str, named: str) -> Path:
-    try:
-        return Path(named).resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
-        words = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
-        raise InputError(words, key=param, cure="name a folder") from error
+        folders = {}
+        for param, named in (
+            (name, str(self.params[name])) for name in self.given if self.params.get(name) is not None
+        ):
+            try:
+                folders[param] = Path(named).resolve()
+            except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
+                words = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
+                raise InputError(words, key=param, cure="name a folder") from error
+        return folders
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,18 +123,31 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     Raises InputError for another format, an unknown name, or stages that need each other.
     """
     pipeline = read_yaml(path, Pipeline)
+
+    def refuse(words: str, key: str, cure: str) -> NoReturn:
+        raise InputError(words, file=path, key=key, cure=cure) from None
+
     if pipeline.format != FORMAT:
-        words, cure = f"format {pipeline.format} is not known", f"this version reads format: {FORMAT}"
-        raise InputError(words, file=path, key="format", cure=cure)
+        refuse(f"format {pipeline.format} is not known", "format", f"this version reads format: {FORMAT}")
     _check_executor(pipeline, path, "")
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
-        _check_stage(name, stage, known, path)
+        key = f"stages.{name}"
+        if not NAME.fullmatch(name) or name in TAKEN:
+            refuse(f"a stage cannot be called {name!r}", "stages", "give it another name, of a-z, 0-9 and _")
+        if stage.gather is not None:
+            check_name(stage.gather, "a gathered file", file=path, key=f"{key}.gather")
+            if stage.over != "photo":
+                refuse("only what is made per photo can be gathered", f"{key}.gather", "add over: photo")
+        for entry in (entry for entry in stage.inputs if entry not in known):
+            refuse(f"there is no {entry!r}", f"{key}.inputs", did_you_mean(entry, known))
+        for param in (param for param in stage.given if param in stage.inputs):
+            refuse(f"{param!r} is a stage already", f"{key}.given", "call the parameter something else")
     try:
         pipeline.order()
     except CycleError as error:
-        words, cure = " <- ".join(error.args[1]), "make the second pass a stage of its own"
-        raise InputError(f"stages that need each other: {words}", file=path, key="stages", cure=cure) from None
+        words = f"stages that need each other: {' <- '.join(error.args[1])}"
+        refuse(words, "stages", "make the second pass a stage of its own")
     return pipeline
 
 
@@ -149,26 +162,6 @@ def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
     if address is not None and not ADDRESS.fullmatch(address):
         words, cure = f"{address[:SHOWN]!r} is no address", "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
         raise InputError(words, file=file, key=f"{prefix}scheduler", cure=cure)
-
-
-def _check_stage(name: str, stage: Stage, known: list[str], path: Path) -> None:
-    if not NAME.fullmatch(name) or name in TAKEN:
-        words, cure = f"a stage cannot be called {name!r}", "give it another name, of a-z, 0-9 and _"
-        raise InputError(words, file=path, key="stages", cure=cure)
-    key = f"stages.{name}"
-    if stage.gather is not None:
-        check_name(stage.gather, "a gathered file", file=path, key=f"{key}.gather")
-    if stage.gather and stage.over != "photo":
-        words = "only what is made per photo can be gathered"
-        raise InputError(words, file=path, key=f"{key}.gather", cure="add over: photo")
-    for entry in (entry for entry in stage.inputs if entry not in known):
-        raise InputError(f"there is no {entry!r}", file=path, key=f"{key}.inputs", cure=did_you_mean(entry, known))
-    for param in (param for param in stage.given if param in stage.inputs):
-        cure = "call the parameter something else"
-        raise InputError(f"{param!r} is a stage already", file=path, key=f"{key}.given", cure=cure)
-
-
-# ── settings of the command line ─────────────────────────────────────────────────────────────────────────────────────
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
@@ -266,27 +259,22 @@ def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
 
 def check_values(pipeline: Pipeline, file: Path) -> None:
     """Raises InputError for a parameter that no key can hold: each must be a finite number of 64 bits, or text."""
+
+    def check(value: Any, key: str) -> None:
+        """Look at a value and, of a table or list, at what it holds."""
+        wrong = None
+        if isinstance(value, dict | list):
+            for name, item in value.items() if isinstance(value, dict) else enumerate(value):
+                check(item, f"{key}.{name}")
+        elif isinstance(value, float) and not math.isfinite(value):
+            wrong = "is not a finite number"
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            wrong = "is not a number of 64 bits"
+        elif isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
+            wrong = "is not text"
+        if wrong:
+            cure = "write a number, a word, or leave it out"
+            raise InputError(f"{str(value)[:SHOWN]!r} {wrong}", file=file, key=key, cure=cure)
+
     for name, stage in pipeline.stages.items():
-        for key, value in _leaves(stage.params, f"stages.{name}.params"):
-            if wrong := _no_value(value):
-                words, cure = f"{str(value)[:SHOWN]!r} {wrong}", "write a number, a word, or leave it out"
-                raise InputError(words, file=file, key=key, cure=cure)
-
-
-def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
-    if items is None:
-        yield key, value
-    else:
-        for name, item in items:
-            yield from _leaves(item, f"{key}.{name}")
-
-
-def _no_value(value: Any) -> str | None:
-    if isinstance(value, float) and not math.isfinite(value):
-        return "is not a finite number"
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        return "is not a number of 64 bits"
-    if isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
-        return "is not text"
-    return None
+        check(stage.params, f"stages.{name}.params")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -91,10 +91,8 @@ def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Pl
     """Every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
     planned: dict[Step, Planned] = {}
     for step in spec.steps():
-        above = [planned[each] for each in spec.above(step)]
-        open_ = [each.step for each in above if each.output is None]
-        outputs = {each.step: each.output for each in above}
-        planned[step] = (_below if open_ else _known)(step, spec, hashes[step], outputs, listing)
+        outputs = {above: planned[above].output for above in spec.above(step)}
+        planned[step] = (_below if None in outputs.values() else _known)(step, spec, hashes[step], outputs, listing)
     return list(planned.values())
 
 
@@ -105,12 +103,11 @@ def _known(step: Step, spec: Spec, own: Record, outputs: Mapping[Step, str], lis
     gathered = {f"gathered:{name}": stages[name].gather for name in above if stages[name].gather}
     record = {**own, **{f"input:{above}": output for above, output in outputs.items()}, **gathered}
     key, before = key_of(record), listing.previous.get(str(step))
-    output = None if step in spec.forced else listing.outputs.get(key)
-    if output is not None:
-        return Planned(step, "current", [], record, key, output)
     if step in spec.forced:
-        reasons = ["forced"]
-    elif key in listing.damaged:
+        return Planned(step, "to run", ["forced"], record, key)
+    if (output := listing.outputs.get(key)) is not None:
+        return Planned(step, "current", [], record, key, output)
+    if key in listing.damaged:
         reasons = [f"its result is damaged: {in_short(listing.damaged[key])}"]
     else:
         reasons = ["not made yet"] if before is None else difference(before, record) or ["its result is gone"]
@@ -153,16 +150,16 @@ _KIND = {
 }
 
 
+_ABSENT = object()
+_HASHED = ("source", "file", "recipe file", "given", "input", "data")
+_LONGEST = 80  # characters of a value that are shown
+_NAMED = 4  # names that came or went
+
+
 def difference(before: Record, after: Record) -> list[str]:
     """What changed between two records, in words, one line per cause."""
     both = sorted(before.keys() | after.keys())
     return [_change(name, before, after) for name in both if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
-
-
-_ABSENT = object()
-_HASHED = ("source", "file", "recipe file", "given", "input", "data")
-_LONGEST = 80  # characters of a value that are shown
-_NAMED, _FILES = 4, 3  # names that came or went; files of one result that are named
 
 
 def _change(name: str, before: Record, after: Record) -> str:
@@ -171,8 +168,11 @@ def _change(name: str, before: Record, after: Record) -> str:
     old, new = before.get(name, _ABSENT), after.get(name, _ABSENT)
     if kind in _HASHED:
         return f"{label}: " + ("new" if old is _ABSENT else "gone" if new is _ABSENT else "changed")
-    if isinstance(old, list) and isinstance(new, list) and (moved := _come_and_gone(old, new)):
-        return f"{label}: {moved}"
+    if isinstance(old, list) and isinstance(new, list):
+        came, gone = [name for name in new if name not in old], [name for name in old if name not in new]
+        if came + gone and all(isinstance(name, str) for name in came + gone):
+            moved = [*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])]
+            return f"{label}: {', '.join(moved)}"
     return f"{label}: {_shown(old, before, kind, what)} -> {_shown(new, after, kind, what)}"
 
 
@@ -186,20 +186,13 @@ def _shown(value: Any, record: Record, kind: str, what: str) -> str:
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
-def _come_and_gone(old: list, new: list) -> str:
-    """Of two lists of names, which came and which went; nothing where that does not tell them apart."""
-    came, gone = [name for name in new if name not in old], [name for name in old if name not in new]
-    if not all(isinstance(name, str) for name in came + gone):
-        return ""
-    return ", ".join([*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])])
+def in_short(lines: Sequence[object], most: int = 3, between: str = "; ") -> str:
+    """The first lines, and how many more there are.
 
-
-def in_short(damage: list[str]) -> str:
-    """
     >>> in_short(["a: missing", "b: missing", "c: missing", "d: missing"])
     'a: missing; b: missing; c: missing; 1 more'
     """
-    return "; ".join([*damage[:_FILES], *([f"{len(damage) - _FILES} more"] if len(damage) > _FILES else [])])
+    return between.join([*map(str, lines[:most]), *([f"{len(lines) - most} more"] if len(lines) > most else [])])
 
 
 def names(steps: Iterable[Step]) -> str:
@@ -208,10 +201,8 @@ def names(steps: Iterable[Step]) -> str:
     >>> names([Step("masks", "a"), Step("masks", "b"), Step("train")])
     'masks (2 photos), train'
     """
-    counts: dict[str, list[Step]] = {}
+    groups: dict[str, list[Step]] = {}
     for step in steps:
-        counts.setdefault(step.stage, []).append(step)
-    return ", ".join(
-        str(found[0]) if len(found) == 1 else f"{stage} ({len(found)} {'recipes' if found[0].recipe else 'photos'})"
-        for stage, found in counts.items()
-    )
+        groups.setdefault(step.stage, []).append(step)
+    kinds = {stage: "recipes" if found[0].recipe else "photos" for stage, found in groups.items()}
+    return ", ".join(str(f[0]) if len(f) == 1 else f"{s} ({len(f)} {kinds[s]})" for s, f in groups.items())

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
@@ -56,7 +56,7 @@ class Data(msgspec.Struct, frozen=True):
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
 
 
-class Provider(msgspec.Struct, frozen=True):
+class Provider(NamedTuple):
     """How to read datasets: the names of their slices, and a reader."""
 
     slices: tuple[str, ...]
@@ -127,21 +127,28 @@ class Project(msgspec.Struct, frozen=True):
         if (folder := self.find_dataset(name)) is not None:
             return folder
         known = [p.parent.name for p in (self.root / "data").glob("*/dataset.yaml")]
-        cure = did_you_mean(name, known) if known and not is_path(name) else HOW
+        cure = did_you_mean(name, known) if known and "/" not in name else HOW
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
     def find_dataset(self, name: str) -> Path | None:
         """The same, None where it is not there; InputError for what can be no dataset's name or path."""
-        if not is_path(name) or name.rstrip("/") in ("", ".", ".."):
+        by_name = "/" not in name or name.rstrip("/") in ("", ".", "..")
+        if by_name:
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
-            if (folder := _folder_at(self.root / "data" / name, name)) is not None:
-                return folder
-        if (folder := _folder_at(Path(os.path.abspath(name)), name)) is not None:
+        for path in ([self.root / "data" / name] if by_name else []) + [Path(os.path.abspath(name))]:
+            try:
+                folder = path if stat.S_ISDIR(os.stat(path).st_mode) else path.parent
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except (OSError, ValueError) as error:  # no right to look, links in a circle, a part too long, a NUL
+                words = f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})"
+                raise InputError(words, key="DATASET", cure=HOW) from error
             check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)
             if self.root.is_relative_to(folder) or folder == self.build:
                 words = "a dataset cannot be the folder that holds the project"
                 raise InputError(words, file=folder, key="DATASET", cure=HOW)
-        return folder
+            return folder
+        return None
 
     def recipes(self, data: Data, words: list[str]) -> dict[str, Recipe]:
         """The recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
@@ -150,45 +157,24 @@ class Project(msgspec.Struct, frozen=True):
         """
         shared, own = self.root / "recipes", self.root / "recipes" / data.folder.name  # the latter goes before
         known = {path.stem: path for folder in (shared, own) for path in sorted(folder.glob("*.yaml"))}
-        paths = [path for word in words for path in (known.values() if word == ALL else [_recipe_at(word, known)])]
-        recipes: dict[str, Recipe] = {}
+        paths, recipes = [], {}
+        for word in words:
+            path = Path(os.path.abspath(word))
+            if word != ALL and word not in known and not path.is_file():
+                by_path = "/" in word or path.suffix
+                said = "there is no such recipe" if by_path else f"there is no recipe {word!r}"
+                cure = did_you_mean(path.stem if by_path else word, [*known, ALL])
+                raise InputError(said, file=word if by_path else None, key="RECIPE", cure=cure)
+            paths += known.values() if word == ALL else [known.get(word, path)]
         for path in dict.fromkeys(paths):
             name = check_name(path.stem, "a recipe", file=path, key="RECIPE", most=200)
             if name in recipes:
-                words = f"two recipes are called {name!r}: their pictures would lie in one folder"
-                raise InputError(words, file=path, cure="rename one of them")
+                said = f"two recipes are called {name!r}: their pictures would lie in one folder"
+                raise InputError(said, file=path, cure="rename one of them")
             recipes[name] = data.recipe(path)
         if not recipes and ALL in words:
             raise InputError("there is none in recipes/", key="RECIPE", cure="name a file: RECIPE=<path>.yaml")
         return recipes
-
-
-def is_path(name: str) -> bool:
-    """Whether a dataset is named by its path, not by its name."""
-    return "/" in name
-
-
-def _folder_at(path: Path, name: str) -> Path | None:
-    """The folder at a path, or the one that holds the file there; None where nothing is."""
-    try:
-        mode = os.stat(path).st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except (OSError, ValueError) as error:  # no right to look, links in a circle, a part too long, a NUL
-        words = f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})"
-        raise InputError(words, key="DATASET", cure=HOW) from error
-    return path if stat.S_ISDIR(mode) else path.parent
-
-
-def _recipe_at(word: str, known: dict[str, Path]) -> Path:
-    path = Path(os.path.abspath(word))
-    if word in known or path.is_file():
-        return known.get(word, path)
-    of_path = "/" in word or path.suffix
-    words, cure = "there is no such recipe", did_you_mean(path.stem if of_path else word, [*known, ALL])
-    raise InputError(
-        words if of_path else f"there is no recipe {word!r}", file=word if of_path else None, key="RECIPE", cure=cure
-    )
 
 
 def check_name(

@@ -8,36 +8,30 @@ what depends on it; one that fails because its stage's code was edited meanwhile
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
+import traceback
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
+from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
-from factorlib.runner.executors import Pools
 from factorlib.runner.gc import tenant
-from factorlib.runner.home import claim, label, remember, sound_lines, view_of
+from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
 from factorlib.runner.pipeline import DASK, DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.survey import Survey
-from factorlib.runner.worker import Code, Outcome, Task, check_params, run_step
+from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
-
-if TYPE_CHECKING:
-    from factorlib.runner.cluster import Cluster
 
 POLL = 0.1  # seconds between two looks at what the workers say
 DIED = "its process died: killed from outside, or for want of memory, or crashed in a library; run again to resume"
-
-
-class Refused(Exception):
-    """Parameters that no stage takes; each has been shown."""
 
 
 @dataclass
@@ -51,73 +45,53 @@ class Running:
     read: int = 0
 
 
-@dataclass
-class Tally:
-    """What a run came to."""
-
-    ran: list[Step] = field(default_factory=list)
-    failed: dict[Step, Outcome] = field(default_factory=dict)
-    held_up: list[Step] = field(default_factory=list)
-
-
-def run(survey: Survey, display: Display) -> Tally:
+def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
+        work = Run(survey, display, folder)
+        if work.refused:
+            return work
         if survey.spec.pipeline.executor == DASK:
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
-            pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
-        else:
-            pools = Pools()
-        work = Run(survey, display, pools, folder)
+            work.pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
         try:
-            work.check()
             work.go()
         except BaseException:
-            pools.close(kill=True)
+            work.pools.close(kill=True)
             raise
         finally:
             for running in work.running.values():
                 running.lock.release()
-            remember(survey)
-        pools.close()
-    return work.tally
+            show(survey, survey.planned(frozenset()))
+        work.pools.close()
+    return work
 
 
 class Run:
-    """The state of one run."""
+    """The state of one run.
 
-    def __init__(self, survey: Survey, display: Display, pools: Pools | Cluster, folder: Path):
-        self.survey, self.display, self.pools, self.folder = survey, display, pools, folder
+    refused: faults of parameters, for which nothing runs;  ran, failed, held_up: the steps that it came to
+    """
+
+    def __init__(self, survey: Survey, display: Display, folder: Path):
+        self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
+        self.refused = survey.wrong_values(survey.planned())
         self.store, self.outputs, self.shared = survey.store, survey.outputs, shared_store(survey.store.root)
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
-        self.tally = Tally()
+        self.ran: list[Step] = []
+        self.failed: dict[Step, Outcome] = {}
+        self.held_up: list[Step] = []
         self.planned: dict[Step, Planned] = {}
         self.stale = False  # there are results that the plan does not know
         self.made: set[str] = set()  # keys
         self.edited: set[str] = set()  # stages whose code is no longer that of their keys
 
-    def check(self) -> None:
-        """Refuse bad parameters before anything has run."""
-        self._plan()
-        stages = dict.fromkeys(p.step.stage for p in self.planned.values() if p.status != "current")
-        checks = [self._code(name) for name in stages if self.survey.spec.pipeline.stages[name].values]
-        running: dict[Future, str] = {}
-        while checks or running:
-            while checks and self.pools.free(checks[0].taken):
-                code = checks.pop(0)
-                running[self.pools.submit(code.taken, code.threads, check_params, code)] = code.stage
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                outcome, stage = self._outcome(future), running.pop(future)
-                if outcome.error:
-                    self._fail(Step(stage), outcome)
-        if self.tally.failed:
-            raise Refused(self.tally.failed)
-
     def go(self) -> None:
         """Run all that can run; returns when nothing is running, and what is left waits for a step that failed."""
+        self._plan()
         while True:
             self.waiting = set()
             self._start_planned()
@@ -128,28 +102,26 @@ class Run:
                 break
             self._wait()
         left = (p.step for p in self.planned.values() if p.status != "current")
-        self.tally.held_up = [step for step in left if step not in self.tally.failed]
-
-    # ── starting ─────────────────────────────────────────────────────────────────────────────────────────────────────
+        self.held_up = [step for step in left if step not in self.failed]
 
     def _plan(self) -> None:
-        planned = self.survey.planned(self.survey.spec.forced - set(self.tally.ran) - set(self.tally.failed))
+        planned = self.survey.planned(self.survey.spec.forced - set(self.ran) - set(self.failed))
         self.planned, self.stale = {p.step: p for p in planned}, False
         self.display.plan(planned)
 
     def _start_planned(self) -> None:
-        for planned in self.planned.values():
-            step = planned.step
+        for step, planned in self.planned.items():
             if planned.status != "to run" or planned.key is None or (self.stale and planned.key in self.made):
                 continue
-            if step in self.running or step in self.tally.failed or step.stage in self.edited:
+            if step in self.running or step in self.failed or step.stage in self.edited:
                 continue
             if not self.pools.free(1):
                 return
-            if self.pools.free(self._code(step.stage).taken):
-                self._start(step, planned)
+            code = self.survey.code(step.stage, self.pools.cores)
+            if self.pools.free(max(code.threads, code.cores)):
+                self._start(step, planned, code)
 
-    def _start(self, step: Step, planned: Planned) -> None:
+    def _start(self, step: Step, planned: Planned, code: Code) -> None:
         if planned.key in self.made:
             words = f"{planned.reasons[0]}, and was made just now: is the disk failing?"
             return self._fail(step, Outcome(error=words))
@@ -160,54 +132,45 @@ class Run:
             self.waiting.add(step)
             return self.display.waits(step)
         self.outputs.forget(planned.key)
-        above = [self.planned[each].key for each in self.survey.spec.above(step)]
         if self.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
             lock.release()  # another run has made it meanwhile
             self.stale = True
-        elif not self.outputs.still(above):
+        elif not self.outputs.still([self.planned[each].key for each in self.survey.spec.above(step)]):
             lock.release()  # a run takes hours, and what is used only now is damaged by now
             self.waiting.add(step)
         else:
             self.display.start(step)
-            task = self._task(planned)
-            future = self.pools.submit(task.code.taken, task.code.threads, run_step, task)
+            task = self._task(planned, code)
+            future = self.pools.submit(max(code.threads, code.cores), code.threads, run_step, task)
             self.running[step] = Running(planned, task, lock, future)
 
-    def _code(self, stage: str) -> Code:
-        return self.survey.code(stage, self.pools.cores)
-
-    def _task(self, planned: Planned) -> Task:
+    def _task(self, planned: Planned, code: Code) -> Task:
         step, survey, record = planned.step, self.survey, planned.record
-        stage, forced = survey.spec.pipeline.stages[step.stage], "forced" in planned.reasons
+        stage, given = survey.spec.pipeline.stages[step.stage], survey.spec.pipeline.stages[step.stage].folders
         slices = {name: survey.data.slice(name, step.photo) for name in stage.slices}
         facts = {DATASET + name: slice_.facts for name, slice_ in slices.items()}
         files = {file: survey.data.folder / file for slice_ in slices.values() for file in slice_.files}
-        hashes = {file: record[f"file:{file}"] for file in files}
-        given = stage.folders
         read = {f"given:{param}/{file}": given[param] / file for param in given for file in stage.given[param]}
         if step.recipe is not None:
             recipe = survey.recipes[step.recipe]
             facts["recipe"] = recipe.facts
             read |= {f"recipe file:{name}": path for name, path in recipe.files.items()}
-        name = self.folder / label(step)
+        temporary = self.folder / label(step)
         return Task(
-            code=self._code(step.stage),
-            photo=step.photo,
-            makes=stage.makes,
-            gather=stage.gather,
+            code=code,
+            stage=stage,
             folders={name: self._folder(step, name) for name in stage.upstream} | given,
             facts=facts,
             files=files | read,
-            hashes=hashes | {file: record[file] for file in read},
-            log=self._log_above(step, name.with_name(f"{name.name}.log.jsonl")) if stage.logs else None,
+            hashes={file: record[f"file:{file}"] for file in files} | {file: record[file] for file in read},
+            log=self._log_above(step, temporary.with_name(f"{temporary.name}.log.jsonl")) if stage.logs else None,
             store=self.store.root,
             key=planned.key,
             record=record,
-            temporary=name,
-            events=name.with_name(f"{name.name}.events.jsonl"),
-            shipped=stage.shipped,
+            temporary=temporary,
+            events=temporary.with_name(f"{temporary.name}.events.jsonl"),
             shared=self.shared,
-            forced=forced,
+            forced="forced" in planned.reasons,
         )
 
     def _folder(self, step: Step, name: str) -> Path:
@@ -215,8 +178,8 @@ class Run:
         stage, spec = self.survey.spec.pipeline.stages[name], self.survey.spec
         if not stage.over or step.photo is not None:
             return self.store.tree(self.planned[Step(name, step.photo if stage.over else None)].output)
-        outputs = {each.photo: self.planned[each].output for each in spec.steps_of(name)}
-        return view_of(self.store, self.outputs.inspector, outputs, stage.gather)
+        keys = {each.photo: self.planned[each].key for each in spec.steps_of(name)}
+        return self.store.tree(self.outputs.get(view_of(self.outputs, name, keys, stage.gather)))
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""
@@ -225,14 +188,12 @@ class Run:
         write_bytes(path, b"".join(line + b"\n" for log in logs for line in sound_lines(log)))
         return path
 
-    # ── taking in ────────────────────────────────────────────────────────────────────────────────────────────────────
-
     def _wait(self) -> None:
-        if futures := {work.future: step for step, work in self.running.items()}:
+        futures, done = {work.future: step for step, work in self.running.items()}, set()
+        if futures:
             done = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED).done
         else:
             time.sleep(POLL)
-            done = set()
         for work in self.running.values():
             self._listen(work)
         for future in done:
@@ -244,26 +205,29 @@ class Run:
 
     def _listen(self, work: Running) -> None:
         """Pass on what a worker has said since the last look."""
-        try:
-            with open(work.task.events, "rb") as stream:
-                stream.seek(work.read)
-                text = stream.read()
-        except OSError:
-            return
+        text = b""
+        with contextlib.suppress(OSError), open(work.task.events, "rb") as stream:
+            stream.seek(work.read)
+            text = stream.read()
         lines = text[: text.rfind(b"\n") + 1]
         work.read += len(lines)
         for line in lines.splitlines():
-            try:
+            with contextlib.suppress(ValueError):  # cut where a try of the step was killed
                 event = json.loads(line)
-            except ValueError:  # cut where a try of the step was killed
-                continue
-            if "warning" in event:
-                self.display.warn(work.planned.step, event["warning"])
-            else:
-                self.display.progress(work.planned.step, event["done"], event["total"], event["text"])
+                if "warning" in event:
+                    self.display.warn(work.planned.step, event["warning"])
+                else:
+                    self.display.progress(work.planned.step, event["done"], event["total"], event["text"])
 
     def _take(self, work: Running) -> None:
-        step, key, outcome = work.planned.step, work.task.key, self._outcome(work.future)
+        step, key = work.planned.step, work.task.key
+        try:
+            outcome = work.future.result()
+        except Exception as error:
+            name = type(error).__name__
+            outcome = Outcome(error=f"{name}: {error}", traceback="".join(traceback.format_exception(error)))
+            if isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker":  # which is Dask's
+                outcome = Outcome(error=DIED)
         work.lock.release()
         if outcome.error is not None:
             return self._fail(step, outcome)
@@ -274,35 +238,20 @@ class Run:
             where = self.survey.project.shown(outcome.damaged)
             self.display.warn(step, f"its kept result was damaged and is replaced; what was there: {where}")
         self.survey.previous[str(step)] = work.task.record
-        self.tally.ran.append(step)
+        self.ran.append(step)
         self.made.add(key)
-        self._log(self.store.log(key).read_text(encoding="utf-8"))
+        append_text(self.survey.home.log, self.store.log(key).read_text(encoding="utf-8"))
         remember(self.survey, {str(step): key})
         self.display.finish(step, outcome.seconds)
 
-    def _outcome(self, future: Future) -> Outcome:
-        """How it ended; its worker is free again."""
-        self.pools.done(future)
-        try:
-            return future.result()
-        except (BrokenProcessPool, CancelledError):
-            return Outcome(error=DIED)
-        except Exception as error:
-            return Outcome(error=f"{type(error).__name__}: {error}", traceback=repr(error))
-
     def _fail(self, step: Step, outcome: Outcome) -> None:
-        self.tally.failed[step] = outcome
+        self.failed[step], home, where = outcome, self.survey.home, None
         self.edited |= {step.stage} if outcome.code_changed else set()
-        where = None
         if outcome.traceback:
-            path = self.survey.home.errors / f"{label(step)}.txt"
+            path = home.errors / f"{label(step)}.txt"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_text(path, outcome.traceback)
             where = self.survey.project.shown(path)
         self.display.fail(step, outcome.error, where)
         event = {"event": "failed", "stage": step.stage, "photo": step.of, "text": outcome.error}
-        self._log(json.dumps(event, sort_keys=True) + "\n")
-
-    def _log(self, lines: str) -> None:
-        self.survey.home.folder.mkdir(parents=True, exist_ok=True)
-        append_text(self.survey.home.log, lines)
+        append_text(home.log, json.dumps(event, sort_keys=True) + "\n")

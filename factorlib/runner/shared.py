@@ -28,7 +28,7 @@ from factorlib.runner.filehash import hash_of_file, is_file_of
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Store, holds
+from factorlib.runner.store import Entry, Store, damage_of
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
@@ -84,7 +84,7 @@ def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
         if not shared.root.is_dir():
             raise FileNotFoundError(errno.ENOENT, "it is gone")
         there = shared.entry(key)
-        if there and holds(shared.tree(there.output), there.files):
+        if there and not damage_of(shared.tree(there.output), there.files):
             return
         for path in shared.tmp.glob("offer-*"):
             with contextlib.suppress(OSError):
@@ -111,7 +111,7 @@ def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
         (draft / name).parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
-    return holds(draft, files)
+    return not damage_of(draft, files)
 
 
 def _copy_log(source: Store, target: Store, key: str) -> None:
@@ -119,9 +119,6 @@ def _copy_log(source: Store, target: Store, key: str) -> None:
     if lines := sound_lines(source.log(key)):
         target.logs.mkdir(parents=True, exist_ok=True)
         replace_file(target.log(key), b"".join(line + b"\n" for line in lines))
-
-
-# ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Shipped(msgspec.Struct, frozen=True):
@@ -141,9 +138,9 @@ def made_from(record: Record, modules: list[str]) -> Record:
     return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
 
 
-def shipped_folder(roots: list[Path], shipping: Shipping, record: Record) -> Path | None:
+def shipped_folder(roots: list[Path], shipping: Shipping | None, record: Record) -> Path | None:
     """The folder, below one of `roots`, whose result is that of `record`; None where it was made from something else."""
-    for folder in (root / shipping.folder for root in roots):
+    for folder in (root / shipping.folder for root in roots if shipping):
         if (folder / MADE_FROM).is_file() and _shipped(folder).record == made_from(record, shipping.made_by):
             return folder
     return None
@@ -167,10 +164,10 @@ def copy_shipped(folder: Path, out: Path) -> None:
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
     """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
-    target, files = root / shipping.folder, {path.name: path.read_bytes() for path in sorted(result.iterdir())}
+    target, hashes = root / shipping.folder, {}
     target.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        replace_file(target / name, content)
-    shipped = Shipped(made_from(record, shipping.made_by), {name: hash_of_file(target / name) for name in files})
-    replace_file(target / MADE_FROM, json_text(shipped).encode())
+    for path in sorted(result.iterdir()):
+        replace_file(target / path.name, path.read_bytes())
+        hashes[path.name] = hash_of_file(target / path.name)
+    replace_file(target / MADE_FROM, json_text(Shipped(made_from(record, shipping.made_by), hashes)).encode())
     return target

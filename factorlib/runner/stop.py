@@ -22,12 +22,11 @@ class Stopped(SystemExit):
 @contextlib.contextmanager
 def heed_stops() -> Iterator[None]:
     """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
-    heeded = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM)
-        if _in_main_thread() and signal.getsignal(number) != signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, _stop) for number in heeded}
+    in_main_thread = (
+        threading.current_thread() is threading.main_thread()
+    )  # only there may Python say what a signal does
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, _stop) for number in numbers}
     try:
         yield
     finally:
@@ -52,13 +51,8 @@ def whole() -> Iterator[None]:
 
 def take_sigterm_back() -> None:
     """What Python does at SIGTERM holds again: pycolmap, once imported, prints a C stack instead."""
-    if _in_main_thread():
+    if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
-
-
-def _in_main_thread() -> bool:
-    """Only there may Python say what a signal does."""
-    return threading.current_thread() is threading.main_thread()
 
 
 def _stop(number: int, frame: FrameType | None = None) -> None:

@@ -3,7 +3,6 @@
     build/store/trees/<output>/   the files of a result, read-only
     build/store/keys/<key>.json   {"output", "record", "files"}: what the key gave
     build/store/logs/<key>.jsonl  what making it cost and said (times and machine facts are only here)
-    build/store/views/<hash>/     the results of all photos of a stage in one folder
     build/store/unfinished/<key>/ what lets a step that was killed go on
     build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
     build/store/locks, tmp, cache
@@ -26,7 +25,7 @@ import shutil
 import stat
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -55,7 +54,7 @@ class Store:
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs, self.views = map(root.joinpath, ("trees", "keys", "logs", "views"))
+        self.trees, self.keys, self.logs = root / "trees", root / "keys", root / "logs"
         self.unfinished, self.damaged = root / "unfinished", root / "damaged"
         self.locks, self.tmp, self.cache = root / "locks", root / "tmp", root / "cache"
 
@@ -86,14 +85,12 @@ class Store:
         for name in files:
             (folder / name).chmod(0o444)
         sync_tree(folder)
-        return entry, self.put(folder, self.tree(entry.output), lambda: holds(self.tree(entry.output), files))
+        return entry, self.put(folder, self.tree(entry.output), lambda: not damage_of(self.tree(entry.output), files))
 
     def keep(self, key: str, entry: Entry) -> None:
         """From now on `key` has that result."""
         path = self.keys / f"{key}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            self._set_aside(path)
         replace_file(path, json_text(entry).encode())
 
     def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
@@ -111,14 +108,10 @@ class Store:
             if is_right():
                 shutil.rmtree(folder)
                 return aside
-            aside = self._set_aside(target)
-
-    def _set_aside(self, target: Path) -> Path:
-        self.damaged.mkdir(parents=True, exist_ok=True)
-        aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
-        with contextlib.suppress(FileNotFoundError):  # another run was quicker
-            os.rename(target, aside)
-        return aside
+            self.damaged.mkdir(parents=True, exist_ok=True)
+            aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
+            with contextlib.suppress(FileNotFoundError):  # another run was quicker
+                os.rename(target, aside)
 
 
 def output_of(files: dict[str, str]) -> str:
@@ -126,26 +119,19 @@ def output_of(files: dict[str, str]) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
 
 
-# ── whether results are as they were kept ────────────────────────────────────────────────────────────────────────────
-
-
-def stamps_of(folder: Path) -> dict[str, Stamp]:
-    """{relative path: stamp} of what lies below a folder; empty where there is none."""
-    return dict(_stamps(folder, ""))
-
-
-def _stamps(folder: str | Path, above: str) -> Iterator[tuple[str, Stamp]]:
-    try:
-        entries = [entry for entry in os.scandir(folder) if not left_over(entry.name)]
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _stamps(entry.path, f"{above}{entry.name}/")
-            continue
-        with contextlib.suppress(FileNotFoundError):
-            facts = entry.stat(follow_symlinks=False)
-            yield above + entry.name, (facts.st_size, facts.st_mtime_ns) if stat.S_ISREG(facts.st_mode) else NO_FILE
+def stamps_of(folder: str | Path, above: str = "") -> dict[str, Stamp]:
+    """{relative path: stamp} of what lies below a folder, with `above` before each path; empty where there is none."""
+    stamps: dict[str, Stamp] = {}
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        for entry in [entry for entry in os.scandir(folder) if not left_over(entry.name)]:
+            if entry.is_dir(follow_symlinks=False):
+                stamps |= stamps_of(entry.path, f"{above}{entry.name}/")
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                facts = entry.stat(follow_symlinks=False)
+                is_file = stat.S_ISREG(facts.st_mode)
+                stamps[above + entry.name] = (facts.st_size, facts.st_mtime_ns) if is_file else NO_FILE
+    return stamps
 
 
 def hashes_of_tree(folder: Path) -> dict[str, str]:
@@ -156,92 +142,44 @@ def hashes_of_tree(folder: Path) -> dict[str, str]:
     return {name: hash_of_file(folder / name) for name, _ in stamps}
 
 
-def holds(tree: Path, files: dict[str, str]) -> bool:
-    """Whether a folder has exactly those files, every content read."""
-    try:
-        return hashes_of_tree(tree) == files
-    except (OSError, InputError):
-        return False
-
-
-def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]) -> list[str]:
+def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
     """How a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
-    now = stamps_of(folder)
-    lines = [(name, _fault(folder / name, files[name], now.get(name), right.get(name))) for name in sorted(files)]
-    lines += [(name, "no file of this result") for name in sorted(now.keys() - files.keys())]
-    return [f"{name}: {words}" for name, words in lines if words]
-
-
-def _fault(path: Path, hash_: str, now: Stamp | None, right: Stamp | None) -> str:
-    if now is None or now == NO_FILE:
-        return "a link, or no file" if now else "missing"
-    try:
-        return "" if now == right or hash_of_file(path) == hash_ else "other content"
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
+    lines, now = [], stamps_of(folder)
+    for name in sorted(files):
+        if (stamp := now.get(name)) in (None, NO_FILE):
+            lines.append(f"{name}: {'a link, or no file' if stamp else 'missing'}")
+        elif stamp != (right or {}).get(name):
+            try:
+                lines += [] if hash_of_file(folder / name) == files[name] else [f"{name}: other content"]
+            except OSError as error:
+                lines.append(f"{name}: cannot be read ({error.strerror})")
+    return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
 
 
 class Inspector:
-    """Looks at the trees and views of a store.  known: by tree or view, the stamps of its files when contents were right."""
+    """Output hash by key (`get`), and whether the trees of a store are as they were kept.
 
-    def __init__(self, root: Path):
-        self.root, self.cache, self._changed = root, root / "cache" / "trees.json", False
-        self.known = read_cache(self.cache, dict[str, dict[str, Stamp]]) or {}
-        self._wrong: dict[str, tuple[dict[str, Stamp], list[str]]] = {}
-
-    def damage(self, output: str, files: Mapping[str, str]) -> list[str]:
-        """What is wrong with a tree that should hold `files` (relative path -> hash), a line each; empty where nothing is."""
-        now = stamps_of(self.root / "trees" / output)
-        if now and now == self.known.get(output):
-            return []
-        if output not in self._wrong or self._wrong[output][0] != now:
-            self._wrong[output] = now, self.thorough(output, files, self.known.get(output, {}))
-        return self._wrong[output][1]
-
-    def thorough(self, output: str, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
-        """The same, with every content read, but for files whose stamps are in `right`."""
-        tree = self.root / "trees" / output
-        now, damage = stamps_of(tree), damage_of(tree, files, right or {})
-        if damage:
-            self._changed |= self.known.pop(output, None) is not None
-        else:
-            self.remember(output, now)
-        return damage
-
-    def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
-        """Note the stamps of a tree or view whose contents were right."""
-        if self.known.get(name) != stamps:
-            self.known[name], self._changed = stamps, True
-
-    def save(self) -> None:
-        """Write the cache, where there is anything new to write."""
-        if self._changed:
-            places = (self.root / "trees", self.root / "views")
-            write_cache(self.cache, {n: s for n, s in self.known.items() if any((p / n).is_dir() for p in places)})
-            self._changed = False
-
-
-class Outputs:
-    """Output hash by key, each looked up once; none of a key whose tree is not as it was kept.
-
-    damaged: by key, what is wrong with its tree
+    known: by tree, the stamps of its files when contents were right
+    damaged: by key, what is wrong with its tree, so that it has no output
     """
 
     def __init__(self, store: Store):
-        self.store, self.inspector = store, Inspector(store.root)
+        self.store, self.cache, self._changed = store, store.cache / "trees.json", False
+        self.known = read_cache(self.cache, dict[str, dict[str, Stamp]]) or {}
         self.damaged: dict[str, list[str]] = {}
-        self._known: dict[str, str] = {}
+        self._outputs: dict[str, str] = {}
         self._entries: dict[str, Entry | None] = {}
+        self._wrong: dict[str, tuple[dict[str, Stamp], list[str]]] = {}
 
     def get(self, key: str) -> str | None:
         """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
-        if key not in self._known and (entry := self.entry(key)):
+        if key not in self._outputs and (entry := self.entry(key)):
             self.damaged.pop(key, None)
-            if damage := self.inspector.damage(entry.output, entry.files):
+            if damage := self.damage(entry.output, entry.files):
                 self.damaged[key] = damage
             else:
-                self._known[key] = entry.output
-        return self._known.get(key)
+                self._outputs[key] = entry.output
+        return self._outputs.get(key)
 
     def entry(self, key: str) -> Entry | None:
         """`Store.entry`, read once."""
@@ -251,18 +189,47 @@ class Outputs:
 
     def forget(self, key: str) -> None:
         """Look `key` up again when it is asked for next."""
-        self._known.pop(key, None)
+        self._outputs.pop(key, None)
         self._entries.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:
         """Whether those keys have the outputs they had, looked up again."""
-        before = {key: self._known.get(key) for key in keys}
+        before = {key: self._outputs.get(key) for key in keys}
         for key in before:
             self.forget(key)
         return None not in before.values() and all(self.get(key) == output for key, output in before.items())
 
+    def damage(self, output: str, files: Mapping[str, str]) -> list[str]:
+        """What is wrong with a tree that should hold `files` (relative path -> hash), a line each; empty where nothing is."""
+        now = stamps_of(self.store.tree(output))
+        if now and now == self.known.get(output):
+            return []
+        if self._wrong.get(output, (None,))[0] != now:
+            self._wrong[output] = now, self.thorough(output, files, self.known.get(output, {}))
+        return self._wrong[output][1]
 
-# ── what killed writers left ─────────────────────────────────────────────────────────────────────────────────────────
+    def thorough(self, output: str, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
+        """The same, with every content read, but for files whose stamps are in `right`."""
+        tree = self.store.tree(output)
+        now, damage = stamps_of(tree), damage_of(tree, files, right)
+        if damage:
+            self._changed |= self.known.pop(output, None) is not None
+        else:
+            self.remember(output, now)
+        return damage
+
+    def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
+        """Note the stamps of a tree whose contents were right."""
+        if self.known.get(name) != stamps:
+            self.known[name], self._changed = stamps, True
+
+    def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
+        if self._changed:
+            write_cache(
+                self.cache, {name: stamps for name, stamps in self.known.items() if self.store.tree(name).is_dir()}
+            )
+            self._changed = False
 
 
 def sweep_drafts(folder: Path) -> None:
@@ -278,8 +245,8 @@ def is_alive(pid: int) -> bool:
     """Whether there is such a process on this machine, whoever's it is."""
     try:
         os.kill(pid, 0)
+        return True
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        pass
-    return True
+        return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,15 +25,12 @@ from factorlib.runner.pipeline import (
     words_by_key,
 )
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import Data, Project, Recipe
-from factorlib.runner.store import Outputs, Store
-from factorlib.runner.worker import Code, check_params
+from factorlib.runner.project import ALL, Data, Project, Recipe
+from factorlib.runner.store import Inspector, Store
+from factorlib.runner.worker import Code, params_of
 
-READ = (
-    "file:",
-    "recipe file:",
-    f"facts:{DATASET}",
-)  # fields of a record: the part of the dataset and recipe that a step reads
+RENDER = "render"  # the stage whose pictures a recipe replaces
+READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of the dataset and recipe, what a step reads
 
 
 @dataclass
@@ -52,7 +49,7 @@ class Survey:
     store: Store
     spec: Spec
     records: dict[Step, Record]
-    outputs: Outputs
+    outputs: Inspector
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
     words: dict[str, str]
@@ -66,8 +63,7 @@ class Survey:
         """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
         stage, project = self.spec.pipeline.stages[name], self.project
         taken = cores if stage.cores == "all" else min(stage.cores, cores)
-        file, words = project.pipeline_file, self.words
-        return Code(project.root, project.package, name, stage.values, file, stage.threads, taken, words)
+        return Code(project.root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
 
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
         """What is wrong with the files that steps read, those of their recipes too, each fault once.
@@ -92,12 +88,23 @@ class Survey:
     def wrong_values(self, planned: list[Planned]) -> list[str]:
         """Of the parameters that steps would run with: one out of its range, or of another kind.
 
-        Only a stage that is given any is imported, which takes seconds where it computes.
+        Only a stage that is given any is imported, in a process of its own: that takes seconds where it computes.
         """
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
-        codes = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values]
-        outcomes = map(check_params, codes)  # a stage that cannot be loaded says so when it is run
-        return [outcome.error for outcome in outcomes if outcome.error and not outcome.traceback]
+        codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
+        if codes:
+            from factorlib.runner.child import Pools
+
+            pools = Pools()
+            try:
+                for future in [pools.submit(1, code.threads, params_of, code) for code in codes]:
+                    if isinstance(
+                        error := future.exception(), InputError
+                    ):  # what cannot be loaded says so when it runs
+                        faults.append(str(said_of_settings(error, self.words)))
+            finally:
+                pools.close(kill=True)
+        return faults
 
 
 def survey(
@@ -107,76 +114,77 @@ def survey(
     settings: list[str],
     force: bool = False,
     recipes: list[str] | None = None,
+    look: bool = False,
 ) -> Survey:
     """Read everything a plan needs; every InputError there is about pipeline, settings, dataset or recipes comes from here.
 
-    recipes: paths or names of those that are asked for; without any, stages over recipes have no steps
+    recipes: paths or names of those that are asked for, which adds the stages over them; without any, all if such a stage is
+             a target.  With the target `render` they are all that is wanted
+    look: without running it: where recipes are named and no stage, of the recipes alone
     """
     file, words = project.pipeline_file, words_by_key(settings)
     pipeline = with_settings(read_pipeline(file, project.provider.slices), settings)
-    with _said_of(words):
-        check_values(pipeline, file)
-    for name in (name for name in targets or [] if name not in pipeline.stages):
-        raise InputError(f"there is no stage {name!r}", file=file, cure=did_you_mean(name, pipeline.stages))
-    data = project.provider.read(project.dataset_folder(dataset))
-    home, store = home_of(project, data.folder), Store(project.build / "store")
-    asked = project.recipes(data, recipes or [])
-    spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
-    if force:
-        forced = pipeline.stages if targets is None else targets
-        spec = msgspec.structs.replace(spec, forced=frozenset(step for name in forced for step in spec.steps_of(name)))
-    hashes = FileHashes(store.cache / "files.json")
-    with _said_of(words):
-        records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
-    with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
-        hashes.save()
-    outputs = Outputs(store)
-    entries = {step: outputs.entry(key) for step, key in home.last_keys(warn=True).items()}
-    previous = {step: entry.record for step, entry in entries.items() if entry}
-    return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
-
-
-@contextlib.contextmanager
-def _said_of(words: dict[str, str]) -> Iterator[None]:
-    """What is wrong with a setting is said of the setting."""
     try:
-        yield
+        check_values(pipeline, file)
+        over_recipes = [name for name, stage in pipeline.stages.items() if stage.over == "recipe"]
+        if recipes and (targets == [RENDER] or (look and targets is None)):
+            targets = over_recipes
+        elif recipes:
+            usual = [name for name, stage in pipeline.stages.items() if not stage.optional]
+            targets = list(dict.fromkeys([*(usual if targets is None else targets), *over_recipes]))
+        elif set(over_recipes) & set(targets or []):
+            recipes = [ALL]
+        for name in (name for name in targets or [] if name not in pipeline.stages):
+            raise InputError(f"there is no stage {name!r}", file=file, cure=did_you_mean(name, pipeline.stages))
+        data = project.provider.read(project.dataset_folder(dataset))
+        home, store = home_of(project, data.folder), Store(project.build / "store")
+        asked = project.recipes(data, recipes or [])
+        spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
+        if force:
+            forced = frozenset(step for name in targets or pipeline.stages for step in spec.steps_of(name))
+            spec = msgspec.structs.replace(spec, forced=forced)
+        hashes = FileHashes(store.cache / "files.json")
+        records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
     except InputError as error:
         raise said_of_settings(error, words) from None
+    with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
+        hashes.save()
+    outputs = Inspector(store)
+    entries = {step: outputs.entry(key) for step, key in home.keys(lenient=True).items()}
+    previous = {step: entry.record for step, entry in entries.items() if entry}
+    return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
 
 
 def _records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages, recipes: dict[str, Recipe]
 ) -> dict[Step, Record]:
     sources, stages, file = Sources(project.source_roots, hashes), spec.pipeline.stages, project.pipeline_file
-    wanted = spec.pipeline.needed(spec.targets)
-    defaults = {
-        name: sources.stage_params(project.package, name, file)
-        for name, stage in stages.items()
-        if stage.params or name in wanted
-    }
-    for name, stage in (
-        (name, stages[name]) for name in defaults
-    ):  # names alone: values are checked where it is loaded
-        known = [*defaults[name], *stage.given]
-        for param in (param for param in stage.params if param not in known):
+    wanted, records = spec.pipeline.needed(spec.targets), {}
+    of = {n: sources.stage_params(project.package, n, file) for n, s in stages.items() if s.params or n in wanted}
+    for name, defaults in of.items():  # names alone: values are checked where the stage is loaded
+        known = [*defaults, *stages[name].given]
+        for param in (param for param in stages[name].params if param not in known):
             words, cure = f"the stage {name!r} has no parameter {param!r}", did_you_mean(param, known)
-            raise InputError(
-                words, file=file, key=f"stages.{name}.params.{param}", cure=cure if known else "leave it out"
-            )
-    records = {}
+            key = f"stages.{name}.params.{param}"
+            raise InputError(words, file=file, key=key, cure=cure if known else "leave it out")
     for name in wanted:
         stage, closure = stages[name], sources.closure(project.package, name, file)
-        values = other_than(defaults[name], stage.values)
         record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
-        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record()
+        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record
         record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
-        record |= {f"param:{param}": value for param, value in values.items()}
-        record |= {f"default:{param}": recorded(value) for param, value in defaults[name].items()}
+        record |= {f"param:{param}": value for param, value in other_than(of[name], stage.values).items()}
+        record |= {f"default:{param}": recorded(value) for param, value in of[name].items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
-                words = f"name a folder with {', '.join(stage.given[param])}, such as the result of an earlier run of the stage"
-                record[f"given:{param}/{given}"] = _given(project, folder, given, f"{name}.{param}", words, hashes)
+                try:
+                    if os.path.lexists(folder / given):
+                        check_plain(folder / given, "a result", f"{name}.{param}", most_bytes=None)  # a pipe never ends
+                    record[f"given:{param}/{given}"] = hashes.content(folder / given)
+                except (OSError, TypeError):
+                    words = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {given!r}"
+                    files = ", ".join(stage.given[param])
+                    cure = f"name a folder with {files}, such as the result of an earlier run of the stage"
+                    raise InputError(words, file=project.shown(folder), key=f"{name}.{param}", cure=cure) from None
         for step in spec.steps_of(name):
             records[step] = record | {"photo": step.photo}
             for slice_ in (data.slice(each, step.photo) for each in stage.slices):
@@ -188,16 +196,6 @@ def _records(
                 files = recipe.files.items()
                 records[step] |= {f"recipe file:{each}": _hash(path.parent, path.name, hashes) for each, path in files}
     return records
-
-
-def _given(project: Project, folder: Path, file: str, key: str, cure: str, hashes: FileHashes) -> str:
-    try:
-        if os.path.lexists(folder / file):
-            check_plain(folder / file, "a result", key, most_bytes=None)  # a pipe or a device would never end
-        return hashes.content(folder / file)
-    except (OSError, TypeError):
-        words = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {file!r}"
-        raise InputError(words, file=project.shown(folder), key=key, cure=cure) from None
 
 
 def _hash(folder: Path, file: str, hashes: FileHashes) -> str:

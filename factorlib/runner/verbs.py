@@ -7,18 +7,19 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.home import Home, claim, label, made_home, made_homes, remember, sound_lines
+from factorlib.runner.home import Home, claim, label, made_home, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
-from factorlib.runner.plan import Planned, difference
-from factorlib.runner.project import ALL, RESERVED, Project, check_name, is_path
+from factorlib.runner.plan import Planned, Step, difference, in_short
+from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
@@ -27,7 +28,6 @@ from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
 
-RENDER = "render"  # the stage whose pictures a recipe replaces
 RESULTS = {  # what a user looks at first
     "report": "report/index.html",
     "materials": "export/materials.json",
@@ -36,8 +36,8 @@ RESULTS = {  # what a user looks at first
 }
 
 
-class Wish(msgspec.Struct, frozen=True):
-    """What the command line asks for.
+class Wish(NamedTuple):
+    """What the command line asks for, as `survey` takes it.
 
     targets:  stages; None for all but those that run only when asked for
     settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
@@ -46,26 +46,9 @@ class Wish(msgspec.Struct, frozen=True):
 
     dataset: str
     targets: list[str] | None = None
-    settings: list[str] = []
+    settings: Sequence[str] = ()
     force: bool = False
-    recipes: list[str] = []
-
-
-def surveyed(project: Project, wish: Wish, look: bool = False) -> Survey:
-    """The survey of what is wanted.  Recipes add the stages over them; with the target `render` they are all that is wanted.
-
-    look: without running it: where recipes are named and no stage, of the recipes alone
-    """
-    stages, targets, recipes = _pipeline(project).stages, wish.targets, wish.recipes
-    over_recipes = [name for name, stage in stages.items() if stage.over == "recipe"]
-    if recipes and (targets == [RENDER] or (look and targets is None)):
-        targets = over_recipes
-    elif recipes:
-        usual = [name for name, stage in stages.items() if not stage.optional]
-        targets = [*(usual if targets is None else targets), *over_recipes]
-    elif any(name in over_recipes for name in targets or []):
-        recipes = [ALL]
-    return survey(project, wish.dataset, targets, wish.settings, wish.force, recipes)
+    recipes: Sequence[str] = ()
 
 
 def check_stage(project: Project, name: str, verbs: list[str]) -> None:
@@ -83,61 +66,53 @@ def _say(seen: Survey, text: str) -> None:
     print(f"{seen.data.folder.name}: {text}")
 
 
-# ── running ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def make(project: Project, wish: Wish) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run."""
     with heed_stops():
-        started, seen = time.perf_counter(), surveyed(project, wish)
+        started, seen = time.perf_counter(), survey(project, *wish)
         planned = seen.planned()
         todo = [p.step for p in planned if p.status != "current"]
         if not todo:
-            remember(seen, planned=planned)
+            show(seen, planned)
             _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
         elif faults := seen.faults(todo, new=True):
             return _refused(seen, faults)
         elif code := _run(seen, started):
             return code
-        _name_results(seen, wish.targets is None)
+        home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
+        for what, path in RESULTS.items() if whole else ():
+            if (home / path).exists():
+                print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
+        for name in seen.spec.targets or ():
+            over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
+            if over_recipes or not whole:
+                one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
+                print(f"  {name}: {project.shown(home / name / one)}")
         return 0
 
 
 def _run(seen: Survey, started: float) -> int:
     from factorlib.runner.display import display_for
-    from factorlib.runner.run import Refused, run
+    from factorlib.runner.run import run
 
     display = display_for()
     try:
-        tally = run(seen, display)
-    except Refused:
-        return 1
+        ran = run(seen, display)
     except (KeyboardInterrupt, Stopped) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
         return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
-    if failed := list(tally.failed):
-        _say(seen, f"{words.count(failed)} failed: {words.listed(failed)}")
-        if tally.held_up:
-            print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in tally.held_up))}")
+    if ran.refused:
+        return _refused(seen, ran.refused, "parameters")
+    if failed := list(ran.failed):
+        _say(seen, f"{words.count(failed)} failed: {in_short(failed, words.NAMED, ', ')}")
+        if ran.held_up:
+            print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in ran.held_up))}")
         return 1
-    current, seconds = len(seen.records) - len(tally.ran), time.perf_counter() - started
-    _say(seen, f"{words.count(tally.ran)} run, {current} current, {seconds:.1f} s")
+    current, seconds = len(seen.records) - len(ran.ran), time.perf_counter() - started
+    _say(seen, f"{words.count(ran.ran)} run, {current} current, {seconds:.1f} s")
     return 0
-
-
-def _name_results(seen: Survey, whole: bool) -> None:
-    """Print, of the whole pipeline what a user looks at first, else each stage's folder; pictures of recipes either way."""
-    home = seen.home.folder
-    for what, path in RESULTS.items() if whole else ():
-        if (home / path).exists():
-            print(f"  {what}: {seen.project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
-    for name in seen.spec.targets or ():
-        over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
-        if over_recipes or not whole:
-            one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
-            print(f"  {name}: {seen.project.shown(home / name / one)}")
 
 
 def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
@@ -148,21 +123,9 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     return 1
 
 
-# ── looking ──────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def show_plan(project: Project, wish: Wish) -> int:
-    """Print what would run; 1 where a value of a parameter would not do."""
-    return _shown(project, wish, words.plan_lines)
-
-
-def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run; 1 where a value of a parameter would not do."""
-    return _shown(project, wish, words.why_lines)
-
-
-def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]]) -> int:
-    seen = surveyed(project, wish, look=True)
+def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]] = words.plan_lines) -> int:
+    """Print what would run; 1 where a value of a parameter would not do.  lines: how a plan is told"""
+    seen = survey(project, *wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
         return _refused(seen, faults, "parameters")
@@ -174,31 +137,35 @@ def _shown(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[s
     return 0
 
 
+def show_why(project: Project, wish: Wish) -> int:
+    """Print why each step would run; 1 where a value of a parameter would not do."""
+    return show_plan(project, wish, words.why_lines)
+
+
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = surveyed(project, wish, look=True)
+    seen = survey(project, *wish, look=True)
+
+    def running(planned: Planned) -> bool:
+        """Whether a run holds the lock on a step's key."""
+        try:
+            descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
 
     def warned(planned: Planned) -> list[str]:
         """What a step said when its present result was made."""
         return [event["text"] for event in _events(seen, planned) if event["event"] == "warning"]
 
-    print("\n".join(words.status_lines(seen.planned(), lambda p: _is_running(seen, p), warned)))
+    print("\n".join(words.status_lines(seen.planned(), running, warned)))
     return 0
-
-
-def _is_running(seen: Survey, planned: Planned) -> bool:
-    """Whether a run holds the lock on a step's key."""
-    try:
-        descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        return False
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
 
 
 def _events(seen: Survey, planned: Planned) -> list[dict]:
@@ -215,7 +182,7 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 
 def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
     """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
-    seen, logged = surveyed(project, wish, look=True), []
+    seen, logged = survey(project, *wish, look=True), []
     for p in seen.planned():
         if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of):
             error = seen.home.errors / f"{label(p.step)}.txt"
@@ -249,22 +216,19 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     counts = f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
     _say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
     if sheet:
-        from factorlib.runner.display import shown_if_long
+        from factorlib.runner.display import display_for
 
         claim(project, seen.home, seen.data.folder)
-        path = seen.home.folder / "sheet.png"
-        with shown_if_long("sheet") as report:
-            _science("sheet").write_sheet(seen.data.folder, path, report)
+        path, step, started, display = seen.home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
+        draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
+        display.start(step)
+        try:
+            draw(seen.data.folder, path, lambda done, all_: (display.progress(step, done, all_, ""), display.tick()))
+            display.finish(step, time.monotonic() - started)
+        finally:
+            display.close()
         print(f"  contact sheet: {project.shown(path)}")
     return 0
-
-
-def _science(name: str) -> object:
-    """A module that the runner does not know: found by its name, as stages are, when it is needed."""
-    return import_module(f"factorlib.{name}")
-
-
-# ── datasets and results ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
@@ -272,9 +236,9 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     if photos is None:
         cure = "add PHOTOS=<folder>, and MASKS=… and MESHES=… where there are some"
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
-    folder = Path(os.path.abspath(dataset)) if is_path(dataset) else project.root / "data" / dataset
+    folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
-    missing = _science("newset").new_dataset(folder, photos, masks, meshes)
+    missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
     where = ", with `?` where you must say more:" if missing else ""
     print(f"{project.shown(folder)}/dataset.yaml is written{where}")
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
@@ -283,31 +247,27 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
 
 def compare(project: Project, first: Path, second: Path) -> int:
     """Write a page that shows two results, folders such as build/eames, side by side."""
-    folders = [path if path.is_dir() else project.build / path for path in (first, second)]
-    for folder, named in zip(folders, (first, second), strict=True):
-        if not Home(folder).keys_file.is_file():
+    homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]
+    for home, named in zip(homes, (first, second), strict=True):
+        if not home.keys_file.is_file():
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    changes = _changes(Store(project.build / "store"), *(Home(folder).keys() for folder in folders))
-    page = _science("report.comparison").comparison(*folders, changes)
-    path = project.build / "compare" / f"{folders[0].name}-{folders[1].name}" / "index.html"
+    (one, other), store, changes = (home.keys() for home in homes), Store(project.build / "store"), set()
+    for step in one.keys() & other.keys():
+        pair = store.entry(one[step]), store.entry(other[step])
+        if None in pair:
+            changes = None  # which is not known
+            break
+        records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in pair]
+        changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
+    folders, changes = [home.folder for home in homes], changes if changes is None else sorted(changes)
+    page = import_module("factorlib.report.comparison").comparison(*folders, changes)
+    path = project.build / "compare" / "-".join(home.folder.name for home in homes) / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
     print(f"comparison: {project.shown(path)}")
     return 0
-
-
-def _changes(store: Store, first: dict[str, str], second: dict[str, str]) -> list[str] | None:
-    """What differs between the records of the steps that both have, results of other steps left out; None where one is gone."""
-    changes: set[str] = set()
-    for step in first.keys() & second.keys():
-        entries = [store.entry(keys[step]) for keys in (first, second)]
-        if None in entries:
-            return None
-        records = [{k: v for k, v in entry.record.items() if not k.startswith("input:")} for entry in entries]
-        changes |= {f"{step.partition('/')[0]}: {change}" for change in difference(*records)}
-    return sorted(changes)
 
 
 def _homes(project: Project, dataset: str | None, otherwise: str) -> list[Home]:
@@ -324,10 +284,9 @@ def clean(project: Project, dataset: str | None) -> int:
 
     homes = _homes(project, dataset, "delete")
     if homes or dataset is None:
-        deleted, left = forget_all(project) if dataset is None else forget(project, homes[0])
-        print("\n".join([f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]))
-        for path in left:
-            print(f"left    {project.shown(path)}")
+        deleted, left = forget_all(project) if dataset is None else forget(project, homes)
+        lines = [f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]
+        print("\n".join([*lines, *(f"left    {project.shown(path)}" for path in left)]))
     return 0
 
 
@@ -353,7 +312,7 @@ def verify(project: Project, dataset: str | None) -> int:
     homes = _homes(project, dataset, "read")
     if dataset is not None and not homes:
         return 0
-    results, damaged = read_all(Store(project.build / "store"), homes, _pipeline(project), dataset is None)
+    results, damaged = read_all(Store(project.build / "store"), homes, dataset is None)
     for where, faults, steps in damaged:
         lines = [f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {fault}" for fault in faults)]
         print("\n".join(lines))

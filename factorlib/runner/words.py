@@ -7,29 +7,23 @@ import inspect
 import textwrap
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from msgspec import inspect as types
 
 from factorlib.runner.pipeline import Pipeline
-from factorlib.runner.plan import Planned, Step
-
-if TYPE_CHECKING:
-    from factorlib.runner.gc import Unneeded
+from factorlib.runner.plan import Planned, Step, in_short
 
 SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
 
 
-# ── plans ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def plan_lines(planned: list[Planned]) -> list[str]:
     """What would run, one line for steps of a stage that share their reasons."""
     lines = [
-        f"{stage:<10} {status:<7} {items:<24} {_short(reasons)}".rstrip()
-        for stage, status, reasons, items in _alike(planned)
+        f"{stage:<10} {status:<7} {items:<24} {in_short(why, SHOWN)}".rstrip()
+        for stage, status, why, items in _alike(planned)
     ]
     current = sum(p.status == "current" for p in planned)
     return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
@@ -37,21 +31,24 @@ def plan_lines(planned: list[Planned]) -> list[str]:
 
 def why_lines(planned: list[Planned]) -> list[str]:
     """Every reason of every step that is not current."""
-    groups = [
-        [f"{stage} {items}".rstrip() + f": {status}", *(f"    {reason}" for reason in reasons)]
-        for stage, status, reasons, items in _alike(planned)
-    ]
-    nothing = "everything is current: sources, parameters, files and versions are those of the last results"
-    return [line for group in groups for line in group] or [nothing]
+    lines = []
+    for stage, status, why, items in _alike(planned):
+        lines += [f"{stage} {items}".rstrip() + f": {status}", *(f"    {reason}" for reason in why)]
+    return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
 
 
-def _alike(planned: list[Planned]) -> list[tuple[str, str, list[str], str]]:
+def _alike(planned: list[Planned]) -> list[tuple[str, str, tuple[str, ...], str]]:
     """Stage, status, reasons and items of steps that are not current and share these, the photo's own name aside."""
     groups: dict[tuple, list[Step]] = {}
     for p in (p for p in planned if p.status != "current"):
         reasons = tuple(_of_any_photo(reason, p.step) for reason in p.reasons)
         groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step)
-    return [(stage, status, list(reasons), _items(steps)) for (stage, status, reasons), steps in groups.items()]
+    lines = []
+    for group, steps in groups.items():
+        names = [step.of for step in steps if step.of]
+        many = f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
+        lines.append((*group, ", ".join(names) if len(names) <= 3 else many))
+    return lines
 
 
 def _of_any_photo(reason: str, step: Step) -> str:
@@ -60,21 +57,11 @@ def _of_any_photo(reason: str, step: Step) -> str:
     >>> _of_any_photo("if masks/kitchen, train comes out different", Step("align", "kitchen"))
     'if masks, train comes out different'
     """
-    if step.photo is None:
-        return reason
-    if reason.startswith(("if ", "result of ")):
+    if step.photo and reason.startswith(("if ", "result of ")):
         return reason.replace(f"/{step.photo}", "")
-    return reason.replace(f" photos.{step.photo}.", " photos.*.", 1) if reason.startswith("dataset.yaml:") else reason
-
-
-def _items(steps: list[Step]) -> str:
-    names = [step.of for step in steps if step.of]
-    return ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
-
-
-def _short(reasons: list[str]) -> str:
-    more = f"; {len(reasons) - SHOWN} more" if len(reasons) > SHOWN else ""
-    return "; ".join(reasons[:SHOWN]) + more
+    if step.photo and reason.startswith("dataset.yaml:"):
+        return reason.replace(f" photos.{step.photo}.", " photos.*.", 1)
+    return reason
 
 
 def status_lines(
@@ -97,11 +84,12 @@ def graph_lines(pipeline: Pipeline, mermaid: bool = False) -> list[str]:
     if mermaid:
         nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
         return ["graph TD", *nodes, *(f"  {above} --> {name}" for name in stages for above in stages[name].upstream)]
-    return [
-        f"{name:<10} {f'per {stage.over}' if stage.over else 'whole set':<10} <- {', '.join(stage.inputs) or '(parameters only)'}"
-        + ("   (only when asked for)" if stage.optional else "")
-        for name, stage in stages.items()
-    ]
+    lines = []
+    for name, stage in stages.items():
+        over, inputs = f"per {stage.over}" if stage.over else "whole set", ", ".join(stage.inputs)
+        optional = "   (only when asked for)" if stage.optional else ""
+        lines.append(f"{name:<10} {over:<10} <- {inputs or '(parameters only)'}{optional}")
+    return lines
 
 
 def count(items: list, one: str = "step") -> str:
@@ -110,19 +98,6 @@ def count(items: list, one: str = "step") -> str:
     ('1 step', '2 faults')
     """
     return f"{len(items)} {one}{'' if len(items) == 1 else 's'}"
-
-
-def listed(steps: list[Step]) -> str:
-    """The steps by name, at most NAMED of them.
-
-    >>> listed([Step("train"), Step("urm", "a")])
-    'train, urm/a'
-    """
-    more = [f"{len(steps) - NAMED} more"] if len(steps) > NAMED else []
-    return ", ".join([*map(str, steps[:NAMED]), *more])
-
-
-# ── logs ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
@@ -145,7 +120,7 @@ def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]
 def _cost(planned: Planned, events: list[dict]) -> str:
     done = next((event for event in reversed(events) if event["event"] == "done"), None)
     if planned.status != "current":
-        return f"{planned.status}: {_short(planned.reasons)}"
+        return f"{planned.status}: {in_short(planned.reasons, SHOWN)}"
     if done is None or done.get("shared"):
         return "its log is not there" if done is None else "from the shared store, without its log"
     cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
@@ -156,21 +131,20 @@ def _cost(planned: Planned, events: list[dict]) -> str:
 def _made_with(record: dict, events: list[dict]) -> str:
     """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
     machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    packages = sorted(item for item in record.items() if item[0].startswith("package:"))
     parts = [f"Python {machine.get('python', record.get('python', ''))}"]
     parts += [f"{machine['system']} {machine['processor']}"] if machine else []
-    parts += [f"{name.removeprefix('package:')} {version}" for name, version in packages]
+    parts += [f"{n.removeprefix('package:')} {v}" for n, v in sorted(record.items()) if n.startswith("package:")]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
 
 
-def unneeded_lines(groups: list[Unneeded]) -> list[str]:
+def unneeded_lines(groups: dict[str, list[tuple[float, int]]]) -> list[str]:
     """A line a stage: how many results nothing names, what they take, and how old they are."""
-    now, lines = time.time(), []
-    for group in groups:
-        oldest, newest = _age(now - group.oldest), _age(now - group.newest)
-        what = f"{group.stage:<10} {group.results:>5} {'result ' if group.results == 1 else 'results'}"
+    lines = []
+    for stage, results in groups.items():
+        oldest, newest = (_age(time.time() - pick(kept for kept, _ in results)) for pick in (min, max))
+        what = f"{stage:<10} {len(results):>5} {'result ' if len(results) == 1 else 'results'}"
         age = newest if oldest == newest else f"{newest} to {oldest}"
-        lines.append(f"{what} {group.bytes / 1e6:>9.1f} MB   {age} old")
+        lines.append(f"{what} {sum(size for _, size in results) / 1e6:>9.1f} MB   {age} old")
     return lines
 
 
@@ -183,53 +157,36 @@ def _age(seconds: float) -> str:
     return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
 
 
-# ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Parameter(msgspec.Struct, frozen=True):
-    """Its name, dotted where it is a field of a field; what is allowed, in words; its default as YAML has it; what it means."""
-
-    name: str
-    allowed: str
-    default: str
-    text: str
-
-
 def parameter_lines(stage: str, params: type) -> list[str]:
     """A stage's parameters, each with its default, what it may be and what it means."""
     lines = []
-    for one in parameters(params):
-        lines.append(f"{stage}.{one.name} = {one.default}    ({one.allowed})")
-        lines += textwrap.wrap(one.text, 100, initial_indent="    ", subsequent_indent="    ")
+    for name, may_be, default, text in parameters(params):
+        lines.append(f"{stage}.{name} = {default}    ({may_be})")
+        lines += textwrap.wrap(text, 100, initial_indent="    ", subsequent_indent="    ")
     return lines or [f"{stage} has no parameters"]
 
 
-def parameters(params: type) -> list[Parameter]:
-    """The fields of a stage's `Params`, in its order, each explained by the string that follows it; a field that is a struct
-    stands for its own fields."""
-    texts, table = _texts_of(params), []
-    for field in types.type_info(params).fields:
-        if isinstance(field.type, types.StructType):
-            inner = parameters(field.type.cls)
-            table += [msgspec.structs.replace(one, name=f"{field.name}.{one.name}") for one in inner]
-        else:
-            made = field.default is msgspec.NODEFAULT and callable(field.default_factory)
-            value = field.default_factory() if made else field.default
-            text = "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
-            table.append(Parameter(field.name, allowed(field.type), text, texts.get(field.name, "")))
-    return table
+def parameters(params: type) -> list[tuple[str, str, str, str]]:
+    """The fields of a stage's `Params`, in its order: name, what is allowed, default as YAML has it, meaning.
 
-
-def _texts_of(struct: type) -> dict[str, str]:
-    """The strings that follow the fields of a class and of those it is derived from."""
-    texts: dict[str, str] = {}
-    for cls in reversed(struct.__mro__):
+    The meaning is the string that follows a field.  One that is a struct stands for its own fields, with dotted names.
+    """
+    texts, table = {}, []
+    for cls in reversed(params.__mro__):
         if issubclass(cls, msgspec.Struct) and cls is not msgspec.Struct:
             body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
             for field, text in zip(body, body[1:]):
                 if isinstance(field, ast.AnnAssign) and isinstance(getattr(text, "value", None), ast.Constant):
                     texts[field.target.id] = " ".join(str(text.value.value).split())
-    return texts
+    for field in types.type_info(params).fields:
+        if isinstance(field.type, types.StructType):
+            table += [(f"{field.name}.{name}", *rest) for name, *rest in parameters(field.type.cls)]
+        else:
+            made = field.default is msgspec.NODEFAULT and callable(field.default_factory)
+            value = field.default_factory() if made else field.default
+            text = "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
+            table.append((field.name, allowed(field.type), text, texts.get(field.name, "")))
+    return table
 
 
 def allowed(of: Any) -> str:

@@ -7,10 +7,13 @@ than `submit`.  While it runs a step says how far it is, and what it warns of, i
 from __future__ import annotations
 
 import contextlib
+import datetime
 import importlib
 import json
 import logging
 import os
+import platform
+import resource
 import shutil
 import sys
 import time
@@ -21,29 +24,27 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
-from factorlib.runner.cost import Meter
 from factorlib.runner.filehash import FileHashes, is_file_of
 from factorlib.runner.home import sound_lines
-from factorlib.runner.pipeline import Shipping, said_of_settings
+from factorlib.runner.pipeline import Stage
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import copy_shipped, fetch, offer, shipped_folder
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Stamp, Store, stamps_of
 from factorlib.stage import Inputs
-from factorlib.wholefile import replace_file
+from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
 LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
 THREAD_VARIABLES = (*(f"{name}_NUM_THREADS" for name in LIBRARIES), "VECLIB_MAXIMUM_THREADS")
-LOGGERS = ("factorlib", "py.warnings")
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -51,7 +52,6 @@ class Code(msgspec.Struct, frozen=True):
     """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
-    words: settings of the command line, by the keys that they stand for
     """
 
     root: Path
@@ -61,26 +61,17 @@ class Code(msgspec.Struct, frozen=True):
     settings: Path
     threads: int = 1
     cores: int = 1
-    words: dict[str, str] = {}
-
-    @property
-    def taken(self) -> int:
-        """Cores that it keeps busy."""
-        return max(self.threads, self.cores)
 
 
 class Task(msgspec.Struct, frozen=True):
     """All that a worker knows of a step.
 
     hashes:  of the dataset's files, as they were when the key was made
-    shipped: where the package may have the result already
     shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
     """
 
     code: Code
-    photo: str | None
-    makes: list[str]
-    gather: str | None
+    stage: Stage
     folders: dict[str, Path]
     facts: dict[str, Any]
     files: dict[str, Path]
@@ -91,7 +82,6 @@ class Task(msgspec.Struct, frozen=True):
     record: dict[str, Any]
     temporary: Path
     events: Path
-    shipped: Shipping | None = None
     shared: Path | None = None
     forced: bool = False
 
@@ -122,37 +112,44 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
     spread_over: an ordered map to which its independent work goes, with what it `spent` outside this process: `cpu_seconds`,
                  and whatever else is worth a log; without, threads of this process
     """
-    meter, code, store = Meter(), task.code, Store(task.store)
-    with Events(task) as events:
+    meter, code, store, fetched, made = Meter(), task.code, Store(task.store), None, None
+    with Events(task.events) as events:
         try:
-            taken, from_shared = _made_elsewhere(task, store, events)
-            entry, damaged = taken or _made(task, store, events, spread_over or partial(spread, code.cores))
+            if task.shared and not task.forced:
+                fetched = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
+            if fetched:
+                for event in map(json.loads, sound_lines(store.log(task.key))):
+                    if event["event"] == "warning":
+                        events.say(str(event.get("text", "")))
+            elif not task.forced and (folder := shipped_folder([code.root, LIBRARY], task.stage.shipped, task.record)):
+                copy_shipped(folder, task.temporary)
+                made = store.take_in(task.record, task.temporary)
+            entry, damaged = fetched or made or _made(task, store, events, spread_over or partial(spread, code.cores))
             cost = meter.read(code.threads, code.cores)
-            if spread_over is not None and not taken:
+            if spread_over is not None and fetched is None and made is None:
                 cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
                 cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
-            if not from_shared:
-                _write_log(task, events, cost)
+            if fetched is None or not store.log(task.key).exists():  # a line for each warning, one for the step
+                done = (
+                    {"event": "done", **cost} if fetched is None else {"event": "done", "seconds": 0.0, "shared": True}
+                )
+                where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+                where |= {"stage": code.stage, "key": task.key}
+                lines = [where | {"event": "warning", "text": text} for text in events.warnings] + [where | done]
+                store.logs.mkdir(parents=True, exist_ok=True)
+                text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
+                replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            if task.shared and not from_shared:
+            if task.shared and fetched is None:
                 offer(store, Store(task.shared), task.key, entry, events.say)
             return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
-            return _failed(error, task.temporary.parent, meter.read(code.threads, code.cores)["seconds"])
+            return _failed(error, task.temporary.parent, meter.read()["seconds"])
 
 
-def check_params(code: Code) -> Outcome:
-    """Only whether the parameters are good."""
-    try:
-        params_of(load_stage(code), code)
-        return Outcome()
-    except Exception as error:
-        return _failed(error, code.root)
-
-
-def _failed(error: BaseException, folder: Path, seconds: float = 0.0) -> Outcome:
+def _failed(error: BaseException, folder: Path, seconds: float) -> Outcome:
     """What the user can mend says how; the rest is a defect, and comes with its traceback."""
     if known := error if isinstance(error, InputError) else disk_error(error, folder):
         return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged), seconds=seconds)
@@ -169,20 +166,17 @@ def load_stage(code: Code) -> ModuleType:
     return module
 
 
+def params_of(code: Code) -> msgspec.Struct:
+    """The stage's parameters as its own struct.  Raises InputError where one is out of its bounds."""
+    return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
+
+
 def spread(cores: int, function: Callable, items: Iterable) -> list:
     """The function of every item, in order, on so many threads."""
     if cores == 1:
         return [function(item) for item in items]
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(function, items))
-
-
-def params_of(module: ModuleType, code: Code) -> msgspec.Struct:
-    """The stage's parameters as its own struct, every bound checked."""
-    try:
-        return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
-    except InputError as error:
-        raise said_of_settings(error, code.words) from None
 
 
 def limit_threads(threads: int) -> None:
@@ -194,45 +188,30 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made_elsewhere(task: Task, store: Store, events: Events) -> tuple[tuple[Entry, Path | None] | None, bool]:
-    """The result as others have made it, and what they were warned of; None where it is to be made here.
-
-    Second comes whether it is of the shared store, with a log of its own.
-    """
-    if task.forced:
-        return None, False
-    if task.shared and (taken := fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)):
-        for event in map(json.loads, sound_lines(store.log(task.key))):
-            if event["event"] == "warning":
-                events.say(str(event.get("text", "")))
-        if not store.log(task.key).exists():
-            _write_log(task, events, {"seconds": 0.0, "shared": True})
-        return taken, True
-    if task.shipped and (folder := shipped_folder([task.code.root, LIBRARY], task.shipped, task.record)):
-        copy_shipped(folder, task.temporary)
-        return store.take_in(task.record, task.temporary), False
-    return None, False
-
-
 def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
     """Run the step; its tree is in the store afterwards, its key is not."""
-    module = load_stage(task.code)  # which takes seconds
-    params = params_of(module, task.code)
-    task.temporary.mkdir(parents=True)
+    module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
+    photo, out = task.record["photo"], task.temporary
+    out.mkdir(parents=True)
     hashes = FileHashes(store.cache / "files.json")
     _check_code(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
-    inputs = Inputs(task.folders, task.facts, task.files, task.photo, map_, task.log, unfinished)
+    inputs = Inputs(task.folders, task.facts, task.files, photo, map_, task.log, unfinished)
     try:
-        module.main(params, inputs, task.temporary, events.progress)
+        module.main(params, inputs, out, events.progress)
     except Exception:
         _check_inputs(task, results)  # of a file that was taken away or edited meanwhile: no defect of the stage
         raise
     _check_inputs(task, results)
     _check_code(task, hashes)
-    _check_made(task)
-    return store.take_in(task.record, task.temporary)
+    promised = [*task.stage.makes, *(["{photo}.json"] if task.stage.gather else [])]  # to break its word is a defect
+    for pattern in (text.replace("{photo}", photo or "") for text in promised):
+        if not any(out.glob(pattern)):
+            raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
+    if not any(path.is_file() for path in out.rglob("*")):
+        raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
+    return store.take_in(task.record, out)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
@@ -241,17 +220,16 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
     for folder, before in results.items():
         now = stamps_of(folder)
         changed += [folder / name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
-    for path in changed[:1]:
-        raise InputError(
-            "the file changed while it was being read", file=path, cure="run again: what is needed is made again"
-        )
+    if changed:
+        cure = "run again: what is needed is made again"
+        raise InputError("the file changed while it was being read", file=changed[0], cure=cure)
 
 
 def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
-    now, before = closure.record(), {n: value for n, value in task.record.items() if n.startswith(CODE)}
+    now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
     if now != before:
         changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
         files = [str(closure.files[name]) for name in changed if name in closure.files]
@@ -259,48 +237,75 @@ def _check_code(task: Task, hashes: FileHashes) -> None:
         raise CodeChanged(words, file=", ".join(files) or None, cure="run again")
 
 
-def _check_made(task: Task) -> None:
-    """A stage that does not keep its word is a defect."""
-    promised = [*task.makes, *(["{photo}.json"] if task.gather else [])]
-    for pattern in (text.replace("{photo}", task.photo or "") for text in promised):
-        if not any(task.temporary.glob(pattern)):
-            raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
-    if not any(path.is_file() for path in task.temporary.rglob("*")):
-        raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
+class Meter:
+    """What is spent since it was made: wall and processor seconds, and the most memory."""
+
+    def __init__(self) -> None:
+        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux counts the peak anew
+            stream.write("5")
+        self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+        self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
+
+    def read(self, threads: int = 1, cores: int = 1) -> dict[str, Any]:
+        """Wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if platform.system() == "Darwin" else 2**10)
+        with contextlib.suppress(OSError), open("/proc/self/status") as stream:
+            peak = next(int(line.split()[1]) / 2**10 for line in stream if line.startswith("VmHWM"))
+        facts = {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()}
+        return {
+            "started": self.started,
+            "seconds": round(time.perf_counter() - self.wall, 3),
+            "cpu_seconds": round(_cpu_seconds() - self.cpu, 3),
+            "memory_mb": round(peak, 1),
+            "threads": threads,
+            "cores": cores,
+            "machine": facts | {"python": platform.python_version()},
+        }
 
 
-def _write_log(task: Task, events: Events, cost: dict) -> None:
-    """What this result cost and said, beside the store's keys: one line for each warning, one for the step."""
-    where = {"stage": task.code.stage, "photo": task.photo, "key": task.key}
-    where |= {"recipe": task.record["recipe"]} if "recipe" in task.record else {}
-    lines = [*({"event": "warning", "text": text} for text in events.warnings), {"event": "done", **cost}]
-    path = Store(task.store).log(task.key)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, "".join(json.dumps(where | line, sort_keys=True) + "\n" for line in lines).encode())
+def _cpu_seconds() -> float:
+    usage = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
-class Events(logging.Handler):
-    """Progress and warnings of one step, as JSON lines that the parent reads while it runs."""
+class Heard(logging.Handler):
+    """Within, what the library and Python warn of comes here alone.  warnings: each text once"""
 
-    def __init__(self, task: Task):
+    LOGGERS = ("factorlib", "py.warnings")
+
+    def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.path, self.warnings, self._last = task.events, [], 0.0
+        self.warnings: list[str] = []
 
-    def __enter__(self) -> Events:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._stream = open(self.path, "a", encoding="utf-8")  # of events
+    def __enter__(self) -> Self:
         logging.captureWarnings(True)
         warnings.simplefilter("ignore", DeprecationWarning)
-        for logger in map(logging.getLogger, LOGGERS):
+        for logger in map(logging.getLogger, self.LOGGERS):
             logger.addHandler(self)
             logger.propagate = False
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for logger in map(logging.getLogger, LOGGERS):
+        for logger in map(logging.getLogger, self.LOGGERS):
             logger.removeHandler(self)
-        with contextlib.suppress(OSError):  # what could not be said, see `_write`
-            self._stream.close()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take note of a warning (as a `logging.Handler`)."""
+        text = record.getMessage().strip()
+        if text not in self.warnings:
+            self.warnings.append(text)
+            self.say(text)
+
+    def say(self, text: str) -> None:
+        """Pass a warning on."""
+
+
+class Events(Heard):
+    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path, self._last = path, 0.0
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
@@ -308,18 +313,10 @@ class Events(logging.Handler):
             self._last = now
             self._write({"done": float(done), "total": float(total), "text": text})
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Report a warning of the log, each text once (as a `logging.Handler`)."""
-        text = record.getMessage().strip()
-        if text not in self.warnings:
-            self.warnings.append(text)
-            self.say(text)
-
     def say(self, text: str) -> None:
-        """Report a warning that is no part of the result's log."""
+        """Report a warning, whether or not it is part of the result's log."""
         self._write({"warning": text})
 
     def _write(self, event: dict) -> None:
         with contextlib.suppress(OSError):  # on a full disk: the step itself fails there, or finds room again
-            self._stream.write(json.dumps(event) + "\n")
-            self._stream.flush()
+            append_text(self.path, json.dumps(event) + "\n")

@@ -34,7 +34,7 @@ from factorlib.results.solution import read_earlier
 from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, read_observations, write_observations
 from factorlib.validation import Validation
-from factorlib.yamlfile import Limits, read_yaml
+from factorlib.yamlfile import read_yaml
 from stages import masks
 
 W, H = 16, 12
@@ -367,5 +367,5 @@ READERS = {  # reader -> who reads a file of the data set's folder
     "solution": lambda folder, _: read_earlier(folder / "solve"),
     "poses": lambda folder, name: read_poses(folder / name),
     "json": lambda folder, name: read_json(folder / name),
-    "yaml": lambda folder, name: read_yaml(folder / name, dict, Limits(values=2000)),
+    "yaml": lambda folder, name: read_yaml(folder / name, dict, most_values=2000),
 }

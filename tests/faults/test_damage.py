@@ -162,7 +162,7 @@ def test_verify_names_views_keys_and_results_that_are_not_current(project, capsy
     next((project.build / "store" / "keys").glob("*.json")).write_text("{")
     assert verbs.verify(project, "set") == 1
     text = capsys.readouterr().out
-    for words in ("build/set/upper", "sizes.json: other content", "build/set/count", "a.json: other content"):
+    for words in ("upper (set)", "sizes.json: other content", "count (set)", "a.json: other content"):
         assert words in text
     assert "store/keys" in text and "not readable" in text
     assert make(project, "table.scale=3") == 0 and make(project) == 0 and is_sound(project, "set")

@@ -317,6 +317,7 @@ REFUSED = {
         (rewritten("weight", pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has empty places"),
         (rewritten("weight", pa.array(["a"] * 5)), "of type string"),
         (rewritten("normal", pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10)), 2)), "'normal' is of type"),
+        (rewritten("normal", pa.array([[b"ab"] * 3] * 5, pa.list_(pa.binary(2), 3))), "'normal' is of type"),
         (rewritten("visibility", pa.array([b"x" * 10_000] * 5, pa.binary(10_000))), "'visibility' is of type"),
     ],
     ("lobes", "a.parquet"): [

@@ -63,7 +63,7 @@ def test_code_or_package_data_edited_while_a_step_runs_is_not_kept_under_the_old
 
 
 def test_a_stage_whose_code_was_edited_is_not_started_for_further_photos(fresh, capsys, monkeypatch):
-    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 1)
+    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 1)
     path = fresh.root / "stages" / "count.py"
     write(path, editing(toy.COUNT, path, toy.COUNT + "\nMORE = 1\n"))
     assert make(fresh) == 1

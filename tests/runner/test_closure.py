@@ -1,12 +1,19 @@
-"""What of the source counts: everything that is run, however far it is imported from; no remark."""
+"""What of the source counts: everything that is run, however far it is imported from, no remark; and what it says of parameters."""
 
+import importlib
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.runner import verbs
 from factorlib.runner.closure import Sources, source_of
 from factorlib.runner.filehash import FileHashes
+from factorlib.runner.pipeline import read_pipeline
+from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.words import parameters
 from tests.runner import toy
 
 FUNCTION = "def f(x):\n    return x + 1\n"
@@ -37,7 +44,10 @@ def test_every_form_of_import_is_followed(tmp_path):
         toy.write(tmp_path / name, text)
     closure = Sources([tmp_path], FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
     assert set(closure.modules) == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
-    assert set(closure.data) == {"p:w.safetensors", "p.sub:templates/page.html"}
+    assert {n for n in closure.record if n.startswith("data:")} == {
+        "data:p:w.safetensors",
+        "data:p.sub:templates/page.html",
+    }
     assert closure.external == ["numpy"]
 
 
@@ -68,3 +78,32 @@ def test_a_stage_without_a_module_is_refused(tmp_path):
     with pytest.raises(InputError, match="uper") as caught:
         toy.state(project)
     assert "did you mean 'upper'" in caught.value.cure
+
+
+class Inner(msgspec.Struct, frozen=True):
+    size: Annotated[int, msgspec.Meta(ge=1, le=9)] = 3
+    """Of what
+    is inside."""
+
+
+class Base(msgspec.Struct):
+    share: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.5
+    """A share."""
+
+
+class Outer(Base):
+    inner: Inner = Inner()
+    mute: bool = False
+
+
+def test_parameters_are_shown_with_those_of_bases_and_of_fields(capsys):
+    share, size = ("share", "number > 0 and < 1", "0.5", "A share."), ("inner.size", "1 … 9", "3", "Of what is inside.")
+    assert parameters(Outer) == [share, size, ("mute", "true, false", "false", "")]
+    assert verbs.show_params(Project(LIBRARY, photo_sets()), ["urm"]) == 0
+    assert "urm.directions = 512    (0 … 4,096)\n    Directions of the sphere" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("stage", read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).order())
+def test_every_parameter_of_a_stage_says_what_it_means(stage):
+    params = importlib.import_module(f"stages.{stage}").Params
+    assert not [name for name, *_, text in parameters(params) if not text.endswith(".")]

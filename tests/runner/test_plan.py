@@ -74,18 +74,12 @@ def test_what_runs_after_a_change_and_what_then_does(photos, forced, changed, ex
     assert ran is None or run(spec, own, listing, same)[0] == ran
 
 
-def test_the_reasons_are_what_differs_from_the_last_result():
+def test_the_reasons_are_what_differs_from_the_last_result_and_going_back_finds_the_old_one():
     spec, listing = done()
     assert open_steps(spec, hashes(spec, masks_a=2), listing)["masks/a"][1] == ["source of m: changed"]
-    without_b = Spec(PIPELINE, ["a"])
-    assert open_steps(without_b, hashes(without_b), listing)["solve"][1] == ["result of align/b: gone"]
     outputs = {k: v for k, v in listing.outputs.items() if k != key_of(listing.previous["train"])}
     gone = open_steps(spec, hashes(spec), Listing(outputs, listing.previous))
     assert gone["train"] == ("to run", ["its result is gone"]) and gone["solve"][0] == "maybe"
-
-
-def test_going_back_finds_the_old_result_and_only_what_a_target_needs_is_planned():
-    spec, listing = done()
     assert not open_steps(spec, hashes(spec), run(spec, hashes(spec, masks=2), listing)[1])
     assert [str(s) for s in Spec(PIPELINE, ["a"], ["align"]).steps()] == ["masks/a", "align/a"]
 

@@ -47,7 +47,6 @@ def project(tmp_path):
         data = toy.read(folder)
 
         def faults(files):
-            """A file with the word 'fault' has one; what was looked at is noted."""
             LOOKED_AT.extend(files)
             return [InputError("a fault", file=path) for path in files.values() if "fault" in path.read_text()]
 
@@ -70,7 +69,10 @@ def make(project, *recipes, targets=("render",), **more):
     return verbs.make(project, verbs.Wish("set", targets and list(targets), recipes=list(recipes), **more))
 
 
-def test_every_recipe_is_a_step_with_a_folder_of_its_own_all_of_them_where_none_is_named(project):
+def test_every_recipe_is_a_step_with_a_folder_of_its_own_all_where_none_is_named_a_path_as_well(project, monkeypatch):
+    write(project.root / "mine" / "own.yaml", '{"word": "own"}')
+    monkeypatch.chdir(project.root)
+    assert make(project, "mine/own.yaml") == 0 and said(project, "own") == "own!ab"
     assert make(project, "hello") == 0 and said(project, "hello") == "hello!ab"
     assert not (project.build / "set" / "total").exists()  # what no recipe takes did not run
     assert make(project, targets=["shout"]) == 0 and said(project, "bye") == "bye!…ab"
@@ -111,12 +113,6 @@ def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_the
     assert make(project, "all") == 1 and LOOKED_AT == ["more.txt"]
 
 
-def test_a_path_is_a_recipe_as_well(project, monkeypatch):
-    write(project.root / "mine" / "own.yaml", '{"word": "own"}')
-    monkeypatch.chdir(project.root)
-    assert make(project, "mine/own.yaml") == 0 and said(project, "own") == "own!ab"
-
-
 @pytest.mark.parametrize(
     "words, wrong",
     [
@@ -137,17 +133,14 @@ def test_a_recipe_that_is_not_there_or_can_have_no_folder_is_refused(project, tm
     assert wrong in str(error.value)
 
 
-@pytest.mark.parametrize("show", [verbs.show_plan, verbs.show_why, verbs.show_status])
-def test_looking_at_recipes_shows_what_they_need_and_no_more(project, capsys, show):
-    show(project, verbs.Wish("set", recipes=["hello"]))
-    shown = capsys.readouterr().out
-    assert "shout" in shown and "upper" in shown and "total" not in shown and "bye" not in shown
-    show(project, verbs.Wish("set"))  # without recipes: the whole pipeline
-    shown = capsys.readouterr().out
-    assert "total" in shown and "shout" not in shown
-
-
-def test_the_whole_pipeline_and_recipes_where_both_are_asked_for(project, capsys):
+def test_looking_at_recipes_shows_what_they_need_alone_and_the_whole_pipeline_where_both_are_asked_for(project, capsys):
+    for show in (verbs.show_plan, verbs.show_why, verbs.show_status):
+        show(project, verbs.Wish("set", recipes=["hello"]))
+        shown = capsys.readouterr().out
+        assert "shout" in shown and "upper" in shown and "total" not in shown and "bye" not in shown
+        show(project, verbs.Wish("set"))
+        shown = capsys.readouterr().out
+        assert "total" in shown and "shout" not in shown
     assert make(project, "hello", targets=None) == 0
     assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
     assert not (project.build / "set" / "shout" / "bye").exists()

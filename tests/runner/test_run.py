@@ -5,8 +5,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -14,32 +12,37 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.executors import Pools
+from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
-from factorlib.runner.project import LIBRARY
-from tests.faults.test_many_photos import own_modules
+from tests.faults.battered import done, make, start, wait_until
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, reasons, state, write
 
-
-def make(project, dataset="set", settings=(), targets=None, force=False):
-    return verbs.make(project, verbs.Wish(dataset, targets, list(settings), force))
-
-
-def ran(project, dataset="set"):
-    """The steps of the run log, in order."""
-    events = map(json.loads, (project.build / dataset / "log.jsonl").read_text().splitlines())
-    return ["/".join(filter(None, (e["stage"], e["photo"]))) for e in events if e["event"] == "done"]
-
-
-def new_runs(project, **options):
-    before = len(ran(project))
-    assert make(project, **options) == 0
-    return sorted(ran(project)[before:])
+COST = r" +\d+\.\d s +\d+\.\d s processor +\d+ MB peak   {} on 1 core   \d{{4}}-\d\d-\d\d \d\d:\d\d UTC$"
+WRITES = "json.dumps(params.scale)"  # what the table is, in its source
 
 
 def total(project):
     return (project.build / "set" / "total" / "total.txt").read_text()
+
+
+def table(project):
+    return (project.build / "set" / "table" / "table.json").read_text()
+
+
+def new_runs(project, *settings, **more):
+    """The steps that the next run does."""
+    before = len(done(project))
+    assert make(project, *settings, **more) == 0
+    return sorted(done(project)[before:])
+
+
+def edit(project, file, old, new):
+    """Replace a text in a file of the project, which must be there; the text before."""
+    text = (project.root / file).read_text()
+    assert old in text
+    write(project.root / file, text.replace(old, new, 1))
+    return text
 
 
 @pytest.fixture(scope="session")
@@ -62,12 +65,10 @@ def test_all_results_stand_under_the_datasets_name_read_only_and_their_costs_in_
     assert json.loads((home / "upper" / "sizes.json").read_text()) == {"a": {"size": 5}, "b": {"size": 4}}
     assert sorted(p.name for p in (home / "upper").iterdir()) == ["a.json", "a.txt", "b.json", "b.txt", "sizes.json"]
     assert not list((project.build / "store" / "tmp").iterdir()), "something is left behind"
-    files = [p for folder in ("trees", "views") for p in (project.build / "store" / folder).rglob("*") if p.is_file()]
+    files = [p for p in (project.build / "store" / "trees").rglob("*") if p.is_file()]
     assert files and not any(p.stat().st_mode & 0o222 for p in files)
     event = json.loads((home / "log.jsonl").read_text().splitlines()[0])
-    assert (
-        event["seconds"] > 0 and event["memory_mb"] > 1 and event["threads"] == 1 and event["key"] and event["started"]
-    )
+    assert event["seconds"] > 0 and event["memory_mb"] > 1 and event["threads"] == 1 and event["key"]
     assert new_runs(project) == [] and "nothing to do" in capsys.readouterr().out
 
 
@@ -86,23 +87,23 @@ def test_all_results_stand_under_the_datasets_name_read_only_and_their_costs_in_
         ("data/set/a.txt", "Alphabet", "upper/a", "file a.txt: changed", ["count/a", "total", "upper/a"]),
         ("data/set/a.txt", "alphA", "upper/a", "file a.txt: changed", ["upper/a"]),
         ("data/set/c.txt", "Gamma", "count/c", "not made yet", ["count/c", "total", "upper/c"]),
+        ("data/set/a.txt", None, "total", "result of count/a: gone", ["total"]),
     ],
-    ids=["a remark", "a docstring", "source", "a template", "a photo", "the same output", "a new photo"],
+    ids=["a remark", "a docstring", "source", "a template", "a photo", "the same output", "a new photo", "one less"],
 )  # fmt: skip
 def test_a_change_reruns_what_it_reaches(project, file, text, step, reason, runs):
-    write(project.root / file, text)
+    write(project.root / file, text or "")
+    if text is None:
+        (project.root / file).unlink()
     assert reasons(project, step) == ([reason] if reason else [])
     assert new_runs(project) == runs
-
-
-def test_a_photo_that_is_taken_away_vanishes(project):
-    (project.root / "data" / "set" / "a.txt").unlink()
-    assert new_runs(project) == ["total"]
-    assert [p.name for p in (project.build / "set" / "upper").glob("*.txt")] == ["b.txt"]
+    assert {p.stem for p in (project.build / "set" / "upper").glob("*.txt")} == set(
+        toy.read(project.root / "data" / "set").photos
+    )
 
 
 def test_a_parameter_reruns_its_stage_and_the_old_result_is_still_there_and_force_runs_just_what_is_named(project):
-    assert new_runs(project, settings=["table.scale=3"]) == ["table", "total"] and total(project) == "total: 27"
+    assert new_runs(project, "table.scale=3") == ["table", "total"] and total(project) == "total: 27"
     assert new_runs(project) == [] and total(project) == "total: 18"
     assert new_runs(project, targets=["upper"], force=True) == ["upper/a", "upper/b"]
 
@@ -113,8 +114,19 @@ def test_another_directory_gives_the_same_bytes_and_datasets_share_what_is_the_s
     trees = [{p.name for p in (each.build / "store" / "trees").iterdir()} for each in (project, other)]
     assert trees[0] == trees[1]
     shutil.copytree(project.root / "data" / "set", project.root / "data" / "again")
-    assert set(state(project, "again").values()) == {"current"} and make(project, "again") == 0
+    assert set(state(project, "again").values()) == {"current"} and verbs.make(project, verbs.Wish("again")) == 0
     assert (project.build / "again" / "total" / "total.txt").exists()
+
+
+def test_plan_why_and_graph_show_the_same_plan(project, capsys):
+    write(project.root / "data" / "set" / "a.txt", "Alphabet")
+    for show, said in (
+        (verbs.show_plan, "upper      to run  a                        file a.txt: changed"),
+        (verbs.show_why, "upper a: to run\n    file a.txt: changed"),
+    ):
+        assert show(project, verbs.Wish("set")) == 0 and said in capsys.readouterr().out
+    for mermaid, said in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
+        assert verbs.show_graph(project, mermaid) == 0 and said in capsys.readouterr().out
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -136,42 +148,28 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
         assert words in str(caught.value) and "pipeline.yaml" not in str(caught.value)
 
 
-@pytest.mark.parametrize("setting", ["upper.times=0", "upper.times=two", "table.scale=1.5"])
-def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave_it(project, capsys, setting):
-    before = ran(project)
+@pytest.mark.parametrize("param, value", [("times", "0"), ("times", "two"), ("sleep", "[1]")])
+def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave_it(project, capsys, param, value):
+    before = done(project)
     for verb in (verbs.make, verbs.show_plan, verbs.show_why):
-        with own_modules("stages", "toylib"):
-            assert verb(project, verbs.Wish("set", settings=[setting])) == 1
+        assert verb(project, verbs.Wish("set", settings=[f"upper.{param}={value}"])) == 1
         said = capsys.readouterr()
-        assert f": SET {setting}: " in said.err
-        assert "pipeline.yaml" not in said.err and not said.out
-    assert ran(project) == before
-    stage, param, value = re.fullmatch(r"(\w+)\.(\w+)=(.*)", setting).groups()
-    opened = {"upper": "upper: {", "table": "table: {"}[stage]
-    text = f"{opened}params: {{{param}: {value}}}{', ' if stage == 'upper' else ''}"
-    write(project.root / "pipeline.yaml", toy.PIPELINE.replace(opened, text))
-    with own_modules("stages", "toylib"):
-        assert verbs.show_plan(project, verbs.Wish("set")) == 1
+        assert f": SET upper.{param}={value}: " in said.err and "pipeline.yaml" not in said.err and not said.out
+    edit(project, "pipeline.yaml", "upper: {", f"upper: {{params: {{{param}: {value}}}, ")
+    assert verbs.show_plan(project, verbs.Wish("set")) == 1 and done(project) == before
     said = capsys.readouterr().err
-    assert "pipeline.yaml: " in said and f"stages.{stage}.params.{param}: " in said and "SET" not in said
-
-
-@pytest.mark.parametrize("name", ["studies", "bench", "store"])
-def test_reserved_names(project, name):
-    shutil.copytree(project.root / "data" / "set", project.root / "data" / name)
-    with pytest.raises(InputError, match=name):
-        make(project, name)
+    assert "pipeline.yaml: " in said and f"stages.upper.params.{param}: " in said and "SET" not in said
 
 
 def test_a_dataset_that_is_not_there_and_two_folders_of_one_name_are_refused(project, tmp_path):
     write(project.root / "data" / "set" / "dataset.yaml", "")
     with pytest.raises(InputError, match="no dataset 'sett'") as caught:
-        make(project, "sett")
+        verbs.make(project, verbs.Wish("sett"))
     assert "did you mean 'set'" in caught.value.cure
     shutil.copytree(project.root / "data" / "set", tmp_path / "else" / "set")
     with pytest.raises(InputError, match="two datasets are called 'set'"):
-        make(project, str(tmp_path / "else" / "set"))
-    assert make(project, str(project.root / "data" / "set")) == 0  # the same one by its path
+        verbs.make(project, verbs.Wish(str(tmp_path / "else" / "set")))
+    assert verbs.make(project, verbs.Wish(str(project.root / "data" / "set"))) == 0  # the same one by its path
 
 
 # ── what fails ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -183,7 +181,7 @@ def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
     assert make(project) == 1
     said = capsys.readouterr().err
     assert "upper/a: a.txt: line 1: a bad word" in said and "use a better one" in said and "Traceback" not in said
-    assert ran(project)[-2:] == ["upper/c", "count/c"] and state(project)["count/c"] == "current"
+    assert done(project)[-2:] == ["upper/c", "count/c"] and state(project)["count/c"] == "current"
     assert not (project.build / "set" / "upper" / "a.txt").exists(), "a result that is not current is shown"
     write(project.root / "data" / "set" / "a.txt", "good")
     assert new_runs(project) == ["count/a", "total", "upper/a"]
@@ -192,7 +190,7 @@ def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
 @pytest.mark.parametrize(
     "file, old, new, words, traced",
     [
-        ("stages/table.py", "json.dumps(params.scale)", "json.dumps(1 / 0)", "table: ZeroDivisionError", ["table.txt"]),
+        ("stages/table.py", WRITES, "json.dumps(1 / 0)", "table: ZeroDivisionError", ["table.txt"]),
         ("stages/table.py", "    (out", "    import os; os.abort()\n    (out", "process died", []),
         ("pipeline.yaml", "[total.txt]", "[total.txt, more.txt]", "more.txt", ["total.txt"]),
     ],
@@ -201,122 +199,143 @@ def test_a_failing_step_holds_up_only_what_needs_it(project, capsys):
 def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     project, capsys, file, old, new, words, traced
 ):
-    text = (project.root / file).read_text()
-    write(project.root / file, text.replace(old, new))
+    text = edit(project, file, old, new)
     assert make(project) == 1
     said = capsys.readouterr().err
     assert words in said and "Traceback" not in said
     assert [path.name for path in (project.build / "set").glob("errors/*")] == traced
+    verbs.show_logs(project, verbs.Wish("set"), None)
+    assert not traced or re.search(rf"failed by a defect of the program: .*errors/{traced[0]}", capsys.readouterr().out)
     write(project.root / file, text)
     assert new_runs(project) == []
+
+
+class Unpicklable(Exception):
+    """An error that pickle takes apart and cannot make again."""
+
+    def __init__(self, one, other):
+        super().__init__(f"{one} and {other}")
+
+
+class Holding(Exception):
+    """An error that pickle cannot take apart."""
+
+
+def fail(how):
+    error = {"made again": Unpicklable("salt", "pepper"), "taken apart": Holding("a lock")}[how]
+    error.lock = threading.Lock() if how == "taken apart" else None
+    raise error
+
+
+@pytest.mark.parametrize(
+    "how, words", [("made again", "Unpicklable: salt and pepper"), ("taken apart", "Holding: a lock")]
+)
+def test_an_error_of_a_child_that_cannot_be_pickled_says_its_type_and_text_and_the_child_lives(how, words):
+    pools = Pools(1)
+    try:
+        with pytest.raises(RuntimeError, match=words):
+            pools.submit(1, 1, fail, how).result(30)
+        (child,) = pools.children
+        assert pools.submit(1, 1, abs, -1).result(30) == 1 and pools.children == [child]
+    finally:
+        pools.close(kill=True)
 
 
 def test_a_name_as_long_as_the_file_system_allows_is_as_good_as_a_short_one(tmp_path, capsys):
     long = ["k" * 239 + end for end in "ab"]
     project = make_project(tmp_path, **{long[0]: "Alpha", long[1]: "1/0"})
-    fails = toy.COUNT.replace("    (out", "    assert not inputs.photo.endswith('b')\n    (out")
-    write(project.root / "stages" / "count.py", fails.replace("import json", "import json\nassert True", 1))
+    text = edit(project, "stages/count.py", "    (out", "    assert not inputs.photo.endswith('b')\n    (out")
     assert make(project) == 1
     assert (project.build / "set" / "upper" / f"{long[0]}.txt").read_text() == "ALPHA"
     assert state(project)[f"count/{long[0]}"] == "current" and "AssertionError" in capsys.readouterr().err
     assert len(list((project.build / "set" / "errors").iterdir())) == 1
-    write(project.root / "stages" / "count.py", toy.COUNT)
+    write(project.root / "stages" / "count.py", text)
     assert make(project) == 0 and not (project.build / "set" / "errors").exists()
     assert not [p for p in (project.build / "store").rglob("*") if "kkk" in p.name and not p.name.startswith("k")]
 
 
-def test_warnings_are_said_once_and_kept(project, capsys):
+# ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_no_name_of_the_machine(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "odd")
-    assert make(project) == 0
-    assert capsys.readouterr().err.count("a is odd") == 1
-    assert verbs.show_status(project, verbs.Wish("set")) == 0
-    assert "a is odd" in capsys.readouterr().out
+    edit(project, "stages/table.py", "import json", "import json, filelock")
 
+    def logs(*stages, photo=None, settings=()):
+        assert verbs.show_logs(project, verbs.Wish("set", list(stages) or None, list(settings)), photo) == 0
+        return capsys.readouterr().out
 
-# ── cleaning ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+    assert make(project) == 0 and capsys.readouterr().err.count("a is odd") == 1
+    assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out
+    said = logs()
+    for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("total", "2 threads")):
+        assert re.search("^" + step + COST.format(threads), said, re.M), said
+    assert re.search(r"Python 3\.\d+\.\d+, \w+ \w+, msgspec \d", said) and re.search(r"filelock \d", said)
+    assert "warning: a is odd" in said
+    texts = [path.read_text() for path in (project.build / "store" / "logs").iterdir()]
+    assert not any(word in text for text in texts for word in (f'"{os.uname().nodename}"', str(project.root)))
+    steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
+    assert steps == ["upper/a", "upper/b"]
+    said = logs(photo="b")
+    assert "upper/b" in said and "count/b" in said and "upper/a" not in said and "total" not in said
+    with pytest.raises(InputError, match=r"(?s)no step is of 'aa'") as caught:
+        logs(photo="aa")
+    assert caught.value.key == "PHOTO"
+    said = logs("table", settings=["table.scale=3"])
+    assert re.search(r"^table +to run: parameter scale: 2 \(the default\) -> 3$", said, re.M)
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):
-    make(project, settings=["table.scale=3"])
-    make(project)
+    assert make(project, "table.scale=3") == 0 and make(project) == 0
     before = {stage: files_of(project.build / "set" / stage) for stage in ("upper", "count", "table", "total")}
     for key in (project.build / "store" / "keys").iterdir():
         os.utime(key, (time.time() - 3 * 86400 - 60,) * 2)
     capsys.readouterr()
     assert verbs.collect(project, lambda: False) == 0
     said = capsys.readouterr().out
-    assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search(
-        r"^total +1 result ", said, re.M
-    )
+    assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search("^total +1 result ", said, re.M)
     assert "nothing was deleted" in said and state(project, settings=("table.scale=3",))["table"] == "current"
     assert verbs.collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out
     assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
-    assert (
-        set(state(project).values()) == {"current"} and state(project, settings=("table.scale=3",))["table"] == "to run"
-    )
+    assert set(state(project).values()) == {"current"}
+    assert state(project, settings=("table.scale=3",))["table"] == "to run"
     assert verbs.collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
-
-
-def test_clean_takes_a_dataset_and_then_gc_its_results(project):
-    assert verbs.clean(project, "set") == 0
-    assert not (project.build / "set").exists() and set(state(project).values()) == {"current"}
+    assert verbs.clean(project, "set") == 0 and set(state(project).values()) == {"current"}
     collect(project)
     assert "current" not in state(project).values()
-
-
-def test_a_folder_in_place_of_a_keys_record_is_a_result_that_is_gone(project):
-    keys = project.build / "store" / "keys"
-    path = next(path for path in keys.iterdir() if json.loads(path.read_text())["record"]["stage"] == "total")
-    path.unlink()
-    path.mkdir()
-    assert new_runs(project) == ["total"] and path.is_file()
 
 
 # ── processes ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def heed_interrupts():
-    """A shell hands SIGINT down as ignored to what it runs in the background, this test perhaps."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def background(project, *settings):
-    command = [sys.executable, toy.__file__, str(project.root), "set", *settings]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    environment = {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    return subprocess.Popen(command, env=environment, preexec_fn=heed_interrupts, **streams)
-
-
-def wait_for_sleepers(project, seconds=20):
-    """Until a step of `upper` has written its files, and waits."""
-    end = time.monotonic() + seconds
-    while not list((project.build / "store" / "tmp").glob("run-*/upper-*/a.txt")):
-        assert time.monotonic() < end, "it never came to that"
-        time.sleep(0.02)
+def sleeping(project):
+    """Whether a step of `upper` has written its files, and waits."""
+    return list((project.build / "store" / "tmp").glob("run-*/upper-*/a.txt"))
 
 
 def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsys):
     go = project.root / "go"
     toy.wait_for(project, go)
-    first = background(project)
-    wait_for_sleepers(project)
+    first = start(project)
+    assert wait_until(lambda: sleeping(project))
     verbs.show_status(project, verbs.Wish("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
     with pytest.raises(InputError, match="a run is going on"):
         collect(project)
-    second = background(project)
+    second = start(project)
     waits = any("another run is making it" in line for line in second.stdout)
     go.touch()
     said = second.communicate(timeout=60)[0]
-    assert waits
-    assert first.wait(timeout=60) == 0 and second.returncode == 0, said
+    assert waits and first.wait(timeout=60) == 0 and second.returncode == 0, said
     first.stdout.close()
-    assert sorted(ran(project)).count("upper/a") == 2  # once in the fixture, once for both
+    assert sorted(done(project)).count("upper/a") == 2  # once in the fixture, once for both
 
 
 def test_a_run_that_is_interrupted_stops_its_workers(project):
-    process = background(project, "upper.sleep=30")
-    wait_for_sleepers(project)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have handed it down as ignored
+    process = start(project, "upper.sleep=30")
+    signal.signal(signal.SIGINT, before)
+    assert wait_until(lambda: sleeping(project))
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=20)[0]
     assert process.returncode == 130 and "stopped" in said and "Traceback" not in said
@@ -328,48 +347,29 @@ def test_pools_that_are_closed_have_no_threads_left(kill):
     before = set(threading.enumerate())
     pools = Pools()
     futures = [pools.submit(1, 1, time.sleep, 60 if kill else 0) for _ in range(2)]
-    if not kill:
-        for future in futures:
-            future.result()
-            pools.done(future)
+    for future in [] if kill else futures:
+        future.result()
     pools.close(kill)
     assert set(threading.enumerate()) == before  # one that closes while Python ends is a traceback after "stopped"
 
 
-def test_plan_why_and_graph_show_the_same_plan(project, capsys):
-    write(project.root / "data" / "set" / "a.txt", "Alphabet")
-    verbs.show_plan(project, verbs.Wish("set"))
-    assert "upper      to run  a                        file a.txt: changed" in capsys.readouterr().out
-    verbs.show_why(project, verbs.Wish("set"))
-    assert "upper a: to run\n    file a.txt: changed" in capsys.readouterr().out
-    verbs.show_graph(project, False)
-    assert "total      whole set  <- count, table" in capsys.readouterr().out
-    verbs.show_graph(project, True)
-    assert "upper --> count" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name, value", [("OMP_NUM_THREADS", "3"), ("PYTHONHASHSEED", "0")])
-def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machine(tmp_path, name, value):
-    project = make_project(tmp_path)
-    text = toy.TABLE.replace("json.dumps(params.scale)", f"__import__('os').environ['{name}']")
-    write(tmp_path / "stages" / "table.py", text)
-    write(tmp_path / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {threads: 3}"))
-    assert make(project, targets=["table"]) == 0
-    assert (project.build / "set" / "table" / "table.json").read_text() == value
+def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machine(project):
+    names = ("OMP_NUM_THREADS", "PYTHONHASHSEED")
+    edit(project, "stages/table.py", WRITES, f"str([__import__('os').environ[name] for name in {names}])")
+    edit(project, "pipeline.yaml", "table: {}", "table: {threads: 3}")
+    assert make(project, targets=["table"]) == 0 and table(project) == "['3', '0']"
 
 
 @pytest.mark.parametrize("cores, expected", [("all", 2), ("1", 1), ("64", 2)])
 def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(
-    tmp_path, monkeypatch, cores, expected
+    project, monkeypatch, cores, expected
 ):
-    monkeypatch.setattr("factorlib.runner.executors.machine_cores", lambda: 2)
-    project = make_project(tmp_path)
-    many = "len(set(inputs.map(lambda _: (__import__('time').sleep(0.1), __import__('threading').get_ident())[1], range(6))))"
-    write(tmp_path / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", f"str({many})"))
-    write(tmp_path / "pipeline.yaml", toy.PIPELINE.replace("table: {}", f"table: {{cores: {cores}}}"))
-    assert make(project, targets=["table"]) == 0
-    assert (project.build / "set" / "table" / "table.json").read_text() == str(expected)
-    write(tmp_path / "pipeline.yaml", toy.PIPELINE)
+    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 2)
+    thread = "(__import__('time').sleep(0.1), __import__('threading').get_ident())[1]"
+    edit(project, "stages/table.py", WRITES, f"str(len(set(inputs.map(lambda _: {thread}, range(6)))))")
+    edit(project, "pipeline.yaml", "table: {}", f"table: {{cores: {cores}}}")
+    assert make(project, targets=["table"]) == 0 and table(project) == str(expected)
+    write(project.root / "pipeline.yaml", toy.PIPELINE)
     assert new_runs(project, targets=["table"]) == []
 
 
@@ -380,7 +380,7 @@ def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success
         note.write_text("half")
         raise RuntimeError("killed")
     (out /"""
-    write(project.root / "stages" / "table.py", toy.TABLE.replace("(out /", note, 1))
+    edit(project, "stages/table.py", "(out /", note)
     assert make(project) != 0 and len(list((project.build / "store" / "unfinished").iterdir())) == 1
     assert make(project) == 0 and not list((project.build / "store" / "unfinished").iterdir())
 
@@ -391,41 +391,34 @@ def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success
 @pytest.fixture
 def giving(project, tmp_path):
     """The toy whose table reads start/seed.txt where it is given one; everything current without."""
-    pipeline = toy.PIPELINE.replace("table: {}", "table: {given: {start: [seed.txt]}}")
     seed = '(inputs["start"] / "seed.txt").read_text() if "start" in inputs.folders else params.scale'
-    write(project.root / "pipeline.yaml", pipeline)
-    write(project.root / "stages" / "table.py", toy.TABLE.replace("json.dumps(params.scale)", f"str({seed})"))
+    edit(project, "pipeline.yaml", "table: {}", "table: {given: {start: [seed.txt]}}")
+    edit(project, "stages/table.py", WRITES, f"str({seed})")
     write(tmp_path / "one" / "seed.txt", "5")
     assert make(project) == 0
     return project
 
 
 def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_path):
-    named = lambda folder: [f"table.start={tmp_path / folder}"]  # noqa: E731
-    assert new_runs(giving, settings=named("one")) == ["table", "total"]
-    assert total(giving) == "total: 45"
+    one, other = (f"table.start={tmp_path / folder}" for folder in ("one", "other"))
+    assert new_runs(giving, one) == ["table", "total"] and total(giving) == "total: 45"
     shutil.copytree(tmp_path / "one", tmp_path / "other")
     write(tmp_path / "other" / "more.txt", "not read")
-    assert new_runs(giving, settings=named("other")) == []
+    assert new_runs(giving, other) == []
     write(tmp_path / "other" / "seed.txt", "6")
-    assert reasons(giving, "table", settings=named("other")) == ["given file start/seed.txt: changed"]
-    assert new_runs(giving, settings=named("other")) == ["table", "total"]
+    assert reasons(giving, "table", settings=(other,)) == ["given file start/seed.txt: changed"]
+    assert new_runs(giving, other) == ["table", "total"]
     assert new_runs(giving) == [] and total(giving) == "total: 18", "it is off unless named"
     assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
+    edit(giving, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
+    assert make(giving, one) == 1, "what changes while it is read is no result"
 
 
 @pytest.mark.parametrize(
     "folder, words", [("nowhere", "no such folder"), (".", "no readable 'seed.txt'"), ("3", "no such folder")]
 )
 def test_a_given_folder_that_is_not_there_is_refused_before_anything_runs(giving, tmp_path, folder, words):
-    named = folder if folder == "3" else tmp_path / folder
     with pytest.raises(InputError) as caught:
-        make(giving, settings=[f"table.start={named}"])
+        make(giving, f"table.start={folder if folder == '3' else tmp_path / folder}")
     said = str(caught.value)
     assert words in said and "table.start" in said and "name a folder with seed.txt" in said
-
-
-def test_a_given_file_that_changes_while_it_is_read_is_no_result(giving, tmp_path):
-    text = (giving.root / "stages" / "table.py").read_text().rstrip("\n")
-    write(giving.root / "stages" / "table.py", text + '\n    (inputs["start"] / "seed.txt").write_text("9")\n')
-    assert make(giving, settings=[f"table.start={tmp_path / 'one'}"]) == 1

@@ -181,7 +181,7 @@ def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
 METERED = """
 import json, sys
 from pathlib import Path
-from factorlib.runner.cost import Meter
+from factorlib.runner.worker import Meter
 from factorlib.stage import Inputs
 from stages import masks
 
