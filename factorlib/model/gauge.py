@@ -1,4 +1,4 @@
-"""The gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
+"""Which materials and lights are linked, and the gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
 
 Where surfaces light each other (interreflection), what they send is known and no factor is free: such a component stays as it is.
 
@@ -14,16 +14,17 @@ Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.model.blocks import Block
-from factorlib.model.components import connected_components
 from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 
 BRIGHTEST = 0.9
 LEAST_ENERGY = 1e-3  # of a light's brightest channel: a light without any blue has no say in how blue the others are
@@ -34,6 +35,34 @@ RULE = (
 DETERMINED = (
     "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
 )
+
+
+class Component(NamedTuple):
+    """Materials (by number) and illuminations (by name) that are linked, both sorted; either may be empty."""
+
+    materials: tuple[int, ...]
+    illuminations: tuple[str, ...]
+
+
+def connected_components(blocks: Sequence[Block], materials: int) -> list[Component]:
+    """All components of materials 0 … `materials`−1 and the blocks, sorted.
+
+    Two materials are linked if one light shows both.  In each component one factor per channel is not determined.
+    """
+    shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
+    first, second = np.array(shown, dtype=int).reshape(-1, 2).T
+    size = materials + len(blocks)
+    _, label = components_of_graph(
+        coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False
+    )
+    members = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+    return sorted(
+        Component(
+            tuple(n for n in nodes if n < materials),
+            tuple(sorted(blocks[n - materials].name for n in nodes if n >= materials)),
+        )
+        for nodes in members
+    )
 
 
 def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:

@@ -1,23 +1,29 @@
-"""Standard errors of materials, and of the light in every direction."""
+"""Standard errors of materials, and of the light in every direction: of lights of few lobes, then of a fit in natural lights."""
 
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.diagnose.coverage import LARGEST, relative_standard_errors
-from factorlib.diagnose.uncertainty import clustered_equations, standard_errors
+from factorlib.diagnose.identifiability import tinted_alike
+from factorlib.diagnose.uncertainty import (
+    LARGEST,
+    MODEL_ERROR,
+    Posterior,
+    in_gauge_of,
+    relative_standard_errors,
+    standard_errors,
+)
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes.arrow import ArrowSystem
-from factorlib.solve.few_lobes.descent import Descent, descend, evaluate
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
+from factorlib.solve.few_lobes.equations import normal_equations
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from tests.solve.made import PRIOR, natural
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
 FEW_LOBES = FewLobes(lobes=16, insert=8, rounds=4, specular="on")
@@ -37,7 +43,7 @@ def noisy(seed: int):
         for light, data in zip(lights, blocks, strict=True)
     ]
     problem = JointProblem(blocks, OPERATOR, LOSS)
-    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), Descent(25, 1e-7)).point
+    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), 25, 1e-7).point
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +53,13 @@ def solved():
 
 def test_scores_of_clusters_sum_to_the_gradient(solved):
     problem, point = solved
-    whole = clustered_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0))
+    first = Point(MATERIALS, point.lights[:1])
+    whole = normal_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0), clustered=True)
     np.testing.assert_allclose(
         whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8
     )
     assert len(whole.scores) > 20
-    (reduced,) = ArrowSystem([whole], 21).reduced_scores(Point(MATERIALS, point.lights[:1]))
+    _, (reduced,) = Iterate(first, [whole]).information()
     assert reduced.shape == (len(whole.scores), 21)
 
 
@@ -114,3 +121,129 @@ def test_directions_that_no_observation_mirrors_are_known_less(solved):
     above, below = errors[directions[..., 1] < -0.6], errors[directions[..., 1] > 0.8]
     assert (errors > 0).all() and (errors <= LARGEST).all()
     assert np.median(below) > 5 * np.median(above)
+
+
+# ── a joint solve's: they cover the truth, and nothing is known for sure that is not ─────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return natural()
+
+
+def with_materials(found, **parts):
+    materials = msgspec.structs.replace(found.point.materials, **parts)
+    return msgspec.structs.replace(found, point=Point(materials, found.point.lights))
+
+
+def test_a_nil_reflectance_is_not_known_for_sure(fit):
+    problem, _, found = fit
+    there = with_materials(found, diffuse=np.where([[False], [False], [True]], 0.0, found.point.materials.diffuse))
+    errors, at_nil = (Posterior(problem, one, PRIOR).standard_errors().materials for one in (found, there))
+    assert (at_nil.diffuse[2] > 0.3 * errors.diffuse[2]).all()
+    assert (errors.vector() > 0).all()
+
+
+def test_no_observation_mends_what_the_model_has_wrong(fit):
+    """k_s and roughness are never known better than the model is right, as far as residuals say that it is wrong."""
+    problem, _, found = fit
+    errors, materials = Posterior(problem, found, PRIOR).standard_errors(), found.point.materials
+    wrong = min(1.0, errors.deviation) * MODEL_ERROR
+    assert (errors.materials.roughness >= wrong[6]).all() and (
+        errors.materials.specular >= wrong[3:6] * materials.specular
+    ).all()
+    assert (errors.materials.diffuse >= wrong[:3] * materials.diffuse).all() and (MODEL_ERROR > 0).all()
+
+
+def test_materials_lie_within_a_few_standard_errors(fit):
+    problem, _, found = fit
+    errors, m = Posterior(problem, found, PRIOR).standard_errors().materials, found.point.materials
+    factor = factor_between(m, MATERIALS)
+    off = np.column_stack(
+        [
+            m.diffuse * factor - MATERIALS.diffuse,
+            m.specular * factor - MATERIALS.specular,
+            m.roughness - MATERIALS.roughness,
+        ]
+    )
+    scale = np.column_stack([errors.diffuse * factor, errors.specular * factor, errors.roughness])
+    assert np.mean(np.abs(off) < scale) > 0.5 and np.mean(np.abs(off) < 3 * scale) > 0.95, np.round(off / scale, 1)
+
+
+def test_lights_lie_within_their_standard_errors(fit):
+    """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
+    problem, true, found = fit
+    posterior, within = Posterior(problem, found, PRIOR), []
+    for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
+        cells = 3 * len(light)
+        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[:cells]).reshape(3, -1)
+        off = light.log_radiance - true_light.log_radiance
+        within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)
+    assert 0.5 < np.mean(within) < 0.9
+    maps = posterior.relative_standard_errors()
+    assert set(maps) == {"room0", "room1", "room2"}
+    assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())
+
+
+def test_fewer_observations_tell_less(fit):
+    problem, _, found = fit
+    errors, of_few = (Posterior(p, found, PRIOR).standard_errors().materials for p in (problem, problem.sampled(60, 0)))
+    assert np.mean(of_few.vector() > errors.vector()) > 0.8
+    maps, maps_of_few = (
+        Posterior(p, found, PRIOR).relative_standard_errors()["room0"] for p in (problem, problem.sampled(60, 0))
+    )
+    assert maps_of_few.mean() > maps.mean()
+
+
+def test_cells_that_have_split_have_maps_too(fit):
+    problem, _, found = fit
+    lights = [light.split(light.weight[:, 1] > np.quantile(light.weight[:, 1], 0.95)) for light in found.point.lights]
+    split = msgspec.structs.replace(found, point=Point(found.point.materials, lights))
+    one, other = (Posterior(problem, fit, PRIOR).relative_standard_errors()["room0"] for fit in (found, split))
+    assert other.shape == one.shape and np.isfinite(other).all() and 0.7 < other.mean() / one.mean() < 1.5
+
+
+def test_errors_go_with_the_gauge(fit):
+    problem, _, found = fit
+    errors, m = Posterior(problem, found, PRIOR).standard_errors(), found.point.materials
+    factor = np.array([2.0, 1.0, 0.5])
+    there = in_gauge_of(errors, m, Materials(m.diffuse * factor, m.specular * factor, m.roughness)).materials
+    np.testing.assert_allclose(there.diffuse, errors.materials.diffuse * factor)
+    np.testing.assert_allclose(there.specular, errors.materials.specular * factor)
+    np.testing.assert_array_equal(there.roughness, errors.materials.roughness)
+
+
+# ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("tints", "bounced", "said"),
+    [
+        ([[1, 3, 3], [1, 4, 3]], True, True),  # red is what surfaces are then
+        ([[1, 3, 3], [1, 4, 3]], False, False),  # the rule of the gauge makes lights grey
+        ([[1, 3, 3], [4, 1, 1]], True, False),  # one light is blue-green, another red: not alike
+        ([[1, 1.3, 1.2], [1, 1.2, 1.5]], True, False),  # as natural lights are
+    ],
+)
+def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(tints, bounced, said):
+    rng, operator = np.random.default_rng(0), reflection_operator("closed_form", dtype="float64")
+    grey = [random_light(rng, 3) for _ in tints]
+    grey = [
+        msgspec.structs.replace(light, weight=np.repeat(light.weight.mean(1, keepdims=True), 3, axis=1))
+        for light in grey
+    ]
+    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
+    if bounced:
+        blocks = [msgspec.structs.replace(one, bounced=np.zeros((len(one), 6))) for one in blocks]
+    lights = [
+        msgspec.structs.replace(light, weight=10.0**k * light.weight * tint)
+        for k, (light, tint) in enumerate(zip(grey, tints, strict=True))
+    ]
+    sentences = tinted_alike(("a", "b", "c"), blocks, lights)
+    assert len(sentences) == said
+    if said:
+        assert (
+            "room0, room1" in sentences[0]
+            and "R : G : B = 0.4" in sentences[0]
+            and "solve.interreflection=off" in sentences[0]
+        )

@@ -9,24 +9,26 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
+from factorlib.model.materials import Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
-from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes.problems import MATERIALS
-from tests.model.made import OPERATOR, bounced_photos
+from tests.model.made import OPERATOR, photos_in_a_wrong_light
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])
 def given(request):
-    return bounced_photos(request.param == "toned")
+    return photos_in_a_wrong_light("bounced", request.param == "toned")
 
 
 def test_bounces_add_a_known_radiance(given):
     light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
     data, kd, ks = given.block, MATERIALS.diffuse[given.block.material], MATERIALS.specular[given.block.material]
-    with_, without = (Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.without_bounces()))
+    with_, without = (
+        Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.with_effects(True, False))
+    )
     np.testing.assert_allclose(with_ - without, kd * data.bounced[:, :3] + ks * data.bounced[:, 3:])
     assert JointProblem([data], OPERATOR).with_effects(shadows=False, bounces=True).blocks[0].bounced is None
 
@@ -117,4 +119,4 @@ def test_the_order_of_photos_changes_nothing():
 def test_what_interreflection_determines_the_gauge_leaves(given):
     point = Point(MATERIALS, [given.light])
     np.testing.assert_array_equal(in_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
-    assert (in_gauge(point, [given.block.without_bounces()]).materials.diffuse != MATERIALS.diffuse).any()
+    assert (in_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()

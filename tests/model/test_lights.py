@@ -5,7 +5,7 @@ import pytest
 
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light, even_cells, tangents
+from factorlib.model.lights import Light, even_cells
 from factorlib.solve.solve import SMALLEST, SPLIT, brightest, on_cells
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
@@ -89,14 +89,6 @@ def test_small_cells_stand_where_a_large_one_stood_with_its_radiance():
     np.testing.assert_allclose(split.sharpness[kept:], 4 * light.sharpness[parent], rtol=0.01)
     np.testing.assert_allclose(split.log_radiance[:, kept:], light.log_radiance[:, parent], rtol=1e-12)
     np.testing.assert_array_equal(split.axis, light.split(which).axis)
-
-
-def test_tangents_are_perpendicular_and_unit():
-    first, second = tangents(DIRECTIONS)
-    frame = np.stack([DIRECTIONS, first, second], axis=1)
-    np.testing.assert_allclose(
-        frame @ frame.transpose(0, 2, 1), np.tile(np.eye(3), (len(DIRECTIONS), 1, 1)), atol=1e-12
-    )
 
 
 def test_the_brightest_split_but_none_that_is_too_small():

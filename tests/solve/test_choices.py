@@ -16,10 +16,11 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve.choices import CURVED_GAIN, sample_of
 from factorlib.solve.evidence import AGAINST, FOR
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, from_nothing, solve
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_nothing
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
-from tests.model.test_shadowing import bowls, rough_light
+from tests.model.made import bowls, rough_light
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)
@@ -122,7 +123,7 @@ def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
 def test_off_is_the_solve_of_the_same_observations_without_codes(lit):
     quick = msgspec.structs.replace(QUICK, cells=30, observations=100, self_shadowing="on", tone="off")
     one = solved(lit, quick, interreflection="off")
-    other = solved([room.without_bounces() for room in lit], quick)
+    other = solved([room.with_effects(True, False) for room in lit], quick)
     assert not one.interreflection.kept and not other.interreflection.kept
     np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
 
@@ -301,9 +302,9 @@ def test_models_are_compared_on_few_observations_of_each_material(curved):
 
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     problem = JointProblem(rooms(), OPERATOR)
-    assert [len(from_nothing(n).points(problem, 30)) for n in (3, 40)] == [1, 1]
+    assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
     only = JointProblem([block.take(block.material < 2) for block in problem.blocks], OPERATOR)
-    points = from_nothing(2).points(only, 30)
+    points = from_nothing(2)(only, 30)
     assert len({float(p.materials.roughness[0]) for p in points}) == 3 and all(
         len(p.lights[0]) == len(even_cells(30)) for p in points
     )

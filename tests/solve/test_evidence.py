@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.solve.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import photographed

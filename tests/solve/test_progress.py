@@ -1,8 +1,7 @@
 """How far a solve is: it never goes back, and says all only at the end."""
 
-from factorlib.solve.history import Event
+from factorlib.solve.history import PHASES, Event, of_parts
 from factorlib.solve.options import Choices
-from factorlib.solve.progress import PHASES, of_parts
 
 
 def test_progress_never_goes_back_and_is_whole_only_at_the_end():

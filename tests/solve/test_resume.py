@@ -12,7 +12,8 @@ from factorlib.solve import solve as solving
 from factorlib.solve.fit import Schedule
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
-from factorlib.solve.solve import Run, from_nothing, solve
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_nothing
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.solve.made import OPERATOR, PRIOR
@@ -43,7 +44,7 @@ def short():
         for name, schedule in (
             ("MATERIALS", Schedule(2, (2,))),
             ("AFTER_SPLITTING", Schedule(1, (2,))),
-            ("LIGHTS", Schedule(together=(0, 2))),
+            ("LIGHTS", Schedule(together=(0, 2), given=True)),
         ):
             patch.setattr(solving, name, schedule)
         yield

@@ -14,8 +14,8 @@ from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, from_nothing, solve
-from factorlib.solve.warm import from_earlier, known_point, with_decided
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_earlier, from_nothing, known_point, with_decided
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
@@ -61,9 +61,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
 
 
 def start_from(earlier, blocks, names=NAMES):
-    start = from_earlier(earlier, names)
-    (point,) = start.points(JointProblem(blocks, OPERATOR), CELLS)
-    assert start.earlier
+    (point,) = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)
     return point.materials, point.lights
 
 
@@ -184,7 +182,7 @@ def test_what_nothing_known_leads_to_starts_as_from_nothing(known):
         earlier = msgspec.structs.replace(earlier, table=MaterialTable({}))
     materials, found = start_from(earlier, blocks)
     problem = JointProblem(blocks, OPERATOR)
-    (nothing,) = from_nothing(3).points(problem, CELLS)
+    (nothing,) = from_nothing(3)(problem, CELLS)
     np.testing.assert_array_equal(materials.rows()[2], nothing.materials.rows()[2])
     np.testing.assert_allclose(found[1].weight, nothing.lights[1].weight)
     if not known:

@@ -11,8 +11,7 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes, even_cells
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.reflected import NODES, Reflections, lagrange
-from factorlib.model.responses import diffuse_response, specular_response
+from factorlib.model.responses import NODES, Reflections, diffuse_response, lagrange, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
