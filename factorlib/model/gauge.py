@@ -18,12 +18,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.model.blocks import Block
-from factorlib.model.lights import Light
 from factorlib.model.materials import Materials, Point
 
 BRIGHTEST = 0.9
@@ -75,7 +73,9 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
         if not own or not is_free(blocks, illuminations):
             continue
         rows = list(members)
-        factor = 1 / _greying([lights[i] for i in own])  # multiplies reflectances
+        sums = np.array([lights[i].energy.sum(0) for i in own])
+        level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
+        factor = 1 / np.exp((level.mean(1, keepdims=True) - level).mean(0))  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
         for i in own:
@@ -86,9 +86,3 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
 def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
     """Whether the component of these illuminations has a free factor."""
     return all(block.bounced is None for block in blocks if block.name in illuminations)
-
-
-def _greying(lights: Sequence[Light]) -> Float[np.ndarray, "3"]:
-    sums = np.array([light.energy.sum(0) for light in lights])
-    level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
-    return np.exp((level.mean(1, keepdims=True) - level).mean(0))

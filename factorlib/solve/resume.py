@@ -33,11 +33,11 @@ class Journal:
         """What was saved of the part; None where it was not done."""
         return restored(type_, self._parts[part]) if part in self._parts else None
 
-    def keep(self, part: str, value: T) -> T:
+    def keep(self, part: str, value: T, type_: type[T]) -> T:
         """Save the part; returns `value` as `kept` would."""
         self._parts[part] = plain(value)
         self._checkpoint.save(self._parts)
-        return restored(type(value), self._parts[part])
+        return restored(type_, self._parts[part])
 
 
 def plain(value: Any) -> Any:
@@ -59,12 +59,6 @@ def restored(type_: type[T], value: Any) -> T:
     return [restored(*get_args(type_), item) for item in value] if isinstance(value, list) else value
 
 
-class Happened(msgspec.Struct, frozen=True):
-    """The journal keeps the events of a part in this form."""
-
-    events: list[Event]
-
-
 class Parts:
     """What is done part by part: the journal keeps each part with its events, which are reported and remembered."""
 
@@ -74,12 +68,12 @@ class Parts:
     def part(self, name: str, type_: type[T], compute: Callable[[], T]) -> T:
         """The part as the journal has it, or computed now and kept; its events join the history."""
         if (kept := self.journal.kept(name, type_)) is not None:
-            for event in self.journal.kept(f"{name}, events", Happened).events:
+            for event in self.journal.kept(f"{name}, events", list[Event]):
                 self._happened(event)
             return kept
         before, value = len(self.history), compute()
-        self.journal.keep(f"{name}, events", Happened(self.history[before:]))
-        return self.journal.keep(name, value)
+        self.journal.keep(f"{name}, events", self.history[before:], list[Event])
+        return self.journal.keep(name, value, type_)
 
     def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
         """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""

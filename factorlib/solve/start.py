@@ -41,8 +41,14 @@ Start = Callable[
 
 def from_nothing(materials: int) -> Start:
     """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
-    roughness = STARTS if materials <= FEW else STARTS[1:2]
-    return lambda problem, cells: [starting_point(problem.blocks, materials, cells, one) for one in roughness]
+
+    def points(problem: JointProblem, cells: int) -> list[Point]:
+        """One point a roughness, its lights constant."""
+        blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
+        begun = [starting_materials(blocks, materials, roughness=one) for one in roughness]
+        return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
+
+    return points
 
 
 def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
@@ -56,12 +62,6 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
         if getattr(choices, name) == "auto" and getattr(earlier, name):
             choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
     return choices
-
-
-def starting_point(blocks: Sequence[Block], count: int, cells: int, roughness: float) -> Point:
-    """Materials 0 … `count`−1 whose diffuse part explains median radiances, and one constant light of `cells` cells a block."""
-    materials = starting_materials(blocks, count, roughness=roughness)
-    return Point(materials, [constant_light(block, materials, cells) for block in blocks])
 
 
 def starting_materials(

@@ -63,42 +63,36 @@ def test_scores_of_clusters_sum_to_the_gradient(solved):
     assert reduced.shape == (len(whole.scores), 21)
 
 
+def inside(found: Materials, errors: Materials) -> list[bool]:
+    """Whether each true value lies within one standard error, after the factor per channel that is free."""
+    factor = factor_between(found, MATERIALS)
+    true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
+    return (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
+
+
 def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():
-    inside = []
+    within = []
     for seed in range(8):
         problem, point = noisy(seed)
         errors, sigma = standard_errors(problem, point)
-        found = point.materials
-        factor = (MATERIALS.diffuse + MATERIALS.specular).sum(0) / (found.diffuse + found.specular).sum(0)
         assert sigma == pytest.approx(NOISE, rel=0.1)
-        for own, true, error in (
-            (found.diffuse * factor, MATERIALS.diffuse, errors.diffuse * factor),
-            (found.specular * factor, MATERIALS.specular, errors.specular * factor),
-            (found.roughness, MATERIALS.roughness, errors.roughness),
-        ):
-            inside += (np.abs(own - true) < error).ravel().tolist()
-    assert 0.58 < np.mean(inside) < 0.85, np.mean(inside)
+        within += inside(point.materials, errors)
+    assert 0.58 < np.mean(within) < 0.85, np.mean(within)
 
 
 @pytest.mark.long
 def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within_the_errors():
     """No noise: all error is the lobes' own bias.  Of narrow residuals about .46 lie within.  Errors of one scene go together: eight."""
-    inside = []
+    within = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        blocks = [
-            block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)
-        ]
+        lights = [random_light(rng, 120) for _ in range(4)]
+        blocks = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, 16, i) for i, li in enumerate(lights)]
         problem = JointProblem(blocks, OPERATOR)
         solution = few_lobes(problem, 3, Run(FEW_LOBES))
-        found, errors = (
-            solution.point.materials,
-            standard_errors(problem.with_loss(solution.loss), solution.point).materials,
-        )
-        factor = factor_between(found, MATERIALS)
-        true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
-        inside += (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
-    assert 0.58 < np.mean(inside) < 0.82, np.mean(inside)
+        errors = standard_errors(problem.with_loss(solution.loss), solution.point).materials
+        within += inside(solution.point.materials, errors)
+    assert 0.58 < np.mean(within) < 0.82, np.mean(within)
 
 
 def test_noise_twice_as_large_doubles_the_errors(solved):
@@ -128,51 +122,38 @@ def test_directions_that_no_observation_mirrors_are_known_less(solved):
 
 @pytest.fixture(scope="module")
 def fit():
-    return natural()
-
-
-def with_materials(found, **parts):
-    materials = msgspec.structs.replace(found.point.materials, **parts)
-    return msgspec.structs.replace(found, point=Point(materials, found.point.lights))
+    """The problem, the true lights, the fit, and the errors of its materials."""
+    problem, true, found = natural()
+    return problem, true, found, Posterior(problem, found, PRIOR).standard_errors()
 
 
 def test_a_nil_reflectance_is_not_known_for_sure(fit):
-    problem, _, found = fit
-    there = with_materials(found, diffuse=np.where([[False], [False], [True]], 0.0, found.point.materials.diffuse))
-    errors, at_nil = (Posterior(problem, one, PRIOR).standard_errors().materials for one in (found, there))
-    assert (at_nil.diffuse[2] > 0.3 * errors.diffuse[2]).all()
-    assert (errors.vector() > 0).all()
+    problem, _, found, errors = fit
+    nil = np.where([[False], [False], [True]], 0.0, found.point.materials.diffuse)
+    there = Point(msgspec.structs.replace(found.point.materials, diffuse=nil), found.point.lights)
+    at_nil = Posterior(problem, msgspec.structs.replace(found, point=there), PRIOR).standard_errors().materials
+    assert (at_nil.diffuse[2] > 0.3 * errors.materials.diffuse[2]).all()
+    assert (errors.materials.vector() > 0).all()
 
 
 def test_no_observation_mends_what_the_model_has_wrong(fit):
     """k_s and roughness are never known better than the model is right, as far as residuals say that it is wrong."""
-    problem, _, found = fit
-    errors, materials = Posterior(problem, found, PRIOR).standard_errors(), found.point.materials
-    wrong = min(1.0, errors.deviation) * MODEL_ERROR
-    assert (errors.materials.roughness >= wrong[6]).all() and (
-        errors.materials.specular >= wrong[3:6] * materials.specular
-    ).all()
-    assert (errors.materials.diffuse >= wrong[:3] * materials.diffuse).all() and (MODEL_ERROR > 0).all()
+    values = fit[2].point.materials.rows()
+    values[:, 6] = 1
+    wrong = min(1.0, fit[3].deviation) * MODEL_ERROR * values
+    assert (fit[3].materials.rows() >= wrong).all() and (MODEL_ERROR > 0).all()
 
 
 def test_materials_lie_within_a_few_standard_errors(fit):
-    problem, _, found = fit
-    errors, m = Posterior(problem, found, PRIOR).standard_errors().materials, found.point.materials
-    factor = factor_between(m, MATERIALS)
-    off = np.column_stack(
-        [
-            m.diffuse * factor - MATERIALS.diffuse,
-            m.specular * factor - MATERIALS.specular,
-            m.roughness - MATERIALS.roughness,
-        ]
-    )
-    scale = np.column_stack([errors.diffuse * factor, errors.specular * factor, errors.roughness])
-    assert np.mean(np.abs(off) < scale) > 0.5 and np.mean(np.abs(off) < 3 * scale) > 0.95, np.round(off / scale, 1)
+    errors, m = fit[3].materials.rows(), fit[2].point.materials
+    factor = np.concatenate([np.tile(factor_between(m, MATERIALS), 2), [1.0]])
+    off = (m.rows() * factor - MATERIALS.rows()) / (errors * factor)
+    assert np.mean(np.abs(off) < 1) > 0.5 and np.mean(np.abs(off) < 3) > 0.95, np.round(off, 1)
 
 
 def test_lights_lie_within_their_standard_errors(fit):
     """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
-    problem, true, found = fit
+    problem, true, found, _ = fit
     posterior, within = Posterior(problem, found, PRIOR), []
     for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
         cells = 3 * len(light)
@@ -185,28 +166,19 @@ def test_lights_lie_within_their_standard_errors(fit):
     assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())
 
 
-def test_fewer_observations_tell_less(fit):
-    problem, _, found = fit
-    errors, of_few = (Posterior(p, found, PRIOR).standard_errors().materials for p in (problem, problem.sampled(60, 0)))
-    assert np.mean(of_few.vector() > errors.vector()) > 0.8
-    maps, maps_of_few = (
-        Posterior(p, found, PRIOR).relative_standard_errors()["room0"] for p in (problem, problem.sampled(60, 0))
-    )
-    assert maps_of_few.mean() > maps.mean()
-
-
-def test_cells_that_have_split_have_maps_too(fit):
-    problem, _, found = fit
+def test_fewer_observations_tell_less_and_cells_that_have_split_have_maps_too(fit):
+    problem, _, found, errors = fit
+    few = Posterior(problem.sampled(60, 0), found, PRIOR)
+    assert np.mean(few.standard_errors().materials.vector() > errors.materials.vector()) > 0.8
     lights = [light.split(light.weight[:, 1] > np.quantile(light.weight[:, 1], 0.95)) for light in found.point.lights]
-    split = msgspec.structs.replace(found, point=Point(found.point.materials, lights))
-    one, other = (Posterior(problem, fit, PRIOR).relative_standard_errors()["room0"] for fit in (found, split))
+    split = Posterior(problem, found.with_lights(lights), PRIOR)
+    one, of_few, other = (p.relative_standard_errors()["room0"] for p in (Posterior(problem, found, PRIOR), few, split))
+    assert of_few.mean() > one.mean()
     assert other.shape == one.shape and np.isfinite(other).all() and 0.7 < other.mean() / one.mean() < 1.5
 
 
 def test_errors_go_with_the_gauge(fit):
-    problem, _, found = fit
-    errors, m = Posterior(problem, found, PRIOR).standard_errors(), found.point.materials
-    factor = np.array([2.0, 1.0, 0.5])
+    m, errors, factor = fit[2].point.materials, fit[3], np.array([2.0, 1.0, 0.5])
     there = in_gauge_of(errors, m, Materials(m.diffuse * factor, m.specular * factor, m.roughness)).materials
     np.testing.assert_allclose(there.diffuse, errors.materials.diffuse * factor)
     np.testing.assert_allclose(there.specular, errors.materials.specular * factor)
@@ -227,23 +199,15 @@ def test_errors_go_with_the_gauge(fit):
 )
 def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(tints, bounced, said):
     rng, operator = np.random.default_rng(0), reflection_operator("closed_form", dtype="float64")
-    grey = [random_light(rng, 3) for _ in tints]
-    grey = [
-        msgspec.structs.replace(light, weight=np.repeat(light.weight.mean(1, keepdims=True), 3, axis=1))
-        for light in grey
-    ]
+    replaced, lights = msgspec.structs.replace, [random_light(rng, 3) for _ in tints]
+    grey = [replaced(one, weight=np.repeat(one.weight.mean(1, keepdims=True), 3, axis=1)) for one in lights]
     blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
     if bounced:
-        blocks = [msgspec.structs.replace(one, bounced=np.zeros((len(one), 6))) for one in blocks]
-    lights = [
-        msgspec.structs.replace(light, weight=10.0**k * light.weight * tint)
-        for k, (light, tint) in enumerate(zip(grey, tints, strict=True))
-    ]
+        blocks = [replaced(one, bounced=np.zeros((len(one), 6))) for one in blocks]
+    pairs = enumerate(zip(grey, tints, strict=True))
+    lights = [replaced(light, weight=10.0**k * light.weight * tint) for k, (light, tint) in pairs]
     sentences = tinted_alike(("a", "b", "c"), blocks, lights)
     assert len(sentences) == said
     if said:
-        assert (
-            "room0, room1" in sentences[0]
-            and "R : G : B = 0.4" in sentences[0]
-            and "solve.interreflection=off" in sentences[0]
-        )
+        for words in ("room0, room1", "R : G : B = 0.4", "solve.interreflection=off"):
+            assert words in sentences[0]

@@ -83,6 +83,16 @@ def traced(normals, sees, light: Light, material, materials: Materials, count=12
     ) @ incoming * materials.specular[material]
 
 
+def seen_from_the_front(normal, radiance, material, names, photo="room", **more) -> Observations:
+    """What one photo shows of surfaces of those normals."""
+    n, zero = len(normal), np.zeros(len(normal), int)
+    return Observations(
+        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
+        photo=zero, illumination=zero, x=np.arange(n), y=zero, weight=np.ones(n), materials=names, photos=(photo,),
+        illuminations=(photo,), **more,
+    )  # fmt: skip
+
+
 def bowls(name, light, size=16, count=512) -> Observations:
     """A bowl and a ball of each material in one light."""
     normals, directions, parts, sees = sphere_normals(size), fibonacci_sphere(count), [], []
@@ -90,13 +100,9 @@ def bowls(name, light, size=16, count=512) -> Observations:
         for seen in (bowl_sees, lambda n, d: np.ones((len(n), len(d)), bool)):
             parts.append(traced(normals, seen, light, m, MATERIALS))
             sees.append(seen(normals, directions))
-    n = len(normals) * 6
-    return Observations(
-        normal=np.tile(normals, (6, 1)), view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=np.vstack(parts), clipped=np.zeros((n, 3), bool),
-        material=np.repeat([0, 0, 1, 1, 2, 2], len(normals)), photo=np.zeros(n, int), illumination=np.zeros(n, int),
-        x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n), materials=("red", "green", "blue"), photos=(name,), illuminations=(name,),
-        visibility=255 * np.vstack(sees).astype(np.uint8),
-    )  # fmt: skip
+    material, visibility = np.repeat([0, 0, 1, 1, 2, 2], len(normals)), 255 * np.vstack(sees).astype(np.uint8)
+    normal, names = np.tile(normals, (6, 1)), ("red", "green", "blue")
+    return seen_from_the_front(normal, np.vstack(parts), material, names, name, visibility=visibility)
 
 
 def rough_light(seed):

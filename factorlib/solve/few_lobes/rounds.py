@@ -13,6 +13,7 @@ stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import msgspec
@@ -43,6 +44,9 @@ HALVED = (
 )
 
 
+Record = Callable[[int, Iterate], None]  # called with the number of an iteration, and where it led
+
+
 class Fit(msgspec.Struct, frozen=True):
     """The chosen round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
 
@@ -52,18 +56,17 @@ class Fit(msgspec.Struct, frozen=True):
     history: list[Event]
 
 
-class Recorder:
-    """Appends events to `history` and reports them; `problem` gives the held-out loss."""
+def recorder(problem: JointProblem, history: list[Event], run: Run, number: int, phase: str) -> Record:
+    """What appends the events of a round to `history` and reports them, with the held-out loss at a round's end (iteration −1)."""
 
-    def __init__(self, problem: JointProblem, history: list[Event], run: Run):
-        self.problem, self.history, self.run = problem, history, run
+    def record(iteration: int, iterate: Iterate) -> None:
+        """Record an iterate."""
+        held_out = problem.held_out_loss(iterate.point) if iteration < 0 else np.nan
+        loss, lobes = iterate.loss / problem.fitted_values, sum(map(len, iterate.point.lights))
+        history.append(Event(number, phase, iteration, loss, held_out, lobes))
+        run.report(history[-1])
 
-    def record(self, round_: int, phase: str, iteration: int, iterate: Iterate) -> None:
-        """Record an iterate, with its held-out loss if it ends a round (iteration −1)."""
-        held_out = self.problem.held_out_loss(iterate.point) if iteration < 0 else np.nan
-        loss = iterate.loss / self.problem.fitted_values
-        self.history.append(Event(round_, phase, iteration, loss, held_out, sum(map(len, iterate.point.lights))))
-        self.run.report(self.history[-1])
+    return record
 
 
 def chosen_round(problem: JointProblem, materials: int, run: Run) -> Fit:
@@ -97,10 +100,10 @@ def sampled_for(problem: JointProblem, point: Point, options: FewLobes, more: in
 
 def round_after(sample: JointProblem, point: Point, run: Run, history: list[Event], number: int) -> Point:
     """The point after one round; its events join the history."""
-    record, options = Recorder(sample, history, run).record, run.options
-    fitting = sample.with_loss(robust(sample, point))
-    current, report = with_new_lobes(fitting, point, options, number), partial(record, number, "descent")
-    current = descend(fitting, current, options.iterations, options.tolerance, report)
+    fitting, options = sample.with_loss(robust(sample, point)), run.options
+    record = recorder(sample, history, run, number, "descent")
+    current = with_new_lobes(fitting, point, options, number)
+    current = descend(fitting, current, options.iterations, options.tolerance, record)
     materials = materials_of_best_roughness(fitting, current.point)
     if (
         materials.roughness != current.point.materials.roughness
@@ -108,7 +111,7 @@ def round_after(sample: JointProblem, point: Point, run: Run, history: list[Even
         current = min(current, evaluate(fitting, Point(materials, current.point.lights)), key=lambda one: one.loss)
     lights = [pruned(light) for light in current.point.lights]
     current = evaluate(fitting, in_gauge(Point(current.point.materials, lights), fitting.blocks))
-    record(number, "round", -1, current)
+    recorder(sample, history, run, number, "round")(-1, current)
     return current.point
 
 

@@ -21,7 +21,6 @@ it is compared with once another material has lost its specular part since the l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -34,7 +33,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve.evidence import Evidence
 from factorlib.solve.few_lobes.descent import descend, evaluate, fit_weights
 from factorlib.solve.few_lobes.options import Run
-from factorlib.solve.few_lobes.rounds import Fit, Recorder, chosen_round, sampled_for
+from factorlib.solve.few_lobes.rounds import Fit, chosen_round, recorder, sampled_for
 from factorlib.solve.few_lobes.unknowns import blurred, pruned, specular_unknowns
 from factorlib.solve.history import Event, Solution
 
@@ -104,7 +103,7 @@ def polished(problem: JointProblem, fit: Fit, chosen: Specular, run: Run) -> tup
     number, fixed = fit.history[-1].round, specular_unknowns(chosen.lambertian)
     point, history = chosen.point, list(fit.history)
     for of, iterations in phases if many.fitted_values < everything.fitted_values else phases[:1]:
-        record = partial(Recorder(of, history, run).record, number, "polish")
+        record = recorder(of, history, run, number, "polish")
         point = descend(of, evaluate(of, point), iterations, run.options.tolerance, record, fixed).point
     return answer_of(everything, point), history
 

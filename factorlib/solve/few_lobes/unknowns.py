@@ -110,13 +110,6 @@ def specular_unknowns(which: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " 7m"]:
     return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)
 
 
-def taken(light: Light, rows: np.ndarray | slice) -> Light:
-    """The lobes `rows` alone, by numbers or a mask."""
-    return msgspec.structs.replace(
-        light, axis=light.axis[rows], log_sharpness=light.log_sharpness[rows], weight=light.weight[rows]
-    )
-
-
 def joined(light: Light, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
     """The light with q further lobes appended."""
     return msgspec.structs.replace(
@@ -138,4 +131,6 @@ def pruned(light: Light, least_share: float = 1e-5) -> Light:
     """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
     energy = lobe_integral(light.sharpness) * light.weight.sum(1)
     kept = energy > least_share * max(float(energy.sum()), 1e-30)
-    return taken(light, kept if kept.any() else slice(0, 1))
+    rows = kept if kept.any() else slice(0, 1)
+    lobes = {name: getattr(light, name)[rows] for name in ("axis", "log_sharpness", "weight")}
+    return msgspec.structs.replace(light, **lobes)
