@@ -6,7 +6,7 @@ import pytest
 
 from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
-from factorlib.model.materials import Materials, Point
+from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
@@ -216,13 +216,6 @@ def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
     assert costs([0.1] * 3) == pytest.approx((np.log(2) / LEVEL) ** 2)
     assert costs([0.05 * np.exp(0.1), 0.05, 0.05 * np.exp(-0.1)]) == pytest.approx(2 * (0.1 / TINT) ** 2)
     assert 30 < costs([1, 0.8, 0.3]) < 60
-
-
-def test_a_point_of_other_materials_in_the_same_gauge_is_a_start():
-    """Of a fit that is given the truth nothing moves far."""
-    problem, true = photographed(11, 2, cells=60, size=12, noise=0.0)
-    found = fitted(problem, start_of(Point(MATERIALS, true)), PRIOR, QUICK).point.materials
-    assert np.abs(found.roughness - MATERIALS.roughness).max() < 0.05
 
 
 # ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────
