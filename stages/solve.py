@@ -16,36 +16,38 @@ from jaxtyping import Float
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import LightSlice
 from factorlib.diagnose.answer import Answer
-from factorlib.diagnose.coverage import relative_standard_errors
-from factorlib.diagnose.posterior import Posterior, in_gauge_of
-from factorlib.diagnose.uncertainty import StandardErrors, standard_errors
-from factorlib.diagnose.warnings import after_solving, before_solving, unusable_observations
+from factorlib.diagnose.identifiability import after_solving, before_solving, unusable_observations
+from factorlib.diagnose.uncertainty import (
+    Posterior,
+    StandardErrors,
+    in_gauge_of,
+    relative_standard_errors,
+    standard_errors,
+)
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.prior import read_light_prior
-from factorlib.model.gathered import gathered
 from factorlib.model.loss import Loss
 from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations
+from factorlib.model.observed import blocks_of_observations, gathered
 from factorlib.model.problem import JointProblem
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
 from factorlib.solve import options
-from factorlib.solve.few_lobes.history import Run as FewLobesRun
 from factorlib.solve.few_lobes.options import FewLobes, LobeChoices
+from factorlib.solve.few_lobes.options import Run as FewLobesRun
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.fit import sure_ones
-from factorlib.solve.history import Event, Solution
+from factorlib.solve.history import Event, Solution, of_parts, of_rounds
 from factorlib.solve.options import Choices
-from factorlib.solve.paper import Paper, Prior, Samplings
+from factorlib.solve.paper import REPORTS, Paper, Prior, Samplings
 from factorlib.solve.paper import solve as solve_as_the_paper
-from factorlib.solve.progress import of_parts, of_rounds, of_subsets
 from factorlib.solve.resume import Journal
-from factorlib.solve.solve import Run, from_nothing, solve
-from factorlib.solve.warm import from_earlier, with_decided
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_earlier, from_nothing, with_decided
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.exposure import at_one_exposure, relative_exposures
 from factorlib.urm.observations import Observations, concatenate
@@ -138,7 +140,7 @@ def _solved(
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, prior=params.paper_prior, seed=params.seed)
-        return solve_as_the_paper(problem, len(names), paper, of_subsets(progress))
+        return solve_as_the_paper(problem, len(names), paper, of_rounds(progress, REPORTS))
     if params.solver == "few_lobes":
         few = FewLobes(**_own(params, LobeChoices))
         return few_lobes(problem, len(names), FewLobesRun(few, of_rounds(progress, few.rounds)))

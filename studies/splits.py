@@ -17,8 +17,7 @@ from factorlib.model.noise import Noise
 from factorlib.model.observed import Rotations, blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection.operator import Operator
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.merge import merge

@@ -10,8 +10,9 @@ import numpy as np
 
 from factorlib.diagnose.uncertainty import ABSOLUTE, GAUGE, StandardErrors
 from factorlib.light.lobes import Lobes
-from factorlib.model.components import connected_components
-from factorlib.model.gauge import DETERMINED, RULE
+from factorlib.model.blocks import Block
+from factorlib.model.gauge import DETERMINED, RULE, connected_components
+from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
@@ -44,10 +45,10 @@ class Answer(msgspec.Struct, frozen=True):
 
     def material_table(self, errors: StandardErrors) -> table.MaterialTable:
         """The content of materials.json."""
-        materials, stderr = _rows(self.solution.point.materials), _errors(self.names, errors)
+        rows, stderr = _rows(self.solution.point.materials), self._errors(errors)
         solved = {
             name: table.solved(table.Reflectance(*row), stderr[name])
-            for name, row in zip(self.names, materials, strict=True)
+            for name, row in zip(self.names, rows, strict=True)
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
@@ -57,14 +58,20 @@ class Answer(msgspec.Struct, frozen=True):
 
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""
-        return Uncertainty(
-            errors.deviation, _errors(self.names, errors), GAUGE + ABSOLUTE * self.solution.interreflection.kept
-        )
+        gauge = GAUGE + ABSOLUTE * self.solution.interreflection.kept
+        return Uncertainty(errors.deviation, self._errors(errors), gauge)
+
+    def _errors(self, errors: StandardErrors) -> dict[str, table.StandardErrors]:
+        rows = zip(self.names, _rows(errors.materials), strict=True)
+        return {name: table.StandardErrors(*row) for name, row in rows}
+
+    def lit(self) -> list[tuple[Block, Light]]:
+        """Each illumination with its light."""
+        return list(zip(self.problem.blocks, self.solution.point.lights, strict=True))
 
     def lights(self) -> dict[str, Lobes]:
         """By illumination, in scene radiance."""
-        lights = zip(self.problem.blocks, self.solution.point.lights, strict=True)
-        return {block.name: Lobes(light.axis, light.sharpness, light.weight * block.unit) for block, light in lights}
+        return {block.name: Lobes(li.axis, li.sharpness, li.weight * block.unit) for block, li in self.lit()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Factor of each photo on its light, per channel."""
@@ -72,19 +79,18 @@ class Answer(msgspec.Struct, frozen=True):
 
     def found_exposures(self) -> dict[str, float]:
         """Factor of each photo beside what its EXIF says."""
-        lights = zip(self.problem.blocks, self.solution.point.lights, strict=True)
-        return {
-            photo: float(np.exp(light.log_exposure[k]))
-            for block, light in lights
-            for k, photo in enumerate(block.photos)
-        }
+        pairs = (pair for b, light in self.lit() for pair in zip(b.photos, light.log_exposure, strict=True))
+        return {photo: float(np.exp(log_exposure)) for photo, log_exposure in pairs}
 
     def model(self) -> table.Model:
-        """What was decided of the model, and by what."""
-        names, solution, blocks = self.names, self.solution, self.problem.blocks
+        """What was decided of the model, and by what; the pivots of tone curves in scene radiance."""
+        names, solution, lit, started = self.names, self.solution, self.lit(), msgspec.UNSET
+        if self.earlier is not None:
+            known = set(names) & set(self.earlier.table.materials), {b.name for b, _ in lit} & set(self.earlier.lights)
+            started = table.Started(*map(sorted, known))
         return table.Model(
             solver=self.solver,
-            lobes={block.name: len(light) for block, light in zip(blocks, solution.point.lights, strict=True)},
+            lobes={block.name: len(light) for block, light in lit},
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase in ("round", "subset")],
             specular={name: not bool(solution.lambertian[m]) for m, name in enumerate(names)},
@@ -95,36 +101,19 @@ class Answer(msgspec.Struct, frozen=True):
             interreflection_chosen_by=_losses(solution.interreflection),
             light_prior=self.solver == "bundle",
             splitting_chosen_by=[_decision(one) for one in solution.splitting],
-            tone=self.tone(),
-            tone_chosen_by=_by_name([block.name for block in blocks], solution.tone),
-            started_from=self.started_from(),
-        )
-
-    def tone(self) -> dict[str, table.Tone]:
-        """Tone curves of the photos that have one; the pivot in scene radiance."""
-        return {
-            photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
-            for block, light in zip(self.problem.blocks, self.solution.point.lights, strict=True)
-            for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
-        }
-
-    def started_from(self) -> table.Started | msgspec.UnsetType:
-        """What the earlier solution knew of this problem."""
-        if self.earlier is None:
-            return msgspec.UNSET
-        materials = set(self.names) & set(self.earlier.table.materials)
-        return table.Started(
-            sorted(materials), sorted({block.name for block in self.problem.blocks} & set(self.earlier.lights))
+            tone={
+                photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
+                for block, light in lit
+                for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
+            },
+            tone_chosen_by=_by_name([block.name for block, _ in lit], solution.tone),
+            started_from=started,
         )
 
 
 def _rows(materials: Materials) -> list[tuple[list[float], list[float], float]]:
     """Diffuse, specular and roughness of each."""
     return list(zip(materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True))
-
-
-def _errors(names: Sequence[str], errors: StandardErrors) -> dict[str, table.StandardErrors]:
-    return {name: table.StandardErrors(*row) for name, row in zip(names, _rows(errors.materials), strict=True)}
 
 
 def _losses(evidence: Evidence) -> dict[str, float]:
@@ -138,5 +127,4 @@ def _decision(evidence: Evidence) -> table.Decision:
 
 
 def _by_name(names: Sequence[str], evidence: Sequence[Evidence]) -> dict[str, table.Decision]:
-    chosen = zip(names, evidence, strict=False)
-    return {name: _decision(one) for name, one in chosen}
+    return {name: _decision(one) for name, one in zip(names, evidence, strict=False)}

@@ -1,7 +1,8 @@
-"""What is not determined: by the observations alone, by the answer's standard errors, and where residuals stay large.
+"""What is missing or unusable in the observations, and what is not determined: by them alone, by the answer's standard errors, and where
+residuals stay large.
 
-Every sentence names what is not determined, why, and which photo would help.  None of them stops the solve.  The factor per channel between reflectances and lights is `factorlib.model.gauge`'s matter, links between
-photos are `factorlib.diagnose.warnings`'.
+Every sentence names what is not determined, why, and which photo would help.  None of them stops the solve.  The factor per
+channel between reflectances and lights is `factorlib.model.gauge`'s matter.
 """
 
 from __future__ import annotations
@@ -9,18 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from factorlib.diagnose.answer import Answer
+from factorlib.diagnose.uncertainty import StandardErrors
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import ROUGHNESS
-from factorlib.model.components import connected_components
-from factorlib.model.gauge import LEAST_ENERGY, is_free
+from factorlib.model.gauge import LEAST_ENERGY, connected_components, is_free
 from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import ROUGHNESS, Materials, Point
+from factorlib.model.observed import PhotoObservations
 from factorlib.model.problem import JointProblem
-from factorlib.model.tone import beyond_cameras
 
 FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
 FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
@@ -29,6 +29,7 @@ ROUGHNESS_ERROR = 0.1  # largest standard error with which dull and glossy can b
 SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
 DARK = 0.1  # a bound on reflectance that still says 'dark'
 TINTED = 0.6  # of a mean |log R/G| or |log B/G|: three standard deviations of the level of one light's colour (docs/light-prior.md)
+EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
 OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
 
 
@@ -37,31 +38,37 @@ def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block]) 
 
     names: of all materials;  a material that no block shows is left out
     """
-    said = [
-        f"illumination '{b.name}' is black in every photo: it tells nothing" for b in blocks if (b.radiance <= 0).all()
-    ]
+    black = [block.name for block in blocks if (block.radiance <= 0).all()]
+    said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
-        shown = [(block, block.material == m) for block in blocks if (block.material == m).any()]
+        shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
         said += _of_material(name, shown) if shown else []
     for members, lights in connected_components(blocks, len(names)):
         if len(members) == 1 and lights:
-            said.append(_alone(names[members[0]], lights))
+            said.append(
+                f"material '{names[members[0]]}' shares no light with another: its colour and brightness are separated from the light's "
+                "by convention only"
+                + ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
+                * (len(lights) == 1)
+                + ". A photo" * (len(lights) > 1)
+                + " that shows another material too would help"
+            )
     return said
 
 
-def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, " n"]]]) -> Iterator[str]:
-    count = sum(int(rows.sum()) for _, rows in shown)
+def _of_material(name: str, shown: Sequence[Block]) -> Iterator[str]:
+    count = sum(map(len, shown))
     if count < FEW:
         yield (
             f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
             "A photo from nearer would help"
         )
-    if all(_spread(block, rows) < FLAT_DEG for block, rows in shown):
+    if all(_spread(block) < FLAT_DEG for block in shown):
         yield (
             f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of it is specular "
             "cannot be determined. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
         )
-    clipped = np.concatenate([block.clipped[rows] for block, rows in shown]).mean()
+    clipped = np.concatenate([block.clipped for block in shown]).mean()
     if clipped >= CLIPPED:
         yield (
             f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance is uncertain. "
@@ -69,21 +76,11 @@ def _of_material(name: str, shown: Sequence[tuple[Block, Bool[np.ndarray, " n"]]
         )
 
 
-def _spread(block: Block, rows: Bool[np.ndarray, " n"]) -> float:
+def _spread(block: Block) -> float:
     """Largest angle between a mirror direction and their mean, degrees."""
-    normal, view = block.normal[rows], block.view[rows]
-    mirror = mirror_directions(normal, view)
+    mirror = mirror_directions(block.normal, block.view)
     mean = mirror.mean(0)
     return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
-
-
-def _alone(name: str, lights: Sequence[str]) -> str:
-    said = f"material '{name}' shares no light with another: its colour and brightness are separated from the light's by convention only"
-    if len(lights) == 1:
-        said += ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
-    else:
-        said += ". A photo"
-    return said + " that shows another material too would help"
 
 
 def undetermined_by_answer(
@@ -91,11 +88,7 @@ def undetermined_by_answer(
 ) -> list[str]:
     """What the data left open, by the standard `errors` of what was `found`, as sentences; of materials that are seen."""
     seen = sorted({int(m) for block in blocks for m in np.unique(block.material)})
-    return [sentence for m in seen for sentence in _of_answer(names[m], _row(found, m), _row(errors, m))]
-
-
-def _row(materials: Materials, m: int) -> Float[np.ndarray, "7"]:
-    return materials.vector()[7 * m : 7 * m + 7]
+    return [sentence for m in seen for sentence in _of_answer(names[m], found.rows()[m], errors.rows()[m])]
 
 
 def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
@@ -138,7 +131,7 @@ def unlikely_curves(blocks: Sequence[Block], lights: Sequence[Light]) -> list[st
         f"the tone curves of illumination '{block.name}' have exponents of {', '.join(f'{g:.2g}' for g in np.exp(light.log_tone))}, "
         'more than a camera does: something else is wrong there, as normals or `encoding`. SET="solve.tone=off" goes without them'
         for block, light in zip(blocks, lights, strict=True)
-        if beyond_cameras(light)
+        if light.beyond_cameras
     ]
 
 
@@ -151,9 +144,8 @@ def tinted_alike(names: Sequence[str], blocks: Sequence[Block], lights: Sequence
     for _, illuminations in connected_components(blocks, len(names)):
         if not illuminations or is_free(blocks, illuminations):
             continue
-        sums = np.array(
-            [light.energy.sum(0) for block, light in zip(blocks, lights, strict=True) if block.name in illuminations]
-        )
+        own = [light for block, light in zip(blocks, lights, strict=True) if block.name in illuminations]
+        sums = np.array([light.energy.sum(0) for light in own])
         level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
         if np.abs(level - level[1]).max() > TINTED:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
@@ -162,3 +154,54 @@ def tinted_alike(names: Sequence[str], blocks: Sequence[Block], lights: Sequence
                 'the opposite colour, if the lights were nearly white. SET="solve.interreflection=off" makes the lights grey'
             )
     return said
+
+
+def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
+    """Photos of which observations were left out."""
+    return [
+        f"photo '{', '.join(photo.merged.photos)}': {photo.unusable} of {photo.count} observations are left out, "
+        "their radiance, normal or view not finite or their weight not positive"
+        for photo in photos
+        if photo.unusable
+    ]
+
+
+def before_solving(names: Sequence[str], photos: Sequence[str], blocks: Sequence[Block]) -> list[str]:
+    """What observations lack and cannot tell; names: of all materials, in the order of their numbers;  photos: all that there are."""
+    shown = {int(m) for block in blocks for m in np.unique(block.material)}
+    unseen = [name for m, name in enumerate(names) if m not in shown]
+    said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
+    dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
+    said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
+    linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
+    if len(linked) > 1:
+        pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
+        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
+        said.append(
+            f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
+            "A photo that shows a material of each would link them"
+        )
+    return said + undetermined_by_observations(names, blocks)
+
+
+def exposures_unlike_exif(answer: Answer) -> list[str]:
+    """Photos whose exposure is found to be another than their EXIF says."""
+    relative = answer.relative
+    return [
+        f"photo '{photo}': by its EXIF its exposure is {relative[photo]:.3g} of its light's first photo, by its pixels "
+        f"{factor * relative[photo]:.3g}: was it made brighter or darker later?"
+        for photo, factor in answer.found_exposures().items()
+        if relative[photo] != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS)
+    ]
+
+
+def after_solving(answer: Answer, errors: StandardErrors) -> list[str]:
+    """What the answer leaves open or explains badly."""
+    problem, point = answer.solution.shown(answer.problem), answer.solution.point
+    return [
+        *undetermined_by_answer(answer.names, problem.blocks, point.materials, errors.materials),
+        *poorly_explained(problem, point),
+        *unlikely_curves(problem.blocks, point.lights),
+        *tinted_alike(answer.names, problem.blocks, point.lights),
+        *exposures_unlike_exif(answer),
+    ]

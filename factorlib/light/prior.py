@@ -108,12 +108,10 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The s_k² of a light that is known as a Gaussian, u with its covariance: one step of expectation maximisation of (4)."""
         p, factors = len(directions), []
         by_channel = covariance.reshape(3, p, 3, p)
-        for k, row in enumerate(MIX):
+        for k, (row, nu) in enumerate(zip(MIX, self.freedom, strict=True)):
             inverse, y = _inverse(self.covariance(k, directions))[0], row @ log_radiance
             spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
-            factors.append(
-                float((self.freedom[k] + y @ inverse @ y + np.sum(inverse * spread)) / (self.freedom[k] + p))
-            )
+            factors.append(float((nu + y @ inverse @ y + np.sum(inverse * spread)) / (nu + p)))
         return factors
 
 

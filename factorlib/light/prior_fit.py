@@ -16,6 +16,7 @@ is no property of light. For the same reason the level of y_0 is not fitted but 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -54,10 +55,8 @@ def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n
     total = np.bincount(cell, area, len(cells))
     if not total.all():
         raise ValueError(f"{height} × {width} texels are too few for {len(cells)} cells")
-    return (
-        np.stack([np.bincount(cell, area * channel, len(cells)) for channel in lat_long.reshape(-1, 3).T], axis=-1)
-        / total[:, None]
-    )
+    sums = [np.bincount(cell, area * channel, len(cells)) for channel in lat_long.reshape(-1, 3).T]
+    return np.stack(sums, axis=-1) / total[:, None]
 
 
 def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
@@ -73,37 +72,23 @@ def fitted(
 
     profile: whether the mean depends on elevation;  start: where to begin the search
     """
-    found = [
-        _fitted_one(k, logs[k], cells, profile, START if start is None else _log_parameters(start, k)) for k in range(3)
-    ]
-    (variance, decay, nugget, level, freedom), coefficients = np.exp([t for t, _ in found]).T, [b for _, b in found]
-    return LightPrior(
-        tuple(variance.tolist()), tuple(np.degrees(decay).tolist()), tuple(level.tolist()), tuple(nugget.tolist()),
-        tuple(tuple(b.tolist()) for b in coefficients), float(np.degrees(np.sqrt(4 * np.pi / len(cells)))), tuple(freedom.tolist()),
-    )  # fmt: skip
-
-
-def _log_parameters(prior: LightPrior, k: int) -> Float[np.ndarray, "5"]:
-    return np.log(
-        [prior.variance[k], np.radians(prior.decay_deg[k]), prior.nugget[k], prior.level[k], prior.freedom[k]]
-    )
-
-
-def _fitted_one(
-    k: int,
-    values: Float[np.ndarray, "m n"],
-    cells: Float[np.ndarray, "n 3"],
-    profile: bool,
-    start: Float[np.ndarray, "5"],
-) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "3"]]:
-    """t of y_k, and its profile."""
-    design = np.hstack([legendre(cells @ UP)[:, : 3 * int(profile)], np.ones((len(cells), int(k == 0)))])
-    bounds, start, angle = list(BOUNDS), start.copy(), angles(cells)
-    if k == 0:
-        start[3] = np.log(EXPOSURE_VARIANCE)
-        bounds[3] = (start[3], start[3])
-    best = minimize(lambda t: _cost(t, angle, design, values)[:2], start, jac=True, method="L-BFGS-B", bounds=bounds).x
-    return best, _cost(best, angle, design, values)[2][:3] if profile else np.zeros(3)
+    numbers, coefficients, angle = [], [], angles(cells)
+    for k in range(3):
+        design = np.hstack([legendre(cells @ UP)[:, : 3 * int(profile)], np.ones((len(cells), int(k == 0)))])
+        bounds, begin = list(BOUNDS), START.copy()
+        if start is not None:
+            decay = np.radians(start.decay_deg[k])
+            begin = np.log([start.variance[k], decay, start.nugget[k], start.level[k], start.freedom[k]])
+        if k == 0:
+            begin[3] = np.log(EXPOSURE_VARIANCE)
+            bounds[3] = (begin[3], begin[3])
+        cost = partial(_cost, angle=angle, design=design, values=logs[k])
+        best = minimize(lambda t, cost=cost: cost(t)[:2], begin, jac=True, method="L-BFGS-B", bounds=bounds).x
+        numbers.append(np.exp(best))
+        coefficients.append(tuple(cost(best)[2][:3].tolist()) if profile else (0.0,) * 3)
+    variance, decay, nugget, level, freedom = (tuple(each.tolist()) for each in np.transpose(numbers))
+    degrees, size = tuple(np.degrees(decay).tolist()), float(np.degrees(np.sqrt(4 * np.pi / len(cells))))
+    return LightPrior(variance, degrees, level, nugget, tuple(coefficients), size, freedom)
 
 
 def _cost(
@@ -122,24 +107,11 @@ def _cost(
     solved = residual @ inverse
     square = np.sum(solved * residual, axis=1)
     slope = 0.5 * (inverse - (weight[:, None] * solved).T @ solved / len(values))
-    by_freedom = (
-        np.log1p(square / freedom)
-        - weight * square / freedom
-        - digamma((freedom + count) / 2)
-        + digamma(freedom / 2)
-        + count / freedom
-    )
-    gradient = [
-        np.sum(slope * alike),
-        np.sum(slope * alike * angle) / decay,
-        nugget * np.trace(slope),
-        level * slope.sum(),
-    ]
-    return (
-        -_log_density(factor[0], square, freedom).mean(),
-        np.array([*gradient, freedom * by_freedom.mean() / 2]),
-        beta,
-    )
+    by_freedom = np.log1p(square / freedom) - weight * square / freedom  # ν
+    by_freedom = by_freedom - digamma((freedom + count) / 2) + digamma(freedom / 2) + count / freedom
+    gradient = [np.sum(slope * alike), np.sum(slope * alike * angle) / decay, nugget * np.trace(slope)]
+    gradient += [level * slope.sum(), freedom * by_freedom.mean() / 2]
+    return -_log_density(factor[0], square, freedom).mean(), np.array(gradient), beta
 
 
 def _weighted_means(
@@ -163,12 +135,8 @@ def _log_density(
 ) -> Float[np.ndarray, " m"]:
     """Of Student's t: `root` is the lower Cholesky factor of K, `square` is d."""
     count = len(root)
-    constant = (
-        gammaln((freedom + count) / 2)
-        - gammaln(freedom / 2)
-        - count / 2 * np.log(np.pi * freedom)
-        - np.log(np.diag(root)).sum()
-    )
+    gammas = gammaln((freedom + count) / 2) - gammaln(freedom / 2)
+    constant = gammas - count / 2 * np.log(np.pi * freedom) - np.log(np.diag(root)).sum()
     return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
@@ -209,16 +177,11 @@ def leave_one_out(
 def rounded(prior: LightPrior) -> LightPrior:
     """To the digits that a table needs."""
 
-    def short(value: float) -> float:
+    def short(value: float | tuple) -> float | tuple:
         """To DIGITS digits."""
-        return float(f"{value:.{DIGITS}g}")
+        return tuple(map(short, value)) if isinstance(value, tuple) else float(f"{value:.{DIGITS}g}")
 
-    names = ("variance", "decay_deg", "level", "nugget", "freedom")
-    numbers = {name: tuple(map(short, getattr(prior, name))) for name in names}
-    profile = tuple(tuple(map(short, each)) for each in prior.profile)
-    scores = prior.leave_one_out and LeaveOneOut(
-        *(round(score, 1) for score in msgspec.structs.astuple(prior.leave_one_out))
-    )
-    return msgspec.structs.replace(
-        prior, **numbers, profile=profile, cell_deg=short(prior.cell_deg), leave_one_out=scores
-    )
+    names, scores = ("variance", "decay_deg", "level", "nugget", "freedom", "profile", "cell_deg"), prior.leave_one_out
+    if scores:
+        scores = LeaveOneOut(*(round(score, 1) for score in msgspec.structs.astuple(scores)))
+    return msgspec.structs.replace(prior, **{name: short(getattr(prior, name)) for name in names}, leave_one_out=scores)

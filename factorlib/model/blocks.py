@@ -6,9 +6,14 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.noise import Noise
 
-ROWS = ("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out")
+PER_OBSERVATION = (
+    *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
+    *("visibility", "bounced", "confidence"),  # where the block has them
+)
+CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
 
 class Block(msgspec.Struct, frozen=True):
@@ -47,9 +52,8 @@ class Block(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """Return the observations `rows` (numbers or a mask) alone."""
-        further = {name: getattr(self, name) for name in ("visibility", "bounced", "confidence")}
-        kept = {name: None if values is None else values[rows] for name, values in further.items()}
-        return msgspec.structs.replace(self, **{name: getattr(self, name)[rows] for name in ROWS}, **kept)
+        values = ((name, getattr(self, name)) for name in PER_OBSERVATION)
+        return msgspec.structs.replace(self, **{name: of[rows] for name, of in values if of is not None})
 
     def fitted(self) -> Block:
         """The observations that are not held out."""
@@ -68,13 +72,10 @@ class Block(msgspec.Struct, frozen=True):
         ]
         return self.take(np.sort(np.concatenate(kept)))
 
-    def without_shadows(self) -> Block:
-        """The same observations, as if nothing hid anything."""
-        return msgspec.structs.replace(self, visibility=None, bounced=None)
-
-    def without_bounces(self) -> Block:
-        """The same observations, as if what hides the light were black."""
-        return msgspec.structs.replace(self, bounced=None)
+    def with_effects(self, shadows: bool, bounces: bool) -> Block:
+        """The same observations, as if nothing hid anything, or as if what hides the light were black."""
+        visibility, bounced = self.visibility if shadows else None, self.bounced if shadows and bounces else None
+        return msgspec.structs.replace(self, visibility=visibility, bounced=bounced)
 
     def with_noise(self, noise: Noise) -> Block:
         """The same observations, which are expected to be off by as much as another noise model says."""
@@ -86,3 +87,7 @@ class Block(msgspec.Struct, frozen=True):
         """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""
         difference = (radiance - self.radiance) * self.precision
         return np.where(self.clipped, np.minimum(difference, 0.0), difference)
+
+    def clusters(self) -> Int[np.ndarray, " n"]:
+        """The number, from 0, of each observation's cluster: those that mirror one region of the light, whose residuals err alike."""
+        return np.unique(mirror_cells(self.normal, self.view, CLUSTER), return_inverse=True)[1].reshape(-1)

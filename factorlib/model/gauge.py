@@ -1,4 +1,4 @@
-"""The gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
+"""Which materials and lights are linked, and the gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
 
 Where surfaces light each other (interreflection), what they send is known and no factor is free: such a component stays as it is.
 
@@ -14,16 +14,15 @@ Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.model.blocks import Block
-from factorlib.model.components import connected_components
-from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 
 BRIGHTEST = 0.9
 LEAST_ENERGY = 1e-3  # of a light's brightest channel: a light without any blue has no say in how blue the others are
@@ -36,6 +35,34 @@ DETERMINED = (
 )
 
 
+class Component(NamedTuple):
+    """Materials (by number) and illuminations (by name) that are linked, both sorted; either may be empty."""
+
+    materials: tuple[int, ...]
+    illuminations: tuple[str, ...]
+
+
+def connected_components(blocks: Sequence[Block], materials: int) -> list[Component]:
+    """All components of materials 0 … `materials`−1 and the blocks, sorted.
+
+    Two materials are linked if one light shows both.  In each component one factor per channel is not determined.
+    """
+    shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
+    first, second = np.array(shown, dtype=int).reshape(-1, 2).T
+    size = materials + len(blocks)
+    _, label = components_of_graph(
+        coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False
+    )
+    members = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+    return sorted(
+        Component(
+            tuple(n for n in nodes if n < materials),
+            tuple(sorted(blocks[n - materials].name for n in nodes if n >= materials)),
+        )
+        for nodes in members
+    )
+
+
 def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
     """The point in the gauge stated above, which predicts the same radiance; one light per block."""
     materials, lights = point.materials, list(point.lights)
@@ -46,7 +73,9 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
         if not own or not is_free(blocks, illuminations):
             continue
         rows = list(members)
-        factor = 1 / _greying([lights[i] for i in own])  # multiplies reflectances
+        sums = np.array([lights[i].energy.sum(0) for i in own])
+        level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
+        factor = 1 / np.exp((level.mean(1, keepdims=True) - level).mean(0))  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
         for i in own:
@@ -57,9 +86,3 @@ def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
 def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
     """Whether the component of these illuminations has a free factor."""
     return all(block.bounced is None for block in blocks if block.name in illuminations)
-
-
-def _greying(lights: Sequence[Light]) -> Float[np.ndarray, "3"]:
-    sums = np.array([light.energy.sum(0) for light in lights])
-    level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
-    return np.exp((level.mean(1, keepdims=True) - level).mean(0))

@@ -26,9 +26,7 @@ from factorlib.model.blocks import Block
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.reflected import Reflected, Reflections
-from factorlib.model.responses import CHUNK, Rows, diffuse_response, specular_response
-from factorlib.model.tone import exponents, slope_at, toned
+from factorlib.model.responses import CHUNK, Reflected, Reflections, Rows, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 
 
@@ -44,10 +42,6 @@ class Shown(NamedTuple):
     linear: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
     responses: list[tuple[int, slice, Reflected]]
-
-    def residual_of(self, block: Block) -> Float[np.ndarray, "n 3"]:
-        """r of the block that these are the observations of."""
-        return block.residuals(self.radiance)
 
 
 class Linearised(NamedTuple):
@@ -86,32 +80,26 @@ class Illumination(msgspec.Struct, frozen=True):
         """Return the exposure of each observation's photo: a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
+    def fitted(self) -> Illumination:
+        """With the observations alone that are not held out."""
+        return msgspec.structs.replace(self, block=self.block.fitted())
+
     def shown(self) -> Shown:
         """Radiance, and what it is made of."""
-        block, kd, ks = self.block, self.materials.diffuse, self.materials.specular
-        diffuse, specular, responses = self._lit()
+        block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
+        diffuse, specular = np.zeros((len(block), 3)), np.zeros((len(block), 3))
+        for m, rows in material_slices(block) if self.table is None else ():
+            diffuse[rows], specular[rows] = self.lit(rows, float(self.materials.roughness[m]))
+        weight = self.light.weight.astype(np.float32)
+        for m in np.unique(block.material).tolist() if self.table else ():
+            rows, of = self.table.rows(m), self.table.at(m, float(self.materials.roughness[m]))
+            diffuse[rows], specular[rows] = of.diffuse @ weight, of.specular @ weight
+            responses.append((m, rows, of))
         diffuse, specular = diffuse * self.exposure, specular * self.exposure
         if block.bounced is not None:
             diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
         linear = kd[block.material] * diffuse + ks[block.material] * specular
-        return Shown(diffuse, specular, linear, toned(linear, self.light, block.photo), responses)
-
-    def _lit(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], list[tuple[int, slice, Reflected]]]:
-        """Σ_p D w and Σ_p S w at all observations."""
-        weight, roughness, responses = self.light.weight, self.materials.roughness, []
-        diffuse, specular = np.zeros((len(self.block), 3)), np.zeros((len(self.block), 3))
-        if self.table is None:
-            for m, rows in material_slices(self.block):
-                diffuse[rows], specular[rows] = self.lit(rows, float(roughness[m]))
-            return diffuse, specular, responses
-        for m in np.unique(self.block.material).tolist():
-            rows, of = self.table.rows(m), self.table.at(m, float(roughness[m]))
-            diffuse[rows], specular[rows] = (
-                of.diffuse @ weight.astype(np.float32),
-                of.specular @ weight.astype(np.float32),
-            )
-            responses.append((m, rows, of))
-        return diffuse, specular, responses
+        return Shown(diffuse, specular, linear, self.light.toned(linear, block.photo), responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """y: what every observation should show."""
@@ -138,9 +126,8 @@ class Illumination(msgspec.Struct, frozen=True):
             of = block.material[rows] == m
             response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
             response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
-        scale = (
-            block.precision[rows] * slope_at(block.radiance[rows], self.light, block.photo[rows]) * self.exposure[rows]
-        )
+        slope = self.light.slope_at(block.radiance[rows], block.photo[rows])
+        scale = block.precision[rows] * slope * self.exposure[rows]
         kd, ks = materials.diffuse[block.material[rows]], materials.specular[block.material[rows]]
         return np.stack(
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
@@ -153,19 +140,13 @@ class Illumination(msgspec.Struct, frozen=True):
         counts = ~block.held_out[:, None] & ~(block.clipped & (residual >= 0))
         pull = np.sqrt(counts * loss.trust(residual) / temperature)
         scale = pull * block.precision
-        rising = scale * slope_at(shown.radiance, light, block.photo)  # ∂r/∂ℓ
-        by_tone = (
-            scale * by_log_exponent(np.maximum(shown.linear, 0), exponents(light, block.photo))
-            if len(light.log_tone)
-            else None
-        )
+        rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
         lit = shown.linear
         if block.bounced is not None:
-            sent = (
-                materials.diffuse[block.material] * block.bounced[:, :3]
-                + materials.specular[block.material] * block.bounced[:, 3:]
-            )
-            lit = lit - sent
+            kd, ks = materials.diffuse[block.material], materials.specular[block.material]
+            lit = lit - (kd * block.bounced[:, :3] + ks * block.bounced[:, 3:])
+        if toned := len(light.log_tone) > 0:
+            by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
         photos = np.eye(len(light.log_exposure))[block.photo]
         for m, rows, of in shown.responses:
             for c in range(3):
@@ -174,7 +155,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 by_roughness = of.by_roughness * (ks * bright)
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
                 by_photo = photos[rows, 1:] * (lit[rows, c] * rising[rows, c])[:, None]
-                if by_tone is not None:
+                if toned:
                     by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
                 yield Linearised(
                     c,

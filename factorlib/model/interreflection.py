@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from factorlib.geometry.met import BINS, UNMET
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -77,32 +77,19 @@ def _by_bin(
 
 
 def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
-    """(1) at observations of one photo."""
-    directions = torch.from_numpy(fibonacci_sphere(seen.visibility.shape[1])).float()
+    """(1) at observations of one photo; the highlight is no narrower than the directions lie apart, as in factorlib.light.visibility."""
+    count, unknown = seen.visibility.shape[1], len(surfaces) - 1
+    directions = torch.from_numpy(fibonacci_sphere(count)).float()
     normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
     hidden = 1 - torch.from_numpy(seen.visibility).float() / 255
-    weights = [hidden * of(normal, view, directions) for of in (_by_cosine, _by_highlight)]
-    code = torch.from_numpy(_places(seen.met, len(surfaces) - 1))
-    by_channel = [torch.from_numpy(surfaces[:, c]).float()[code] for c in range(3)]
-    return np.column_stack([(weight * met).sum(1).double().numpy() for weight in weights for met in by_channel])
-
-
-def _places(met: Int[np.ndarray, "n k"], unknown: int) -> Int[np.ndarray, "n k"]:
-    """Rows of `radiance_by_code`."""
-    return np.where((met == UNMET) | (met >= unknown), unknown, met).astype(np.int64)
-
-
-def _by_cosine(normal: torch.Tensor, view: torch.Tensor, directions: torch.Tensor) -> Float[torch.Tensor, "n k"]:
-    return cosine_weights(normal, directions)
-
-
-def _by_highlight(normal: torch.Tensor, view: torch.Tensor, directions: torch.Tensor) -> Float[torch.Tensor, "n k"]:
-    """No narrower than the directions lie apart, as in factorlib.light.visibility."""
-    count = len(directions)
     alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
     nd, no, od = normal @ directions.T, (normal * view).sum(1, keepdim=True), view @ directions.T
     nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
-    return specular(alpha, nd, no, nh) * (4 * math.pi / count)
+    highlight = specular(alpha, nd, no, nh) * (4 * math.pi / count)
+    code = np.where((seen.met == UNMET) | (seen.met >= unknown), unknown, seen.met).astype(np.int64)
+    by_channel = [torch.from_numpy(surfaces[:, c]).float()[torch.from_numpy(code)] for c in range(3)]
+    weights = [hidden * of for of in (cosine_weights(normal, directions), highlight)]
+    return np.column_stack([(weight * met).sum(1).double().numpy() for weight in weights for met in by_channel])
 
 
 def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

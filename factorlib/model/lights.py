@@ -1,4 +1,4 @@
-"""A light: log radiance on cells of the sphere, and the exposures and tone curves of its photos.
+"""A light: log radiance on cells of the sphere, and the exposures and tone curves (`factorlib.images.tone`) of its photos.
 
 A cell is a lobe w·exp(λ(ω·z − 1)).  Its width 1/√λ is half the distance between neighbouring cells, so that equal weights make a nearly
 constant light:
@@ -15,15 +15,18 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images import tone
 from factorlib.light.lobes import lobe_integral
 
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more of them reach 2.7 % at best
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
+TONE = (0.6, 1.7)  # range of the exponents of tone curves
+NEAR_BOUNDS = 0.8  # of the logarithms of that range: the exponents of cameras lie well within
 
 
 class UnitLobes(msgspec.Struct, frozen=True):
@@ -125,10 +128,29 @@ class Light(msgspec.Struct, frozen=True):
         )
         return light.with_log_radiance(np.hstack([u[:, kept], u[:, parent]]))
 
+    def with_curves(self) -> Light:
+        """Return the light with a tone curve for each photo, the identity."""
+        return msgspec.structs.replace(self, log_tone=np.zeros_like(self.log_exposure))
 
-def tangents(axis: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """Two unit vectors that span the tangent plane of each unit `axis`."""
-    helper = np.where(np.abs(axis[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(axis, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return first, np.cross(axis, first)
+    @property
+    def beyond_cameras(self) -> bool:
+        """Whether the exponent of a tone curve has run near the bounds of what cameras do."""
+        low, high = NEAR_BOUNDS * np.log(TONE)
+        return bool(((self.log_tone < low) | (self.log_tone > high)).any())
+
+    def exponents(self, photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 1"]:
+        """The exponent of the photo of each of n observations."""
+        return np.exp(self.log_tone)[photo][:, None]
+
+    def toned(self, linear: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
+        """What the photos show of linear radiance: their tone curves, the identity where the light has none."""
+        return tone.curve(np.maximum(linear, 0.0), self.exponents(photo)) if len(self.log_tone) else linear
+
+    def slope_at(
+        self, radiance: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n c"] | float:
+        """Derivative of what a photo shows by linear radiance, where it shows `radiance`."""
+        if len(self.log_tone) == 0:
+            return 1.0
+        g = self.exponents(photo)
+        return tone.slope(tone.inverse(radiance, g), g)

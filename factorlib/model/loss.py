@@ -11,7 +11,7 @@ class Loss(msgspec.Struct, frozen=True):
     """Σ 2k² (√(1 + r²/k²) − 1) of whitened residuals r.
 
     robust_scale  k, in σ
-    prior         weight of the paper's tint prior, where lights are few lobes (`factorlib.solve.few_lobes.tint`)
+    prior         weight of the paper's tint prior, where lights are few lobes (`factorlib.solve.few_lobes.equations`)
     """
 
     robust_scale: float = 10.0

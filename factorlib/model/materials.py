@@ -1,12 +1,19 @@
-"""The materials of a problem, and their vector of unknowns."""
+"""The unknowns: materials with their ranges, and points, which are materials and lights."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS, sharpest_resolved
+from factorlib.model.lights import Light
+
+ROUGHNESS = (0.1, 1.0)  # the operators' domain
+SHARPNESS = (0.1, 2000.0)  # λ of few lobes: from nearly constant to 1.3° wide, about a texel of the exported map
+RESOLVED = 16.0  # times the sharpest reflection's λ: such a lobe widens it by 3 %, and nothing sharper can be resolved
+LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
 class Materials(msgspec.Struct, frozen=True):
@@ -28,6 +35,11 @@ class Materials(msgspec.Struct, frozen=True):
         return self.vector().reshape(-1, 7)
 
     @staticmethod
+    def of_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
+        """The inverse of `rows`."""
+        return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
+
+    @staticmethod
     def of_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
         """The nearest materials within bounds."""
         rows = vector.reshape(-1, 7)
@@ -41,8 +53,8 @@ class Materials(msgspec.Struct, frozen=True):
 
     @property
     def sharpest(self) -> float:
-        """The largest sharpness that can be resolved: reflections of sharper lobes look the same."""
-        return sharpest_resolved(self.blur)
+        """The largest sharpness λ that can be resolved: reflections of sharper lobes look the same."""
+        return min(RESOLVED / self.blur, SHARPNESS[1])
 
     def lambertian(self, m: int) -> Materials:
         """With material m Lambertian: its specular reflectance is added to its diffuse one."""
@@ -50,3 +62,14 @@ class Materials(msgspec.Struct, frozen=True):
         diffuse[m] += specular[m]
         specular[m] = LEAST_REFLECTANCE
         return Materials(diffuse, specular, self.roughness)
+
+
+class Point(msgspec.Struct, frozen=True):
+    """The materials of a problem, and one light for each of its blocks, in their order."""
+
+    materials: Materials
+    lights: list[Light]
+
+    def restricted(self, lights: Sequence[int]) -> Point:
+        """The same materials, with the lights of numbers `lights` alone."""
+        return Point(self.materials, [self.lights[k] for k in lights])

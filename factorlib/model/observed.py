@@ -1,31 +1,47 @@
-"""From observations to the data of the joint problem: one block per illumination."""
+"""From the observations of all photos, as `urm` wrote them, to the data of the joint problem: one block per illumination."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.model.blocks import Block
-from factorlib.model.clusters import HELD_OUT_CELL, held_out_by_cells
 from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
-from factorlib.urm.observations import Observations
+from factorlib.model.problem import Spread
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import Observations, read_observations
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 
 
-class _How(msgspec.Struct, frozen=True):
-    """How observations become blocks."""
+HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
 
-    noise: Noise
-    held_out: float
-    world_from_camera: Rotations
-    seed: int
+
+class PhotoObservations(msgspec.Struct, frozen=True):
+    """Of one file: its usable observations, merged; how many it holds, and how many of those are not usable."""
+
+    merged: Observations
+    count: int
+    unusable: int
+
+
+def gathered(files: Sequence[Path], degrees: float, spread: Spread) -> list[PhotoObservations]:
+    """Of each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`)."""
+    return spread(partial(_of_file, degrees=degrees), files)
+
+
+def _of_file(path: Path, degrees: float) -> PhotoObservations:
+    read = read_observations(path)
+    seen = usable(read)
+    return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
 
 
 def blocks_of_observations(
@@ -52,13 +68,9 @@ def blocks_of_observations(
             "every observation is black",
             cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
         )
-    how = _How(noise, held_out, world_from_camera or {}, seed)
-    blocks = [
-        _block(seen.take(seen.illumination == i), name, how)
-        for i, name in enumerate(seen.illuminations)
-        if (seen.illumination == i).any()
-    ]
-    return sorted(blocks, key=lambda block: block.name)
+    block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
+    shown = [(name, seen.illumination == i) for i, name in enumerate(seen.illuminations)]
+    return sorted((block(seen.take(rows), name) for name, rows in shown if rows.any()), key=lambda block: block.name)
 
 
 def usable(observations: Observations) -> Observations:
@@ -70,46 +82,46 @@ def usable(observations: Observations) -> Observations:
     )
 
 
-def _block(seen: Observations, name: str, how: _How) -> Block:
+def _block(seen: Observations, name: str, noise: Noise, share: float, rotations: Rotations, seed: int) -> Block:
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
     order = np.lexsort((seen.x, seen.y, local, seen.material))
     seen, local = seen.take(order), local[order]
-    normal, view = (_in_frame(vectors, seen, how.world_from_camera) for vectors in (seen.normal, seen.view))
+    turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
+    normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
     radiance = seen.radiance.astype(float)
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
     scaled = radiance / unit
-    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, how.held_out, how.seed)
+    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
+    visibility = directions = None
+    if seen.visibility is not None and (seen.visibility < 255).any():
+        every = fibonacci_sphere(seen.visibility.shape[1])
+        visibility, directions = seen.visibility, np.stack([every @ turned.get(p, np.eye(3)).T for p in photos])
+    bounced = bounced_light(seen, scaled)
     return Block(
-        name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), how.noise.precision(scaled, seen.weight),
-        seen.material.astype(np.int64), local, held_out, *_visibility(seen, photos, how.world_from_camera), _bounced(seen, scaled),
-        how.noise, None if seen.confidence is None else seen.confidence.astype(float),
+        name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
+        seen.material.astype(np.int64), local, held_out, visibility, directions,
+        bounced if bounced is not None and bounced.any() else None, noise,
+        None if seen.confidence is None else seen.confidence.astype(float),
     )  # fmt: skip
-
-
-def _visibility(
-    seen: Observations, photos: Sequence[str], rotations: Rotations
-) -> tuple[UInt8[np.ndarray, "n k"] | None, Float[np.ndarray, "f k 3"] | None]:
-    """Visibility and its directions in the block's frame; None where nothing is hidden."""
-    if seen.visibility is None or (seen.visibility == 255).all():
-        return None, None
-    directions = fibonacci_sphere(seen.visibility.shape[1])
-    frames = [
-        np.eye(3) if rotations.get(photo) is None else np.asarray(rotations[photo], dtype=float) for photo in photos
-    ]
-    return seen.visibility, np.stack([directions @ frame.T for frame in frames])
-
-
-def _bounced(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"] | None:
-    """None where no observation is hidden from anything."""
-    sent = bounced_light(seen, radiance)
-    return sent if sent is not None and sent.any() else None
 
 
 def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
     turned = vectors.astype(float)
     for i, photo in enumerate(seen.photos):
-        if rotations.get(photo) is not None:
-            rows = seen.photo == i
-            turned[rows] = turned[rows] @ np.asarray(rotations[photo], dtype=float).T
+        if photo in rotations:
+            turned[seen.photo == i] = turned[seen.photo == i] @ rotations[photo].T
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def held_out_by_cells(
+    cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int
+) -> Bool[np.ndarray, " n"]:
+    """Which observations are held out: all of randomly chosen cells, a `share` of the cells, but never all of a material.
+
+    Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would
+    explain them as well as a lobe that the light needs.
+    """
+    names, number = np.unique(cell, return_inverse=True)
+    chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
+    return chosen & np.isin(material, material[~chosen])

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.reflection.operator import Operator
 from factorlib.stage import serial_map
 
@@ -50,8 +50,7 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     def held_out_losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
         """Robust loss of each held-out observation, block by block; if no observation at all is held out, of each observation."""
-        none = self.none_held_out
-        judged = msgspec.structs.replace(self, blocks=[block.take(block.held_out | none) for block in self.blocks])
+        judged = self.of([block.take(block.held_out | self.none_held_out) for block in self.blocks])
         return [illumination.losses(self.loss) for illumination in judged.illuminations(point)]
 
     def held_out_loss(self, point: Point) -> float:
@@ -77,28 +76,28 @@ class JointProblem(msgspec.Struct, frozen=True):
     def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
         """At most `count` fitted observations of each block (one number, or one a block), and a third as many held out."""
         counts = [count] * len(self.blocks) if isinstance(count, int) else count
-        blocks = [block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)]
-        return msgspec.structs.replace(self, blocks=blocks)
+        return self.of([block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)])
 
     def fitted(self) -> JointProblem:
         """The observations that are not held out."""
-        return msgspec.structs.replace(self, blocks=[block.fitted() for block in self.blocks])
+        return self.of([block.fitted() for block in self.blocks])
 
     def restricted(self, lights: Sequence[int]) -> JointProblem:
         """The blocks of numbers `lights` alone."""
-        return msgspec.structs.replace(self, blocks=[self.blocks[k] for k in lights])
+        return self.of([self.blocks[k] for k in lights])
 
     def with_effects(self, shadows: bool, bounces: bool) -> JointProblem:
         """The same observations, as if meshes cast no shadows, or as if what hides the light were black."""
-        blocks = self.blocks if bounces else [block.without_bounces() for block in self.blocks]
-        return msgspec.structs.replace(
-            self, blocks=blocks if shadows else [block.without_shadows() for block in blocks]
-        )
+        return self.of([block.with_effects(shadows, bounces) for block in self.blocks])
 
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""
-        return msgspec.structs.replace(self, blocks=[block.with_none_held_out() for block in self.blocks])
+        return self.of([block.with_none_held_out() for block in self.blocks])
 
     def with_loss(self, loss: Loss) -> JointProblem:
         """The same observations, another loss."""
         return msgspec.structs.replace(self, loss=loss)
+
+    def of(self, blocks: list[Block]) -> JointProblem:
+        """The same question of other observations."""
+        return msgspec.structs.replace(self, blocks=blocks)

@@ -20,8 +20,8 @@ from factorlib.model.materials import Materials
 from factorlib.reflection.operator import Operator
 from factorlib.results.materials import Solved
 from factorlib.robust import robust_deviation
+from factorlib.solve.few_lobes.equations import nonnegative_minimum
 from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
-from factorlib.solve.few_lobes.normal_equations import nonnegative_minimum
 from factorlib.solve.few_lobes.unknowns import pruned, starting_light
 
 ROUNDS, INSERTED = 3, 16  # of pursuit, and lobes in each, while a pose moves

@@ -8,7 +8,7 @@ have an arrow shape and the illuminations are eliminated one by one (Schur).
     fit         materials and lights fitted together, and how much observations and prior count
     descent     Levenberg–Marquardt: the step and the loop
     marginal    what is minimised: the marginal likelihood, the lights integrated out;  material_prior: what is expected of materials
-    start, warm where a solve starts, from nothing or from an earlier solution
+    start       where a solve starts, from nothing or from an earlier solution;  resume: parts that are done already
     few_lobes   another solver, for exact scenes: lights are few lobes with free axes;  it decides nothing for the first
     paper       the paper's solver, the baseline
 

@@ -18,12 +18,10 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from factorlib.light.prior import LightPrior
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
-from factorlib.model.tone import beyond_cameras, with_curves
 from factorlib.solve.evidence import AGAINST, FOR, Evidence, Losses, compare, losses_of
-from factorlib.solve.fit import Fit, Schedule, all_free, fitted, start_of
+from factorlib.solve.fit import Fit, Schedule, start_of
 from factorlib.solve.options import Choices
 
 TRIAL_OBSERVATIONS, TRIAL_CELLS = 1500, 250  # of a light, while models are compared
@@ -32,12 +30,8 @@ CURVED = Schedule(together=(8,), estimate=False)
 # Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
 # 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
-FEW = 2  # materials: with so few, several starts are tried
-STARTS = (0.15, 0.4, 0.8)  # roughness
 
-Report = Callable[
-    [str, Fit], Callable[[float], None]
-]  # by what is done, and its start: what to call at every point that is tried
+Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
 
 
 class Effects(msgspec.Struct, frozen=True):
@@ -52,11 +46,11 @@ class Effects(msgspec.Struct, frozen=True):
         return problem.with_effects(self.shadows.kept, self.bounces.kept)
 
 
-class Trial(msgspec.Struct, frozen=True):
-    """A fit of one model, and what it makes of held-out observations."""
+class Curves(msgspec.Struct, frozen=True):
+    """The fit with the tone curves that are kept, and the evidence for each light's."""
 
     fit: Fit
-    losses: Losses
+    evidence: list[Evidence]
 
 
 def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
@@ -64,44 +58,30 @@ def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
     return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
 
 
-def effects_chosen(
-    problem: JointProblem, starts: list[Point], prior: LightPrior, choices: Choices, report: Report
-) -> Effects:
+def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices, fit: Fitting) -> Effects:
     """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
     sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
     unjudged = problem.none_held_out  # then what is there anyway stays, and nothing further is added
-    shadows = {"on": hidden, "off": False, "auto": hidden if unjudged or not hidden else None}[choices.self_shadowing]
-    bounces = (
-        {"on": True, "off": False, "auto": False if unjudged else None}[choices.interreflection]
-        if problem.has_bounces
-        else False
-    )
-    tried: dict[tuple[bool, bool], Trial] = {}
+    asked = {"on": True, "off": False}
+    shadows = hidden and asked.get(choices.self_shadowing, True if unjudged else None)
+    bounces = problem.has_bounces and asked.get(choices.interreflection, False if unjudged else None)
+    tried: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
 
-    def trial(with_shadows: bool, with_bounces: bool) -> Trial:
-        """Fit one model from each start, once, and return the best fit."""
+    def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
+        """Fit one model from each start, once, and return the best fit and its losses."""
         if (with_shadows, with_bounces) not in tried:
             name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
             model = sample.with_effects(with_shadows, with_bounces)
-            begun = [start_of(start) for start in starts]
-            fits = [fitted(model, one, prior, TRIAL, all_free(one), report(name, one)) for one in begun]
-            trials = [Trial(fit, losses_of(model, fit.point)) for fit in fits]
-            tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one.losses))
+            fits = [fit(name, model, start_of(start), TRIAL) for start in starts]
+            trials = [(one, losses_of(model, one.point)) for one in fits]
+            tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
         return tried[with_shadows, with_bounces]
 
-    said = (
-        Evidence(bool(shadows))
-        if shadows is not None
-        else compare(trial(False, False).losses, trial(True, False).losses, AGAINST)
-    )
+    said = Evidence(shadows) if shadows is not None else compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
     if not said.kept:
-        return Effects(trial(False, False).fit, said, Evidence(False))
-    lit = (
-        Evidence(bool(bounces))
-        if bounces is not None
-        else compare(trial(True, False).losses, trial(True, True).losses, FOR)
-    )
-    return Effects(trial(True, lit.kept).fit, said, lit)
+        return Effects(trial(False, False)[0], said, Evidence(False))
+    lit = Evidence(bounces) if bounces is not None else compare(trial(True, False)[1], trial(True, True)[1], FOR)
+    return Effects(trial(True, lit.kept)[0], said, lit)
 
 
 def _geometric_mean(losses: Losses) -> float:
@@ -111,42 +91,24 @@ def _geometric_mean(losses: Losses) -> float:
     return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
 
 
-class Curves(msgspec.Struct, frozen=True):
-    """The fit with the tone curves that are kept, and the evidence for each light's."""
-
-    fit: Fit
-    evidence: list[Evidence]
-
-
-def curves_chosen(problem: JointProblem, fit: Fit, prior: LightPrior, choices: Choices, report: Report) -> Curves:
-    """Tone curves; problem: sure observations, with the effects that were chosen;  fit: of few of them."""
-    lights = fit.point.lights
+def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Curves:
+    """Tone curves; problem: sure observations, with the effects that were chosen;  before: the fit of few of them."""
+    lights = before.point.lights
     had = [len(light.log_tone) > 0 for light in lights]
     if choices.tone == "off" or problem.none_held_out:
-        return Curves(fit, [Evidence(has) for has in had])
-    sample, freed = (
-        sample_of(problem, choices),
-        [light if has else with_curves(light) for light, has in zip(lights, had, strict=True)],
-    )
-    curved = _with_lights(fit, freed)
-    curved = fitted(sample, curved, prior, CURVED, all_free(fit), report("tone curves", curved))
-    before, after = losses_of(sample, fit.point), losses_of(sample, curved.point)
-    evidence = []
+        return Curves(before, [Evidence(has) for has in had])
+    sample = sample_of(problem, choices)
+    freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
+    curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
+    losses, evidence = [losses_of(sample, one.point) for one in (before, curved)], []
     for k, light in enumerate(curved.point.lights):
-        one = compare(
-            Losses([before.values[k]], [before.clusters[k]]), Losses([after.values[k]], [after.clusters[k]]), FOR
-        )
+        one = compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in losses), FOR)
         gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
-        kept = one.kept and gain > CURVED_GAIN and not beyond_cameras(light)
+        kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
         evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))
     if all(one.kept for one in evidence):
         return Curves(curved, evidence)
     if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
-        return Curves(fit, evidence)
+        return Curves(before, evidence)
     kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
-    begun = _with_lights(fit, kept)
-    return Curves(fitted(sample, begun, prior, CURVED, all_free(fit), report("tone curves", begun)), evidence)
-
-
-def _with_lights(fit: Fit, lights: list) -> Fit:
-    return msgspec.structs.replace(fit, point=Point(fit.point.materials, lights))
+    return Curves(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)

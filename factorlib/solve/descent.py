@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS, TONE
-from factorlib.model.lights import Light
+from factorlib.model.lights import TONE, Light
+from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.model.problem import Spread
 from factorlib.solve.marginal import Field, Marginal, marginal
 from factorlib.solve.material_prior import Gaussian, MaterialPrior, materials_of
@@ -48,23 +48,21 @@ class State(NamedTuple):
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """prior: on materials;  spread: a map over lights;  tolerance: as TOLERANCE."""
+    """prior: on materials;  spread: a map over lights."""
 
     prior: MaterialPrior
     spread: Spread
-    report: Report = lambda loss: None
-    tolerance: float = TOLERANCE
+    report: Report
 
     def run(
-        self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], free: Bool[np.ndarray, "m 7"], iterations: int
+        self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool, iterations: int
     ) -> State:
-        """The state after at most so many steps; only the materials' unknowns that are `free` change, and all lights."""
-        given, damping = not free.any(), DAMPING
-        state = self.at(fields, theta, given)
+        """The state after at most so many steps of all lights and, unless they are given, of all materials."""
+        state, damping = self.at(fields, theta, materials_given), DAMPING
         for _ in range(iterations):
-            trial = self.at(*stepped(state, free, damping), given)
+            trial = self.at(*stepped(state, materials_given, damping), materials_given)
             if trial.value < state.value:
-                small = state.value - trial.value < self.tolerance * abs(state.value)
+                small = state.value - trial.value < TOLERANCE * abs(state.value)
                 state, damping = trial, damping * LOWER
                 if small:
                     break
@@ -76,49 +74,38 @@ class Descent(msgspec.Struct, frozen=True):
 
     def at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool) -> State:
         """Compute the systems of all lights at some materials; `marginal` says what `materials_given` means."""
-        materials = materials_of(theta)
-        fields = [
-            msgspec.structs.replace(f, illumination=msgspec.structs.replace(f.illumination, materials=materials))
-            for f in fields
-        ]
+        materials, replaced = materials_of(theta), msgspec.structs.replace
+        fields = [replaced(f, illumination=replaced(f.illumination, materials=materials)) for f in fields]
         parts = list(self.spread(lambda field: marginal(field, materials_given=materials_given), fields))
         prior, values = self.prior.at(theta), sum(3 * int((~f.illumination.block.held_out).sum()) for f in fields)
         self.report(sum(part.loss for part in parts) / max(values, 1))
         return State(theta, fields, sum(part.value for part in parts) + prior.value, parts, prior)
 
 
-def stepped(
-    state: State, free: Bool[np.ndarray, "m 7"], damping: float
-) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
+def stepped(state: State, materials_given: bool, damping: float) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
     """Fields and materials after the damped step (1), each unknown within its range and changed by no more than is sound."""
-    H, g, solutions = state.prior.hessian.copy(), state.prior.gradient.copy(), []
+    H, g, solutions = state.prior.hessian.copy(), state.prior.gradient.copy(), []  # of the materials
     for part in state.parts:
         H[np.ix_(part.places, part.places)] += part.material_hessian
         g[part.places] += part.material_gradient
     H = damped(H, damping)
     for part in state.parts:
-        factor = cho_factor(damped(part.light_hessian, damping), check_finite=False)
-        solution = cho_solve(
-            factor,
-            np.column_stack([part.cross_hessian.T, part.light_gradient, part.determinant_by_light]),
-            check_finite=False,
-        )
-        H[np.ix_(part.places, part.places)] -= part.cross_hessian @ solution[:, :-2]
-        g[part.places] -= part.cross_hessian @ (solution[:, -2] + solution[:, -1])
+        L, C = damped(part.light_hessian, damping), part.cross_hessian
+        right = np.column_stack([C.T, part.light_gradient, part.determinant_by_light])
+        solution = cho_solve(cho_factor(L, check_finite=False), right, check_finite=False)
+        H[np.ix_(part.places, part.places)] -= C @ solution[:, :-2]
+        g[part.places] -= C @ (solution[:, -2] + solution[:, -1])
         solutions.append(solution)
-    may = free.reshape(-1)
-    change = np.linalg.solve(masked(H, may), np.where(may, -g, 0.0)).reshape(-1, 7)
-    theta = state.theta + change.clip(-MOST_CHANGE, MOST_CHANGE)
-    theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
-    theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
-    theta = np.where(free, theta, state.theta)
+    theta = state.theta
+    if not materials_given:
+        theta = theta + np.linalg.solve(H, -g).reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
+        theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
+        theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
     dm, fields = (theta - state.theta).reshape(-1), []
     for field, part, solution in zip(state.fields, state.parts, solutions, strict=True):
-        step = -(solution[:, -2] + solution[:, :-2] @ dm[part.places])
-        one = field.illumination
-        fields.append(
-            msgspec.structs.replace(field, illumination=msgspec.structs.replace(one, light=moved(one.light, step)))
-        )
+        light = moved(field.illumination.light, -(solution[:, -2] + solution[:, :-2] @ dm[part.places]))
+        one = msgspec.structs.replace(field.illumination, light=light)
+        fields.append(msgspec.structs.replace(field, illumination=one))
     return fields, theta
 
 

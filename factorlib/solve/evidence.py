@@ -1,7 +1,7 @@
 """How choices of the model are made: by observations that no candidate was fitted to.
 
 Two models are fitted to the same observations, each for itself.  Held-out observations are those of whole cells of mirror directions
-(`factorlib.model.clusters`).  With a_i and b_i the mean robust losses of light i without and with the richer part, and n_i its held-out
+(`factorlib.model.observed`).  With a_i and b_i the mean robust losses of light i without and with the richer part, and n_i its held-out
 observations,
 
     d = Σ_i n_i (log a_i − log b_i) / Σ_i n_i                                                                       (1)
@@ -21,8 +21,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from factorlib.model.clusters import clusters_of
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 
 LEAST_LOSS = 1e-4  # in σ² of the noise model, added to every loss: two losses far below it count as equal
@@ -54,7 +53,7 @@ def losses_of(problem: JointProblem, point: Point) -> Losses:
     """The held-out observations' losses at a point; of every observation, if none is held out."""
     none = problem.none_held_out
     judged = [block.take(block.held_out | none) for block in problem.blocks]
-    return Losses(problem.held_out_losses(point), [clusters_of(block) for block in judged])
+    return Losses(problem.held_out_losses(point), [block.clusters() for block in judged])
 
 
 def compare(without: Losses, richer: Losses, least: float) -> Evidence:

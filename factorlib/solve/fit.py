@@ -18,22 +18,19 @@ show directions that nothing else shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.light.prior import LightPrior
 from factorlib.model.blocks import Block
-from factorlib.model.clusters import clusters_of
 from factorlib.model.illumination import Illumination
+from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
-from factorlib.model.reflected import Reflections
-from factorlib.solve.descent import Descent, State
+from factorlib.model.responses import Reflections
+from factorlib.solve.descent import Descent, Report
 from factorlib.solve.marginal import Field, Marginal, positive_definite_inverse
 from factorlib.solve.material_prior import MaterialPrior, materials_of, unknowns_of
 
@@ -42,7 +39,7 @@ DARK = 0.2  # of the noise model's absolute part is left where normals are sure
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
 LEAST_AT_START = (
-    0.01  # of reflectances: of a smaller one the derivative by its logarithm is nearly zero, and no step would move it
+    0.01  # of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it
 )
 
 
@@ -64,20 +61,26 @@ class Fit(msgspec.Struct, frozen=True):
     hyperparameters: list[Hyperparameters]
     value: float = float("inf")
 
+    def with_lights(self, lights: list[Light]) -> Fit:
+        """Return the start of another fit, in other lights."""
+        return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
+
 
 class Schedule(msgspec.Struct, frozen=True):
     """How many steps a fit takes.
 
     lights     of the lights alone, materials given, before all else
-    together   of materials and lights; hyperparameters are estimated anew before each of these descents but the first
+    together   of lights and, unless they are given, materials; hyperparameters are estimated anew before each of these descents but the first
     estimate   whether they are estimated before the first one too: right after a splitting, residuals show the splitting, not the noise
     least      the least temperature of (1)
+    given      whether materials stay as they are
     """
 
     lights: int = 0
     together: tuple[int, ...] = ()
     estimate: bool = True
     least: float = 1.0
+    given: bool = False
 
 
 def fitted(
@@ -85,43 +88,28 @@ def fitted(
     start: Fit,
     prior: LightPrior,
     schedule: Schedule,
-    free: Bool[np.ndarray, "m 7"],
-    report: Callable[[float], None] = lambda loss: None,
+    report: Report = lambda loss: None,
 ) -> Fit:
     """The fit of the observations that are not held out.
 
-    start: where the descent begins; its cells stay;  free: unknowns of the materials that change;  report: called at every point that is
-    tried, with the mean robust loss of what is fitted
+    start: where the descent begins; its cells stay;  report: called at every point that is tried, with the mean robust loss of what is fitted
     """
-    problem = problem.fitted()
-    materials = above_zero(start.point.materials, free)
-    point = Point(materials, start.point.lights)
+    problem, given, hyperparameters = problem.fitted(), schedule.given, start.hyperparameters
+    materials = start.point.materials if given else above_zero(start.point.materials)
     descent = Descent(MaterialPrior(materials, problem.blocks), problem.spread, report)
-    given = not free.any()
-    fields = list(
-        problem.spread(
-            lambda one: field_of(*one, prior, given),
-            list(zip(problem.illuminations(point), start.hyperparameters, strict=True)),
-        )
-    )
-    state, hyperparameters = (
-        descent.run(fields, unknowns_of(materials), np.zeros_like(free), schedule.lights),
-        start.hyperparameters,
-    )
+    illuminations = problem.illuminations(Point(materials, start.point.lights))
+    pairs = list(zip(illuminations, hyperparameters, strict=True))
+    fields = list(problem.spread(lambda pair: field_of(*pair, prior, given), pairs))
+    state = descent.run(fields, unknowns_of(materials), True, schedule.lights)
     for number, iterations in enumerate(schedule.together):
         fields = state.fields
         if number or schedule.estimate:
-            parts = list(zip(state.fields, state.parts, strict=True))
-            hyperparameters = list(problem.spread(lambda one: estimated(*one, prior, schedule.least), parts))
-            fields = [recounted(field, one, prior) for field, one in zip(state.fields, hyperparameters, strict=True)]
-        state = descent.run(fields, state.theta, free, iterations)
-    return Fit(_point_of(state, materials, free), hyperparameters, state.value)
-
-
-def _point_of(state: State, start: Materials, free: Bool[np.ndarray, "m 7"]) -> Point:
-    """Unknowns that are not free are those of the start to the last bit."""
-    rows = np.where(free, materials_of(state.theta).rows(), start.rows())
-    return Point(Materials(rows[:, :3], rows[:, 3:6], rows[:, 6]), [field.illumination.light for field in state.fields])
+            parts = list(zip(fields, state.parts, strict=True))
+            hyperparameters = list(problem.spread(lambda part: estimated(*part, prior, schedule.least), parts))
+            fields = [recounted(field, one, prior) for field, one in zip(fields, hyperparameters, strict=True)]
+        state = descent.run(fields, state.theta, given, iterations)
+    lights = [field.illumination.light for field in state.fields]
+    return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
 
 
 def field_of(
@@ -129,18 +117,14 @@ def field_of(
 ) -> Field:
     """Give an illumination its table of responses, and say how much its observations and the prior count."""
     table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
-    precision, log_determinant = prior.precision(illumination.light.axis, one.factors)
-    return Field(
-        msgspec.structs.replace(illumination, table=table), precision, log_determinant, one.temperature, ROBUST
-    )
+    field = Field(msgspec.structs.replace(illumination, table=table), np.zeros((0, 0)), 0.0, 1.0, ROBUST)
+    return recounted(field, one, prior)
 
 
 def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
     """Return the field as other hyperparameters weight it."""
-    precision, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
-    return msgspec.structs.replace(
-        field, precision=precision, log_determinant=log_determinant, temperature=one.temperature
-    )
+    Q, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
+    return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
 
 
 def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
@@ -154,25 +138,22 @@ def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> 
 
 def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
     """T of (1)."""
-    number, bounded = clusters_of(block), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    number, bounded = block.clusters(), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 
 
-def above_zero(materials: Materials, free: Bool[np.ndarray, "m 7"]) -> Materials:
-    """The materials, reflectances that are free raised to at least `LEAST_AT_START`."""
+def above_zero(materials: Materials) -> Materials:
+    """The materials, reflectances raised to at least `LEAST_AT_START`."""
     rows = materials.rows()
-    rows[:, :6] = np.where(free[:, :6], np.maximum(rows[:, :6], LEAST_AT_START), rows[:, :6])
-    return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
+    rows[:, :6] = np.maximum(rows[:, :6], LEAST_AT_START)
+    return Materials.of_rows(rows)
 
 
 def sure_ones(problem: JointProblem) -> JointProblem:
     """The observations that materials are fitted to: those whose normals are sure, with less noise in the dark."""
-    blocks = [block.take(sure(block)) for block in problem.blocks]
-    blocks = [
-        block.with_noise(msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute)) for block in blocks
-    ]
-    return msgspec.structs.replace(problem, blocks=blocks)
+    noises = [msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute) for block in problem.blocks]
+    return problem.of([b.take(sure(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)])
 
 
 def sure(block: Block) -> Bool[np.ndarray, " n"]:
@@ -188,11 +169,6 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
     return result
 
 
-def all_free(fit: Fit) -> Bool[np.ndarray, "m 7"]:
-    """Let every unknown of the materials change."""
-    return np.ones((len(fit.point.materials), 7), bool)
-
-
-def start_of(point: Point, hyperparameters: Sequence[Hyperparameters] | None = None) -> Fit:
+def start_of(point: Point) -> Fit:
     """Return the fit that a point is before any descent."""
-    return Fit(point, list(hyperparameters or [Hyperparameters() for _ in point.lights]))
+    return Fit(point, [Hyperparameters() for _ in point.lights])

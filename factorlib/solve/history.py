@@ -1,4 +1,4 @@
-"""What a run of a solver reports, and what it ends with."""
+"""What a run of a solver reports, how far that says it is, and what it ends with."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from factorlib.model.loss import Loss
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.evidence import Evidence
 from factorlib.solve.fit import Fit
+from factorlib.solve.options import Choices
 
 
 class Event(msgspec.Struct, frozen=True):
@@ -29,6 +30,15 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
+Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
+PHASES = (
+    "no shadows",
+    "shadows",
+    "shadows and bounces",
+    "tone curves",
+    "materials and lights",
+)  # then splittings, and lights
+POINTS = 30  # of a phase: about as many as are tried
 
 
 def unreported(event: Event) -> None:
@@ -61,3 +71,29 @@ class Solution(msgspec.Struct, frozen=True):
     def shown(self, problem: JointProblem) -> JointProblem:
         """The problem that the answer solves: with shadows and bounces or without, with the last loss."""
         return problem.with_effects(self.shadows.kept, self.interreflection.kept).with_loss(self.loss)
+
+
+def of_rounds(progress: Progress, rounds: int) -> Report:
+    """The progress of a solver that takes at most so many rounds, or reports so many subsets: few lobes', or the paper's."""
+
+    def report(event: Event) -> None:
+        """Say how many of all rounds are done."""
+        done = event.round if event.phase in ("descent", "round", "subset") else rounds
+        progress(done, rounds + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes")
+
+    return report
+
+
+def of_parts(progress: Progress, choices: Choices) -> Report:
+    """The progress of the joint solve, which never goes back: where there are several starts, a phase is entered several times."""
+    phases = (*PHASES, *(f"splitting {k + 1}" for k in range(choices.splittings)), "lights")
+    furthest = 0.0
+
+    def report(event: Event) -> None:
+        """Say how many of all phases are done."""
+        nonlocal furthest
+        within = 1.0 if event.iteration < 0 else min(event.iteration / POINTS, 1.0)
+        furthest = min(max(furthest, phases.index(event.phase) + within), len(phases) - 0.01)
+        progress(furthest, len(phases), f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
+
+    return report

@@ -111,10 +111,8 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
             scores[:, at] += summing @ part.by_material
             scores[:, k + own.start : k + own.stop] += summing @ J
             scores[:, k + 3 * p :] += summing @ part.by_photo
-    loss, by_light = (
-        float(field.loss.of_residuals(shown.residual_of(one.block))[~one.block.held_out].sum()),
-        np.zeros(size),
-    )
+    residual, by_light = one.block.residuals(shown.radiance), np.zeros(size)
+    loss = float(field.loss.of_residuals(residual)[~one.block.held_out].sum())
     value += loss / T
     if materials_given:
         return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)

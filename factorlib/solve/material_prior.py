@@ -30,9 +30,8 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS
-from factorlib.model.components import connected_components
-from factorlib.model.materials import Materials
+from factorlib.model.gauge import connected_components
+from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS, Materials
 
 DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
 SPECULAR, LEVEL, TINT = (

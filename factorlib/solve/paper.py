@@ -38,13 +38,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.model.blocks import Block
-from factorlib.model.bounds import ROUGHNESS, SHARPNESS
 from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import ROUGHNESS, SHARPNESS, Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import UnitReflection, cosines, radiance_of
 from factorlib.solve.history import Event, Report, Solution, unreported
@@ -58,7 +55,6 @@ MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
 SUFFICIENT, HALVINGS = 1e-4, 12
 REPORTS = 20  # in a run
-
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
@@ -82,17 +78,14 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / paper.subset)
-    every = max(1, iterations // REPORTS)
+    every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
     x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
     for iteration in range(iterations):
         subset = drawn(rows, paper.subset, random)
         x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
-            point = objective.point(x)
-            held_out = problem.held_out_loss(point)
-            history.append(
-                Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, paper.lobes * len(blocks))
-            )
+            held_out = problem.held_out_loss(objective.point(x))
+            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
             report(history[-1])
     return Solution(in_gauge(objective.point(x), blocks), history, problem.loss, np.zeros(materials, bool))
 
@@ -155,38 +148,33 @@ class PaperObjective:
     def start(self) -> Float[Tensor, " k"]:
         """Even lobes under which the block's mean radiance, 1, is what its materials reflect."""
         p, begin = self.paper.lobes, self.begin
-        bounded = np.column_stack([begin.diffuse, begin.specular, _share(begin.roughness, ROUGHNESS)])
-        sharpness = p / 2  # 1/λ of a lobe's variance, where p of them cover 4π
-        parts = [_logit(bounded).reshape(-1)]
+        roughness = _unbounded(begin.roughness, ROUGHNESS)
+        parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
+        level = np.full((p, 1), _unbounded(np.log(p / 2), np.log(SHARPNESS)))  # λ of lobes whose variances cover 4π
         for block in self.blocks:
             reflectance = (begin.diffuse + begin.specular)[block.material].mean(0)
             weight = np.tile(block.radiance.mean(0) / np.maximum(reflectance, 1e-3), (p, 1))
-            level = np.full((p, 1), _logit(_share(np.log(sharpness), np.log(SHARPNESS))))
-            parts += [
-                np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))]).reshape(-1),
-                np.zeros(len(block.photos) - 1),
-            ]
+            lobes = np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))])
+            parts += [lobes.reshape(-1), np.zeros(len(block.photos) - 1)]
         return torch.from_numpy(np.concatenate(parts))
 
     def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
         """(diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
-        parts = torch.split(x, self.sizes)
-        bounded = torch.sigmoid(parts[0].reshape(-1, 7))
-        low, high = ROUGHNESS
-        materials = bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]
-        return materials, [self._light(part) for part in parts[1:]]
-
-    def _light(self, part: Tensor) -> tuple[Tensor, ...]:
-        rows = part[: 7 * self.paper.lobes].reshape(-1, 7)
-        low, high = np.log(SHARPNESS)
-        axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
-        exposure = torch.cat([part.new_zeros(1), part[7 * self.paper.lobes :]])
-        return axis, low + (high - low) * torch.sigmoid(rows[:, 3]), torch.nn.functional.softplus(rows[:, 4:]), exposure
+        of_materials, *of_lights = torch.split(x, self.sizes)
+        bounded = torch.sigmoid(of_materials.reshape(-1, 7))
+        (low, high), (least, most), lights = ROUGHNESS, np.log(SHARPNESS), []
+        for part in of_lights:
+            rows, others = part[: 7 * self.paper.lobes].reshape(-1, 7), part[7 * self.paper.lobes :]
+            axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
+            log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
+            weight = torch.nn.functional.softplus(rows[:, 4:])
+            lights.append((axis, log_sharpness, weight, torch.cat([part.new_zeros(1), others])))
+        return (bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]), lights
 
     def point(self, x: Tensor) -> Point:
         """The materials and lights that x stands for."""
-        materials, lights = self.unpacked(x)
-        vector = torch.cat([materials[0], materials[1], materials[2][:, None]], 1).reshape(-1).numpy()
+        (diffuse, specular, roughness), lights = self.unpacked(x)
+        vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         return Point(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights])
 
     def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
@@ -194,45 +182,29 @@ class PaperObjective:
         x = x.detach().requires_grad_()
         (diffuse, specular, roughness), lights = self.unpacked(x)
         squares, values, prior = x.new_zeros(()), 0, x.new_zeros(())
-        for block, light, rows in zip(self.blocks, lights, subset, strict=True):
-            prior = prior + _variance(light[2].sum(0))
+        for block, (axis, log_sharpness, weight, log_exposure), rows in zip(self.blocks, lights, subset, strict=True):
+            sums = weight.sum(0)
+            prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # their variance over channels
             for m in np.unique(block.material[rows]).tolist():
                 own = rows[block.material[rows] == m]
-                predicted = self._predicted(block, own, light, (diffuse[m], specular[m], roughness[m]))
-                difference = (predicted - torch.from_numpy(block.radiance[own])) * torch.from_numpy(
-                    block.precision[own]
+                normal, view, photo, radiance, precision, clipped = (
+                    torch.from_numpy(of[own])
+                    for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
                 )
-                satisfied = torch.from_numpy(block.clipped[own]) & (difference > 0)
-                squares = squares + (difference.masked_fill(satisfied, 0.0) ** 2).sum()
+                seen = cosines(normal, view, axis)
+                lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
+                exposure = torch.exp(log_exposure)[photo][:, None]
+                predicted = radiance_of(exposure, diffuse[m], specular[m], *(part @ weight for part in lit))
+                difference = (predicted - radiance) * precision
+                squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
         value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
         value.backward()
         return value.item(), x.grad
 
-    def _predicted(
-        self, block: Block, rows: Int[np.ndarray, " n"], light: tuple[Tensor, ...], material: tuple[Tensor, ...]
-    ) -> Float[Tensor, "n 3"]:
-        """`factorlib.model.responses`, equation (1), on autograd's graph."""
-        axis, log_sharpness, weight, log_exposure = light
-        diffuse, specular, roughness = material
-        seen = cosines(torch.from_numpy(block.normal[rows]), torch.from_numpy(block.view[rows]), axis)
-        parts = UnitReflection.apply(self.operator, roughness, log_sharpness, *seen)
-        exposure = torch.exp(log_exposure)[torch.from_numpy(block.photo[rows])]
-        return radiance_of(exposure[:, None], diffuse, specular, *(part @ weight for part in parts))
 
-
-def _variance(sums: Float[Tensor, "3"]) -> Tensor:
-    """Variance over channels of the summed weights, in units of their squared mean."""
-    return ((sums / sums.mean() - 1) ** 2).mean()
-
-
-def _share(value: Float[np.ndarray, "*n"] | float, bounds: tuple[float, float]) -> Float[np.ndarray, "*n"]:
-    """Where between its bounds a value lies, 0 to 1."""
+def _unbounded(value: Float[np.ndarray, "*n"], bounds: tuple[float, float] = (0.0, 1.0)) -> Float[np.ndarray, "*n"]:
+    """The inverse of a sigmoid onto the bounds, of values that are kept off their ends."""
     low, high = bounds
-    return (np.asarray(value) - low) / (high - low)
-
-
-def _logit(share: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """The inverse of the sigmoid, of shares that are kept off 0 and 1."""
-    share = np.clip(share, 1e-4, 1 - 1e-4)
+    share = np.clip((value - low) / (high - low), 1e-4, 1 - 1e-4)
     return np.log(share / (1 - share))

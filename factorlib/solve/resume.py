@@ -1,47 +1,43 @@
-"""The journal of a solve: the parts that are done, so that a solve that was killed goes on and ends in the same bytes.
+"""The parts of a solve: each is done once, said as it is done, and kept, so that a solve that was killed goes on and ends in the same bytes.
 
-Every part (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the part before it, so a part that was saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory
-layout of an array can change the order of a sum, and so the last bits.
+Every part (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the part before it, so a part that was
+saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory layout of an array can change the order
+of a sum, and so the last bits.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeVar, get_args, get_type_hints
+from collections.abc import Callable
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 import numpy as np
 import torch
 
+from factorlib.checkpoint import Checkpoint
+from factorlib.light.prior import LightPrior
+from factorlib.model.problem import JointProblem
+from factorlib.solve.fit import Fit, Schedule, fitted
+from factorlib.solve.history import Event, Report
+
 T = TypeVar("T")
 
 
-class Keeper(Protocol):
-    """Keeps one state of tensors, numbers, strings, lists and dictionaries, as `factorlib.checkpoint.Checkpoint` does."""
-
-    def load(self) -> dict[str, Any] | None:
-        """What was saved last, None where nothing was."""
-
-    def save(self, state: dict[str, Any]) -> None:
-        """Keep the state instead of what was saved before."""
-
-
 class Journal:
-    """keeper: None keeps nothing beyond this process (a notebook, a test)."""
+    """The parts that are done; a checkpoint of no file keeps nothing beyond this process (a notebook, a test)."""
 
-    def __init__(self, keeper: Keeper | None = None):
-        self._keeper = keeper
-        self._parts: dict[str, Any] = (keeper.load() if keeper else None) or {}
+    def __init__(self, checkpoint: Checkpoint = Checkpoint(None)):
+        self._checkpoint, self._parts = checkpoint, checkpoint.load() or {}
 
     def kept(self, part: str, type_: type[T]) -> T | None:
-        """What was saved of the part, done or half done; None where it was not begun."""
+        """What was saved of the part; None where it was not done."""
         return restored(type_, self._parts[part]) if part in self._parts else None
 
-    def keep(self, part: str, value: T) -> T:
+    def keep(self, part: str, value: T, type_: type[T]) -> T:
         """Save the part; returns `value` as `kept` would."""
         self._parts[part] = plain(value)
-        if self._keeper:
-            self._keeper.save(self._parts)
-        return restored(type(value), self._parts[part])
+        self._checkpoint.save(self._parts)
+        return restored(type_, self._parts[part])
 
 
 def plain(value: Any) -> Any:
@@ -61,3 +57,44 @@ def restored(type_: type[T], value: Any) -> T:
         hints = get_type_hints(type_)
         return type_(**{name: restored(hints[name], item) for name, item in value.items()})
     return [restored(*get_args(type_), item) for item in value] if isinstance(value, list) else value
+
+
+class Parts:
+    """What is done part by part: the journal keeps each part with its events, which are reported and remembered."""
+
+    def __init__(self, journal: Journal, report: Report, prior: LightPrior):
+        self.journal, self.report, self.prior, self.history = journal, report, prior, list[Event]()
+
+    def part(self, name: str, type_: type[T], compute: Callable[[], T]) -> T:
+        """The part as the journal has it, or computed now and kept; its events join the history."""
+        if (kept := self.journal.kept(name, type_)) is not None:
+            for event in self.journal.kept(f"{name}, events", list[Event]):
+                self._happened(event)
+            return kept
+        before, value = len(self.history), compute()
+        self.journal.keep(f"{name}, events", self.history[before:], list[Event])
+        return self.journal.keep(name, value, type_)
+
+    def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
+        """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""
+        number = self.history[-1].round + 1 if self.history else 0
+        iteration, cells = 0, sum(map(len, start.point.lights))
+
+        def tell(loss: float) -> None:
+            """Report one point."""
+            nonlocal iteration
+            self._happened(Event(number, phase, iteration, loss, float("nan"), cells))
+            iteration += 1
+
+        return fitted(problem, start, self.prior, schedule, tell)
+
+    def judged(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
+        """The fit, whose held-out loss is reported as the end of its part (iteration −1)."""
+        fit = self.fit(phase, problem, start, schedule)
+        held_out = problem.held_out_loss(fit.point)
+        self._happened(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
+        return fit
+
+    def _happened(self, event: Event) -> None:
+        self.history.append(event)
+        self.report(event)

@@ -1,37 +1,67 @@
-"""Where a solve starts: reflectances from median radiances, exposures from mean ones, constant lights.
+"""Where a solve starts: from mean radiances alone, or from an earlier solution, of which what has a name there is used.
 
-The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose logarithm is
-fitted as a sum by least squares.
+From nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose
+               logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, lights are constant.
+From earlier   Materials are known by their names, lights by their illumination's.  Mean radiances give all materials one relative scale
+               (`mean_albedo`), known or new; each gauge of the earlier solution is brought to that scale by one factor per channel, the
+               geometric mean over its materials, and its lights by the inverse.  So groups that a new photo links come into one gauge, and
+               new materials stand beside the known ones.  A new photo of a known light gets the exposure that explains its mean radiance; a
+               new light is constant.  A light that explains its photos worse than a constant does (it was taken again, or turned, or in
+               other units) is not known but new.  Only the start, and what was decided of shadows and bounces, are taken over: nothing pulls
+               toward the earlier answer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import LEAST_REFLECTANCE
-from factorlib.model.lights import Light, even_cells
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.illumination import Illumination
+from factorlib.model.lights import TONE, Light, even_cells
+from factorlib.model.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
+from factorlib.model.problem import JointProblem
+from factorlib.results.solution import Earlier
+from factorlib.solve.options import Choices
 
+log = logging.getLogger("factorlib.solve")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
 ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
+FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
 LEAST_RADIANCE = 1e-6  # of a block's mean
 
+Start = Callable[
+    [JointProblem, int], list[Point]
+]  # points on so many cells a light, of which the one that explains most goes on
 
-def starting_point(
-    blocks: Sequence[Block],
-    count: int,
-    cells: int,
-    roughness: float = ROUGHNESS,
-    specular_share: float = SPECULAR_SHARE,
-) -> Point:
-    """Materials 0 … `count`−1 whose diffuse part explains median radiances, and one constant light of `cells` cells a block."""
-    materials = starting_materials(blocks, count, specular_share, roughness)
-    return Point(materials, [constant_light(block, materials, cells) for block in blocks])
+
+def from_nothing(materials: int) -> Start:
+    """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
+
+    def points(problem: JointProblem, cells: int) -> list[Point]:
+        """One point a roughness, its lights constant."""
+        blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
+        begun = [starting_materials(blocks, materials, roughness=one) for one in roughness]
+        return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
+
+    return points
+
+
+def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
+    """The start of a problem whose materials are called `names`; lights of the earlier solution keep their cells."""
+    return lambda problem, cells: [known_point(problem, earlier, names, cells)]
+
+
+def with_decided(choices: Choices, earlier: Earlier) -> Choices:
+    """Return the choices with shadows and bounces as they were decided before, where the two had been compared."""
+    for name in ("self_shadowing", "interreflection"):
+        if getattr(choices, name) == "auto" and getattr(earlier, name):
+            choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
+    return choices
 
 
 def starting_materials(
@@ -74,3 +104,82 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     lobes = even_cells(cells)
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
     return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
+
+
+def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
+    """Build the point from which a solve starts that has an earlier solution."""
+    blocks, component = problem.blocks, [earlier.table.gauge.component.get(name) for name in names]
+    factors = gauge_factors(earlier, names, component, mean_albedo(blocks, len(names)), blocks)
+    rows = starting_materials(blocks, len(names)).rows()
+    for m, name in enumerate(names):
+        if component[m] is not None:
+            known, factor = earlier.table.materials[name], factors[component[m]]
+            rows[m] = [*(known.diffuse * factor), *(known.specular * factor), known.roughness]
+    materials, lights = Materials.of_vector(rows.reshape(-1)), []
+    for block in blocks:
+        light = constant_light(block, materials, cells)
+        shown = [component[m] for m in np.unique(block.material) if component[m] is not None]
+        if shown:
+            factor = factors[max(set(shown), key=lambda c: (shown.count(c), -c))]
+            light = better_one(problem, block, materials, known_light(block, light, earlier, factor), light)
+        lights.append(light)
+    return Point(materials, lights)
+
+
+def gauge_factors(
+    earlier: Earlier,
+    names: Sequence[str],
+    component: Sequence[int | None],
+    albedo: Float[np.ndarray, "m 3"],
+    blocks: Sequence[Block],
+) -> dict[int, Float[np.ndarray, "3"]]:
+    """Find, for each component of the earlier solution, the factor per channel that brings its reflectances to the scale of `albedo`.
+
+    The factor is the geometric mean over the component's materials that a block shows, or over all of them where none is shown.
+    """
+    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    for c in sorted({c for c in component if c is not None}):
+        members = [m for m in range(len(names)) if component[m] == c]
+        members = [m for m in members if m in shown] or members
+        known = [earlier.table.materials[names[m]] for m in members]
+        whole = np.array([np.array(one.diffuse) + np.array(one.specular) for one in known])
+        factors[c] = np.exp(np.mean(np.log(albedo[members]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
+    return factors
+
+
+def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light | None:
+    """Bring the earlier light of a block to the block's unit and the start's gauge; None where there is none.
+
+    A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
+    """
+    lobes = earlier.lights.get(block.name)
+    exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
+    if not lobes or np.isnan(exposure).all():
+        return None
+    new = np.isnan(exposure)
+    level = np.mean(exposure[~new] - constant.log_exposure[~new])
+    exposure = np.where(new, constant.log_exposure + level, exposure)
+    tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
+    return Light(
+        lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
+        np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
+        np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
+        exposure - exposure[0],
+        np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
+    )
+
+
+def better_one(
+    problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light
+) -> Light:
+    """Return the known light, unless the constant one explains the block better."""
+    if known is None:
+        return constant
+    lit = [Illumination(block, one, materials, problem.operator) for one in (known, constant)]
+    if lit[0].losses(problem.loss).mean() <= lit[1].losses(problem.loss).mean():
+        return known
+    log.warning(
+        "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light",
+        block.name,
+    )
+    return constant

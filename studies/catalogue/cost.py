@@ -130,8 +130,7 @@ def measured(seed: int, side: int, solve: dict[str, Any]) -> dict[str, float]:
 
     from factorlib.model.problem import JointProblem
     from factorlib.reflection import reflection_operator
-    from factorlib.solve.few_lobes.history import Run
-    from factorlib.solve.few_lobes.options import FewLobes
+    from factorlib.solve.few_lobes.options import FewLobes, Run
     from factorlib.solve.few_lobes.solve import few_lobes
     from studies.scenes.problems import square
 

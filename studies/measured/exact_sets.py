@@ -20,7 +20,8 @@ from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
-from factorlib.solve.solve import from_nothing, solve
+from factorlib.solve.solve import solve
+from factorlib.solve.start import from_nothing
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, concatenate
 from studies.measured.tools import Clock, Tables, exact

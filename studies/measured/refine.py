@@ -25,8 +25,7 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge

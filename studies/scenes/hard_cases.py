@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.diagnose.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
 from factorlib.diagnose.uncertainty import standard_errors
 from factorlib.model.blocks import Block
-from factorlib.model.components import connected_components
+from factorlib.model.gauge import connected_components
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.materials import Materials
@@ -24,8 +24,7 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Solution
 from factorlib.urm.observations import Observations

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.model.bounds import ROUGHNESS
-from factorlib.model.materials import Materials
+from factorlib.model.materials import ROUGHNESS, Materials
 
 ROWS, SPP, FLAT = 16, 16, 60
 

@@ -1,23 +1,29 @@
-"""Standard errors of materials, and of the light in every direction."""
+"""Standard errors of materials, and of the light in every direction: of lights of few lobes, then of a fit in natural lights."""
 
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.diagnose.coverage import LARGEST, relative_standard_errors
-from factorlib.diagnose.uncertainty import clustered_equations, standard_errors
+from factorlib.diagnose.identifiability import tinted_alike
+from factorlib.diagnose.uncertainty import (
+    LARGEST,
+    MODEL_ERROR,
+    Posterior,
+    in_gauge_of,
+    relative_standard_errors,
+    standard_errors,
+)
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes.arrow import ArrowSystem
-from factorlib.solve.few_lobes.descent import Descent, descend, evaluate
-from factorlib.solve.few_lobes.history import Run
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
+from factorlib.solve.few_lobes.equations import normal_equations
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from tests.solve.made import PRIOR, natural
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
 FEW_LOBES = FewLobes(lobes=16, insert=8, rounds=4, specular="on")
@@ -37,7 +43,7 @@ def noisy(seed: int):
         for light, data in zip(lights, blocks, strict=True)
     ]
     problem = JointProblem(blocks, OPERATOR, LOSS)
-    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), Descent(25, 1e-7)).point
+    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), 25, 1e-7).point
 
 
 @pytest.fixture(scope="module")
@@ -47,51 +53,46 @@ def solved():
 
 def test_scores_of_clusters_sum_to_the_gradient(solved):
     problem, point = solved
-    whole = clustered_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0))
+    first = Point(MATERIALS, point.lights[:1])
+    whole = normal_equations(problem.illuminations(Point(MATERIALS, point.lights))[0], Loss(prior=0.0), clustered=True)
     np.testing.assert_allclose(
         whole.scores.sum(0), np.concatenate([whole.material_gradient, whole.light_gradient]), atol=1e-8
     )
     assert len(whole.scores) > 20
-    (reduced,) = ArrowSystem([whole], 21).reduced_scores(Point(MATERIALS, point.lights[:1]))
+    _, (reduced,) = Iterate(first, [whole]).information()
     assert reduced.shape == (len(whole.scores), 21)
 
 
+def inside(found: Materials, errors: Materials) -> list[bool]:
+    """Whether each true value lies within one standard error, after the factor per channel that is free."""
+    factor = factor_between(found, MATERIALS)
+    true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
+    return (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
+
+
 def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():
-    inside = []
+    within = []
     for seed in range(8):
         problem, point = noisy(seed)
         errors, sigma = standard_errors(problem, point)
-        found = point.materials
-        factor = (MATERIALS.diffuse + MATERIALS.specular).sum(0) / (found.diffuse + found.specular).sum(0)
         assert sigma == pytest.approx(NOISE, rel=0.1)
-        for own, true, error in (
-            (found.diffuse * factor, MATERIALS.diffuse, errors.diffuse * factor),
-            (found.specular * factor, MATERIALS.specular, errors.specular * factor),
-            (found.roughness, MATERIALS.roughness, errors.roughness),
-        ):
-            inside += (np.abs(own - true) < error).ravel().tolist()
-    assert 0.58 < np.mean(inside) < 0.85, np.mean(inside)
+        within += inside(point.materials, errors)
+    assert 0.58 < np.mean(within) < 0.85, np.mean(within)
 
 
 @pytest.mark.long
 def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within_the_errors():
     """No noise: all error is the lobes' own bias.  Of narrow residuals about .46 lie within.  Errors of one scene go together: eight."""
-    inside = []
+    within = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        blocks = [
-            block(f"room{i}", random_light(rng, 120), MATERIALS, [0, 1, 2], OPERATOR, size=16, seed=i) for i in range(4)
-        ]
+        lights = [random_light(rng, 120) for _ in range(4)]
+        blocks = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, 16, i) for i, li in enumerate(lights)]
         problem = JointProblem(blocks, OPERATOR)
         solution = few_lobes(problem, 3, Run(FEW_LOBES))
-        found, errors = (
-            solution.point.materials,
-            standard_errors(problem.with_loss(solution.loss), solution.point).materials,
-        )
-        factor = factor_between(found, MATERIALS)
-        true = Materials(MATERIALS.diffuse / factor, MATERIALS.specular / factor, MATERIALS.roughness)
-        inside += (np.abs(found.vector() - true.vector()) < errors.vector()).tolist()
-    assert 0.58 < np.mean(inside) < 0.82, np.mean(inside)
+        errors = standard_errors(problem.with_loss(solution.loss), solution.point).materials
+        within += inside(solution.point.materials, errors)
+    assert 0.58 < np.mean(within) < 0.82, np.mean(within)
 
 
 def test_noise_twice_as_large_doubles_the_errors(solved):
@@ -114,3 +115,99 @@ def test_directions_that_no_observation_mirrors_are_known_less(solved):
     above, below = errors[directions[..., 1] < -0.6], errors[directions[..., 1] > 0.8]
     assert (errors > 0).all() and (errors <= LARGEST).all()
     assert np.median(below) > 5 * np.median(above)
+
+
+# ── a joint solve's: they cover the truth, and nothing is known for sure that is not ─────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """The problem, the true lights, the fit, and the errors of its materials."""
+    problem, true, found = natural()
+    return problem, true, found, Posterior(problem, found, PRIOR).standard_errors()
+
+
+def test_a_nil_reflectance_is_not_known_for_sure(fit):
+    problem, _, found, errors = fit
+    nil = np.where([[False], [False], [True]], 0.0, found.point.materials.diffuse)
+    there = Point(msgspec.structs.replace(found.point.materials, diffuse=nil), found.point.lights)
+    at_nil = Posterior(problem, msgspec.structs.replace(found, point=there), PRIOR).standard_errors().materials
+    assert (at_nil.diffuse[2] > 0.3 * errors.materials.diffuse[2]).all()
+    assert (errors.materials.vector() > 0).all()
+
+
+def test_no_observation_mends_what_the_model_has_wrong(fit):
+    """k_s and roughness are never known better than the model is right, as far as residuals say that it is wrong."""
+    values = fit[2].point.materials.rows()
+    values[:, 6] = 1
+    wrong = min(1.0, fit[3].deviation) * MODEL_ERROR * values
+    assert (fit[3].materials.rows() >= wrong).all() and (MODEL_ERROR > 0).all()
+
+
+def test_materials_lie_within_a_few_standard_errors(fit):
+    errors, m = fit[3].materials.rows(), fit[2].point.materials
+    factor = np.concatenate([np.tile(factor_between(m, MATERIALS), 2), [1.0]])
+    off = (m.rows() * factor - MATERIALS.rows()) / (errors * factor)
+    assert np.mean(np.abs(off) < 1) > 0.5 and np.mean(np.abs(off) < 3) > 0.95, np.round(off, 1)
+
+
+def test_lights_lie_within_their_standard_errors(fit):
+    """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
+    problem, true, found, _ = fit
+    posterior, within = Posterior(problem, found, PRIOR), []
+    for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
+        cells = 3 * len(light)
+        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[:cells]).reshape(3, -1)
+        off = light.log_radiance - true_light.log_radiance
+        within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)
+    assert 0.5 < np.mean(within) < 0.9
+    maps = posterior.relative_standard_errors()
+    assert set(maps) == {"room0", "room1", "room2"}
+    assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())
+
+
+def test_fewer_observations_tell_less_and_cells_that_have_split_have_maps_too(fit):
+    problem, _, found, errors = fit
+    few = Posterior(problem.sampled(60, 0), found, PRIOR)
+    assert np.mean(few.standard_errors().materials.vector() > errors.materials.vector()) > 0.8
+    lights = [light.split(light.weight[:, 1] > np.quantile(light.weight[:, 1], 0.95)) for light in found.point.lights]
+    split = Posterior(problem, found.with_lights(lights), PRIOR)
+    one, of_few, other = (p.relative_standard_errors()["room0"] for p in (Posterior(problem, found, PRIOR), few, split))
+    assert of_few.mean() > one.mean()
+    assert other.shape == one.shape and np.isfinite(other).all() and 0.7 < other.mean() / one.mean() < 1.5
+
+
+def test_errors_go_with_the_gauge(fit):
+    m, errors, factor = fit[2].point.materials, fit[3], np.array([2.0, 1.0, 0.5])
+    there = in_gauge_of(errors, m, Materials(m.diffuse * factor, m.specular * factor, m.roughness)).materials
+    np.testing.assert_allclose(there.diffuse, errors.materials.diffuse * factor)
+    np.testing.assert_allclose(there.specular, errors.materials.specular * factor)
+    np.testing.assert_array_equal(there.roughness, errors.materials.roughness)
+
+
+# ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("tints", "bounced", "said"),
+    [
+        ([[1, 3, 3], [1, 4, 3]], True, True),  # red is what surfaces are then
+        ([[1, 3, 3], [1, 4, 3]], False, False),  # the rule of the gauge makes lights grey
+        ([[1, 3, 3], [4, 1, 1]], True, False),  # one light is blue-green, another red: not alike
+        ([[1, 1.3, 1.2], [1, 1.2, 1.5]], True, False),  # as natural lights are
+    ],
+)
+def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(tints, bounced, said):
+    rng, operator = np.random.default_rng(0), reflection_operator("closed_form", dtype="float64")
+    replaced, lights = msgspec.structs.replace, [random_light(rng, 3) for _ in tints]
+    grey = [replaced(one, weight=np.repeat(one.weight.mean(1, keepdims=True), 3, axis=1)) for one in lights]
+    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], operator, size=6) for k, light in enumerate(grey)]
+    if bounced:
+        blocks = [replaced(one, bounced=np.zeros((len(one), 6))) for one in blocks]
+    pairs = enumerate(zip(grey, tints, strict=True))
+    lights = [replaced(light, weight=10.0**k * light.weight * tint) for k, (light, tint) in pairs]
+    sentences = tinted_alike(("a", "b", "c"), blocks, lights)
+    assert len(sentences) == said
+    if said:
+        for words in ("room0, room1", "R : G : B = 0.4", "solve.interreflection=off"):
+            assert words in sentences[0]

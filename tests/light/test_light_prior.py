@@ -22,10 +22,8 @@ def folder(tmp_path):
     rng = np.random.default_rng(1)
     (tmp_path / "maps").mkdir()
     for name in "abc":
-        write_rgb_exr(
-            tmp_path / f"maps/{name}.exr",
-            np.exp(np.linspace(1, -1, 16)[:, None, None] + 0.5 * rng.normal(size=(16, 32, 3))),
-        )
+        logs = np.linspace(1, -1, 16)[:, None, None] + 0.5 * rng.normal(size=(16, 32, 3))
+        write_rgb_exr(tmp_path / f"maps/{name}.exr", np.exp(logs))
     return tmp_path / "maps"
 
 
@@ -62,18 +60,10 @@ def test_folders_that_hold_no_map_are_named(tmp_path, run):
         assert done.exit_code == 2 and said in done.output and place.name in done.output
 
 
-def black(light):
-    light[:] = 0
-
-
-def not_a_number(light):
-    light[3, 4, 1] = np.nan
-
-
-@pytest.mark.parametrize("spoil, said", [(black, "black"), (not_a_number, "1 pixels are no numbers")])
-def test_maps_that_tell_nothing_are_named(folder, spoil, said):
+@pytest.mark.parametrize("value, said", [(0, "black"), (np.nan, "1 pixels are no numbers")])
+def test_maps_that_tell_nothing_are_named(folder, value, said):
     light = np.ones((16, 32, 3))
-    spoil(light)
+    light[(3, 4, 1) if np.isnan(value) else ...] = value
     write_rgb_exr(folder / "b.exr", light)
     with pytest.raises(InputError, match=said) as error:
         light_prior.prior_of(light_prior.maps_in([folder]), COUNT)

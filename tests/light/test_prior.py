@@ -31,30 +31,24 @@ def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
 
 
 @pytest.mark.parametrize("decay_deg", [1.0, 40.0, 400.0])
-@pytest.mark.parametrize("k", range(3))
-def test_covariance_is_positive_definite_without_a_nugget(k, decay_deg):
+def test_covariance_is_that_of_the_equation_and_positive_definite_without_a_nugget(decay_deg):
     prior = msgspec.structs.replace(KNOWN, nugget=(0.0,) * 3, decay_deg=(decay_deg,) * 3)
-    covariance = prior.covariance(k, np.concatenate([fibonacci_sphere(150), [[1, 0, 0], [-1, 0, 0], [0, 1, 0]]]))
-    np.testing.assert_array_equal(covariance, covariance.T)
-    assert np.linalg.eigvalsh(covariance).min() > 0
-
-
-def test_covariance_is_that_of_the_equation():
+    for k in range(3):
+        covariance = prior.covariance(k, np.concatenate([fibonacci_sphere(150), [[1, 0, 0], [-1, 0, 0], [0, 1, 0]]]))
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() > 0
     directions = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0]])
     half, quarter = 1.5 * np.exp(-180 / 40) + 100, 1.5 * np.exp(-90 / 40) + 100
     expected = [[101.7, quarter, half], [quarter, 101.7, quarter], [half, quarter, 101.7]]
     np.testing.assert_allclose(KNOWN.covariance(0, directions), expected, rtol=1e-12)
 
 
-def test_without_up_all_frames_are_alike_and_with_up_it_turns_along():
+def test_without_up_all_frames_are_alike_and_with_up_the_profile_turns_along_and_leaves_the_level_alone():
     directions, rotation = fibonacci_sphere(40), Rotation.random(random_state=3).as_matrix()
     turned = directions @ rotation.T
     np.testing.assert_allclose(KNOWN.precision(turned)[0], KNOWN.precision(directions)[0], atol=1e-7)
     assert not KNOWN.mean(turned, None).any()
     np.testing.assert_allclose(KNOWN.mean(turned, rotation @ UP), KNOWN.mean(directions, UP), atol=1e-12)
-
-
-def test_the_profile_leaves_the_level_alone():
     np.testing.assert_allclose(KNOWN.mean(fibonacci_sphere(5000), np.array([0.6, 0.0, 0.8])).mean(axis=1), 0, atol=1e-3)
 
 
@@ -75,11 +69,8 @@ def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():
 def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     cells = fibonacci_sphere(100)
     found = fitted(drawn(KNOWN, cells, 150), cells)
-    np.testing.assert_allclose(found.variance, KNOWN.variance, rtol=0.25)
-    np.testing.assert_allclose(found.decay_deg, KNOWN.decay_deg, rtol=0.25)
-    np.testing.assert_allclose(found.nugget, KNOWN.nugget, rtol=0.3)
-    np.testing.assert_allclose(found.level, KNOWN.level, rtol=0.5)
-    np.testing.assert_allclose(found.freedom, KNOWN.freedom, rtol=0.4)
+    for name, rtol in (("variance", 0.25), ("decay_deg", 0.25), ("nugget", 0.3), ("level", 0.5), ("freedom", 0.4)):
+        np.testing.assert_allclose(getattr(found, name), getattr(KNOWN, name), rtol=rtol)
     np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
 
 
@@ -119,14 +110,10 @@ def test_a_map_of_much_contrast_has_little_weight():
 
 def test_the_likelihood_is_highest_at_the_truth():
     cells = fibonacci_sphere(60)
-    logs = drawn(KNOWN, cells, 60)
-    wrong = [
-        msgspec.structs.replace(KNOWN, **change)
-        for change in ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})
-    ]
-    truth = log_likelihood(KNOWN, logs, cells, UP).mean()
-    assert all(log_likelihood(prior, logs, cells, UP).mean() < truth for prior in wrong)
-    assert log_likelihood(KNOWN, logs, cells, None).mean() < truth
+    logs, changes = drawn(KNOWN, cells, 60), ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})
+    wrong = [(msgspec.structs.replace(KNOWN, **change), UP) for change in changes]
+    truth, *others = (log_likelihood(of, logs, cells, up).mean() for of, up in [(KNOWN, UP), *wrong, (KNOWN, None)])
+    assert all(other < truth for other in others)
 
 
 def test_brighter_maps_give_the_same_prior():
@@ -139,14 +126,7 @@ def test_brighter_maps_give_the_same_prior():
         np.testing.assert_allclose(getattr(dim, name), getattr(bright, name), rtol=1e-3, atol=1e-4)
 
 
-def test_one_map_is_enough_for_a_fit():
-    cells = fibonacci_sphere(60)
-    prior = fitted(drawn(KNOWN, cells, 1), cells)
-    precision, _ = prior.precision(cells)
-    assert np.isfinite(precision).all() and np.linalg.eigvalsh(precision).min() > 0
-
-
-def test_cells_hold_the_energy_of_the_map():
+def test_cells_hold_the_energy_of_the_map_and_dark_ones_are_floored():
     cells = fibonacci_sphere(50)
     np.testing.assert_allclose(cell_means(np.full((32, 64, 3), 2.0), cells), 2.0)
     lamp = np.zeros((64, 128, 3))
@@ -154,9 +134,6 @@ def test_cells_hold_the_energy_of_the_map():
     assert np.count_nonzero(cell_means(lamp, cells).sum(axis=1)) == 1
     with pytest.raises(ValueError, match="too few"):
         cell_means(np.ones((2, 4, 3)), cells)
-
-
-def test_dark_cells_are_floored():
     means = np.ones((1, 5, 3))
     means[0, 0] = 0
     assert np.isfinite(log_cells(means)).all() and log_cells(means)[0, 0, 0] == pytest.approx(np.log(0.8e-4))

@@ -3,12 +3,14 @@
 import msgspec
 import numpy as np
 
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from studies.scenes.problems import MATERIALS, block, random_light
+from factorlib.urm.observations import Observations
+from studies.scenes.problems import MATERIALS, block, random_light, sphere_normals
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 
@@ -21,20 +23,26 @@ def guessed(rng: np.random.Generator, data, curves: bool) -> Illumination:
     )
 
 
-def clipped_photos(curves: bool) -> Illumination:
-    """Observations of two photos, the brightest tenth of them clipped, in a wrong light."""
+def photos_in_a_wrong_light(kind: str, curves: bool = False) -> Illumination:
+    """Observations of two photos: `clipped`, the brightest tenth of them; `bounced`, half of them reached by light from other surfaces;
+    `hidden`, in a light fixed to the world, each photo hiding other directions."""
     rng = np.random.default_rng(1)
-    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=16)
-    clipped = data.radiance > np.quantile(data.radiance, 0.9)
-    return guessed(rng, msgspec.structs.replace(data, clipped=clipped, radiance=np.minimum(data.radiance, 2.0)), curves)
-
-
-def bounced_photos(curves: bool) -> Illumination:
-    """Observations of two photos, half of them reached by light from other surfaces, in a wrong light."""
-    rng = np.random.default_rng(1)
-    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=14)
-    bounced = rng.random((len(data), 6)) * (rng.random((len(data), 1)) < 0.5)
-    return guessed(rng, msgspec.structs.replace(data, bounced=bounced), curves)
+    size = 16 if kind == "clipped" else 14
+    data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=size)
+    if kind == "clipped":
+        clipped = data.radiance > np.quantile(data.radiance, 0.9)
+        return guessed(
+            rng, msgspec.structs.replace(data, clipped=clipped, radiance=np.minimum(data.radiance, 2.0)), curves
+        )
+    if kind == "bounced":
+        bounced = rng.random((len(data), 6)) * (rng.random((len(data), 1)) < 0.5)
+        return guessed(rng, msgspec.structs.replace(data, bounced=bounced), curves)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    directions = np.stack([fibonacci_sphere(96), fibonacci_sphere(96) @ turn.T])
+    visibility = (rng.random((len(data), 96)) * 255).astype(np.uint8)
+    one = guessed(rng, msgspec.structs.replace(data, visibility=visibility, directions=directions), curves)
+    wide = msgspec.structs.replace(one.light, log_sharpness=np.minimum(one.light.log_sharpness, 3))
+    return msgspec.structs.replace(one, light=wide)
 
 
 def three_rooms() -> tuple[JointProblem, Point]:
@@ -48,3 +56,55 @@ def three_rooms() -> tuple[JointProblem, Point]:
     return JointProblem(blocks, OPERATOR), Point(
         MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]
     )
+
+
+def bowl_sees(normals, directions):
+    """A ray from −n leaves the sphere at −n + 2(n·d)d; it is free where that lies before the rim."""
+    exit_z = -normals[:, 2:] + 2 * (normals @ directions.T) * directions[:, 2]
+    return (exit_z < 0) | (normals @ directions.T <= 0)
+
+
+def traced(normals, sees, light: Light, material, materials: Materials, count=12_000):
+    """Radiance toward (0, 0, −1) by summing the light over `count` directions: no operator, no lobes."""
+    d = fibonacci_sphere(count)
+    view = np.array([0.0, 0.0, -1.0])
+    incoming = np.exp(light.sharpness * (d @ light.axis.T - 1)) @ light.weight
+    half = (d + view) / np.maximum(np.linalg.norm(d + view, axis=1, keepdims=True), 1e-9)
+    ni, no, nh = (np.maximum(normals @ v.T, 0) for v in (d, view[None], half))
+    square = materials.roughness[material] ** 4
+
+    def smith(c):
+        return 2 * c / (c + np.sqrt(square + (1 - square) * c * c) + 1e-12)
+
+    highlight = square / (np.pi * (nh**2 * (square - 1) + 1) ** 2) * smith(ni) * smith(no) / (4 * no)
+    weight = sees(normals, d) * 4 * np.pi / count
+    return (weight * ni / np.pi) @ incoming * materials.diffuse[material] + (
+        weight * highlight
+    ) @ incoming * materials.specular[material]
+
+
+def seen_from_the_front(normal, radiance, material, names, photo="room", **more) -> Observations:
+    """What one photo shows of surfaces of those normals."""
+    n, zero = len(normal), np.zeros(len(normal), int)
+    return Observations(
+        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
+        photo=zero, illumination=zero, x=np.arange(n), y=zero, weight=np.ones(n), materials=names, photos=(photo,),
+        illuminations=(photo,), **more,
+    )  # fmt: skip
+
+
+def bowls(name, light, size=16, count=512) -> Observations:
+    """A bowl and a ball of each material in one light."""
+    normals, directions, parts, sees = sphere_normals(size), fibonacci_sphere(count), [], []
+    for m in range(3):
+        for seen in (bowl_sees, lambda n, d: np.ones((len(n), len(d)), bool)):
+            parts.append(traced(normals, seen, light, m, MATERIALS))
+            sees.append(seen(normals, directions))
+    material, visibility = np.repeat([0, 0, 1, 1, 2, 2], len(normals)), 255 * np.vstack(sees).astype(np.uint8)
+    normal, names = np.tile(normals, (6, 1)), ("red", "green", "blue")
+    return seen_from_the_front(normal, np.vstack(parts), material, names, name, visibility=visibility)
+
+
+def rough_light(seed):
+    light = random_light(np.random.default_rng(seed), 5)
+    return msgspec.structs.replace(light, log_sharpness=np.minimum(light.log_sharpness, 3.5))

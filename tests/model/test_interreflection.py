@@ -9,24 +9,26 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
+from factorlib.model.materials import Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
-from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes.problems import MATERIALS
-from tests.model.made import OPERATOR, bounced_photos
+from tests.model.made import OPERATOR, photos_in_a_wrong_light, seen_from_the_front
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])
 def given(request):
-    return bounced_photos(request.param == "toned")
+    return photos_in_a_wrong_light("bounced", request.param == "toned")
 
 
 def test_bounces_add_a_known_radiance(given):
     light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
     data, kd, ks = given.block, MATERIALS.diffuse[given.block.material], MATERIALS.specular[given.block.material]
-    with_, without = (Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.without_bounces()))
+    with_, without = (
+        Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.with_effects(True, False))
+    )
     np.testing.assert_allclose(with_ - without, kd * data.bounced[:, :3] + ks * data.bounced[:, 3:])
     assert JointProblem([data], OPERATOR).with_effects(shadows=False, bounces=True).blocks[0].bounced is None
 
@@ -41,16 +43,13 @@ def bowl(albedo, depth=0.5, size=40, count=1024, name="bowl") -> Observations:
     d = fibonacci_sphere(count)
     out = -n[:, None] + 2 * (n @ d.T)[..., None] * d  # where a ray from −n leaves the sphere
     hidden = (out[..., 2] > 1 - 2 * depth) & (n @ d.T > 0)
-    met = np.where(
-        hidden, met_codes(np.zeros(out.shape[:2], int).reshape(-1), -out.reshape(-1, 3)).reshape(hidden.shape), UNMET
-    )
+    codes = met_codes(np.zeros(hidden.size, int), -out.reshape(-1, 3)).reshape(hidden.shape)
     radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
-    return Observations(
-        normal=n, view=np.tile([0.0, 0.0, -1.0], (len(n), 1)), radiance=radiance, clipped=np.zeros((len(n), 3), bool),
-        material=np.zeros(len(n), int), photo=np.zeros(len(n), int), illumination=np.zeros(len(n), int), x=np.arange(len(n)),
-        y=np.zeros(len(n), int), weight=np.ones(len(n)), materials=("white",), photos=(name,), illuminations=(name,),
-        visibility=np.where(hidden, 0, 255).astype(np.uint8), met=met.astype(np.uint16),
-    )  # fmt: skip
+    how = {
+        "visibility": np.where(hidden, 0, 255).astype(np.uint8),
+        "met": np.where(hidden, codes, UNMET).astype(np.uint16),
+    }
+    return seen_from_the_front(n, radiance, np.zeros(len(n), int), ("white",), name, **how)
 
 
 @pytest.mark.parametrize(("albedo", "depth"), [(0.3, 0.5), (0.9, 0.5), (0.9, 0.9)])
@@ -66,49 +65,36 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
 def test_facing_plates_of_red_and_white_bleed_and_keep_their_colours():
     """Two plates that hide three quarters of the light from each other, in constant light 1, with all bounces."""
     albedo, count, each = np.array([[0.8, 0.8, 0.8], [0.8, 0.1, 0.05]]), 1024, 30
-    open_, hidden = (
-        0.25,
-        0.75,
-    )  # of the cosine-weighted hemisphere: what lies within 60° of a plate's normal is the other plate
-    radiance = np.stack(
-        [np.linalg.solve([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T], axis=1
-    )
+    open_, hidden = 0.25, 0.75  # of the cosine-weighted hemisphere: within 60° of a plate's normal lies the other plate
+    pairs = [([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T]
+    radiance = np.stack([np.linalg.solve(*pair) for pair in pairs], axis=1)
     material, normal = np.repeat([0, 1], each), np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], each, axis=0)
     facing = normal @ fibonacci_sphere(count).T > 0.5
-    met = np.where(
-        facing, np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None], UNMET
-    )
-    n = len(material)
-    seen = Observations(
-        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance[material], clipped=np.zeros((n, 3), bool),
-        material=material, photo=np.zeros(n, int), illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n),
-        materials=("white", "red"), photos=("plates",), illuminations=("plates",),
-        visibility=np.where(facing, 0, 255).astype(np.uint8), met=met.astype(np.uint16),
-    )  # fmt: skip
+    codes = np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None]
+    how = {
+        "visibility": np.where(facing, 0, 255).astype(np.uint8),
+        "met": np.where(facing, codes, UNMET).astype(np.uint16),
+    }
+    seen = seen_from_the_front(normal, radiance[material], material, ("white", "red"), **how)
     assert radiance[0, 0] > 1.2 * radiance[0, 1]  # the white plate looks red
     sent = bounced_light(seen, seen.radiance)[:, :3]
     np.testing.assert_allclose(seen.radiance / (open_ + sent), albedo[material], rtol=0.05)
 
 
-def test_nothing_hidden_sends_nothing():
-    seen = bowl(0.5)
+def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
+    seen, factor = bowl(0.5, size=20, count=256), 1e4
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
-    assert blocks_of_observations(open_, Noise())[0].bounced is None
-    assert blocks_of_observations(msgspec.structs.replace(seen, met=None), Noise())[0].bounced is None
-
-
-def test_brighter_photos_send_more_in_their_own_unit_alike():
-    seen, factor = bowl(0.5), 1e4
+    for none in (open_, msgspec.structs.replace(seen, met=None)):
+        assert blocks_of_observations(none, Noise())[0].bounced is None
     brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
-    np.testing.assert_allclose(
-        bounced_light(brighter, brighter.radiance), factor * bounced_light(seen, seen.radiance), rtol=1e-5
-    )
+    sent, more = (bounced_light(photo, photo.radiance) for photo in (seen, brighter))
+    np.testing.assert_allclose(more, factor * sent, rtol=1e-5)
     one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (seen, brighter))
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
 def test_the_order_of_photos_changes_nothing():
-    photos = [bowl(albedo, name=name) for albedo, name in ((0.3, "a"), (0.8, "b"))]
+    photos = [bowl(albedo, size=20, count=256, name=name) for albedo, name in ((0.3, "a"), (0.8, "b"))]
     one, other = (blocks_of_observations(concatenate(order), Noise()) for order in (photos, photos[::-1]))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a.bounced, b.bounced)
@@ -117,4 +103,4 @@ def test_the_order_of_photos_changes_nothing():
 def test_what_interreflection_determines_the_gauge_leaves(given):
     point = Point(MATERIALS, [given.light])
     np.testing.assert_array_equal(in_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
-    assert (in_gauge(point, [given.block.without_bounces()]).materials.diffuse != MATERIALS.diffuse).any()
+    assert (in_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()

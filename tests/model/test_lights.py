@@ -5,7 +5,7 @@ import pytest
 
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light, even_cells, tangents
+from factorlib.model.lights import Light, even_cells
 from factorlib.solve.solve import SMALLEST, SPLIT, brightest, on_cells
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
@@ -26,10 +26,7 @@ def smooth(cells: int) -> Light:
 def test_cells_of_equal_radiance_are_a_constant_light_but_for_a_ripple(count):
     radiance = shown(on_even_cells(np.zeros((3, count))))
     ripple = np.abs(radiance - 1)  # largest at the poles, where cells are least even
-    assert radiance.std() < 0.03 and np.quantile(ripple, 0.99) < 0.1 and abs(radiance.mean() - 1) < 0.005, (
-        radiance.std(),
-        ripple.max(),
-    )
+    assert radiance.std() < 0.03 and np.quantile(ripple, 0.99) < 0.1 and abs(radiance.mean() - 1) < 0.005
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
@@ -39,14 +36,11 @@ def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share
     some = np.random.default_rng(0).random(200) < share
     once = light.split(some)
     twice = once.split(once.sharpness > light.sharpness.max())
-    assert len(once) == pytest.approx(200 + 3 * some.sum(), rel=0.05) and len(twice) == pytest.approx(
-        200 + 15 * some.sum(), rel=0.05
-    )
+    for one, more in ((once, 3), (twice, 15)):
+        assert len(one) == pytest.approx(200 + more * some.sum(), rel=0.05)
     spheres = block("room", light, MATERIALS, [0, 1, 2], OPERATOR, size=14)
-    before, rough = (
-        Illumination(spheres, light, MATERIALS, OPERATOR).radiance(),
-        MATERIALS.roughness[spheres.material] > 0.3,
-    )
+    before = Illumination(spheres, light, MATERIALS, OPERATOR).radiance()
+    rough = MATERIALS.roughness[spheres.material] > 0.3
     for one, ripple in ((once, 0.04), (twice, 0.06)):
         np.testing.assert_allclose(one.energy.sum(0), light.energy.sum(0), rtol=0.02)
         np.testing.assert_allclose(np.linalg.norm(one.axis, axis=1), 1, rtol=1e-12)
@@ -64,39 +58,21 @@ def test_split_cells_leave_no_dark_or_bright_spots(scattered):
         light = light.with_log_radiance(np.zeros((3, len(light))))
     there = np.array([0.6, 0.0, 0.8]) + 0.4 * DIRECTIONS
     radiance = shown(light, there / np.linalg.norm(there, axis=1, keepdims=True))
-    assert radiance.std() < 0.1 and radiance.min() > 0.45 and radiance.max() < 1.3, (
-        radiance.std(),
-        radiance.min(),
-        radiance.max(),
-    )
+    assert radiance.std() < 0.1 and radiance.min() > 0.45 and radiance.max() < 1.3
 
 
 def test_small_cells_stand_where_a_large_one_stood_with_its_radiance():
     light, which = on_even_cells(drawn(0, 60)), np.arange(60) % 7 == 3
     split, kept = light.split(which), (~which).sum()
-    for now, before in (
-        (split.axis.T, light.axis.T),
-        (split.sharpness, light.sharpness),
-        (split.log_radiance, light.log_radiance),
-    ):
-        np.testing.assert_allclose(now[..., :kept], before[..., ~which], rtol=1e-12)
+    for now, before in (([li.axis.T, li.sharpness, li.log_radiance] for li in (split, light)),):
+        for one, other in zip(now, before, strict=True):
+            np.testing.assert_allclose(one[..., :kept], other[..., ~which], rtol=1e-12)
     parent = np.argmax(split.axis[kept:] @ light.axis.T, axis=1)
-    assert (
-        set(parent) == set(np.flatnonzero(which))
-        and 3 <= np.bincount(parent)[which].min()
-        and np.bincount(parent)[which].max() <= 5
-    )
+    children = np.bincount(parent)[which]
+    assert set(parent) == set(np.flatnonzero(which)) and 3 <= children.min() and children.max() <= 5
     np.testing.assert_allclose(split.sharpness[kept:], 4 * light.sharpness[parent], rtol=0.01)
     np.testing.assert_allclose(split.log_radiance[:, kept:], light.log_radiance[:, parent], rtol=1e-12)
     np.testing.assert_array_equal(split.axis, light.split(which).axis)
-
-
-def test_tangents_are_perpendicular_and_unit():
-    first, second = tangents(DIRECTIONS)
-    frame = np.stack([DIRECTIONS, first, second], axis=1)
-    np.testing.assert_allclose(
-        frame @ frame.transpose(0, 2, 1), np.tile(np.eye(3), (len(DIRECTIONS), 1, 1)), atol=1e-12
-    )
 
 
 def test_the_brightest_split_but_none_that_is_too_small():

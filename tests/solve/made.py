@@ -1,5 +1,7 @@
 """Problems in natural lights whose answer is known: lights on cells, drawn from the prior, and what spheres show of them."""
 
+from functools import cache
+
 import msgspec
 import numpy as np
 
@@ -7,11 +9,10 @@ from factorlib.light.prior import MIX, read_light_prior
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import PEAK, Light, even_cells
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.fit import Fit, Hyperparameters, field_of, start_of
+from factorlib.solve.fit import Fit, Hyperparameters, Schedule, field_of, fitted, start_of
 from factorlib.solve.marginal import Field
 from factorlib.solve.start import constant_light
 from studies.scenes.problems import MATERIALS, block
@@ -19,7 +20,7 @@ from studies.scenes.problems import MATERIALS, block
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()
 START = Materials(np.full((3, 3), 0.3), np.full((3, 3), 0.1), np.full(3, 0.4))
-FREE = np.ones((3, 7), bool)
+WHOLE = Schedule(4, (14, 10))
 
 
 def drawn(seed: int, cells: int) -> np.ndarray:
@@ -75,6 +76,13 @@ def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[Joint
 def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START) -> Fit:
     """The start of a fit: wrong materials in constant lights."""
     return start_of(Point(materials, [constant_light(one, materials, cells) for one in problem.blocks]))
+
+
+@cache
+def natural() -> tuple[JointProblem, list[Light], Fit]:
+    """Spheres in three lights drawn from the prior, the lights, and the fit."""
+    problem, true = photographed(5, 3)
+    return problem, true, fitted(problem, begun(problem), PRIOR, WHOLE)
 
 
 def field(

@@ -1,5 +1,7 @@
 """What is in the model is decided by what is held out: shadows, bounces, tone curves, the start."""
 
+from functools import cache
+
 import msgspec
 import numpy as np
 import pytest
@@ -9,24 +11,22 @@ from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
 from factorlib.model.interreflection import bounced_light
-from factorlib.model.lights import even_cells
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.solve.choices import CURVED_GAIN, sample_of
+from factorlib.solve.choices import CURVED_GAIN
 from factorlib.solve.evidence import AGAINST, FOR
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, from_nothing, solve
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_nothing
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
-from tests.model.test_shadowing import bowls, rough_light
+from tests.model.made import bowls, rough_light
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
-MORE = msgspec.structs.replace(
-    QUICK, observations=1000
-)  # an exponent that all photos share is known less than those between photos
+MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all photos share is known less
 
 
 def solved(blocks, choices=QUICK, **others):
@@ -52,17 +52,19 @@ def lit_bowls(name, seed) -> Observations:
     shown = seen.radiance
     for _ in range(8):
         sent = bounced_light(seen, shown)
-        shown = (
-            seen.radiance
-            + MATERIALS.diffuse[seen.material] * sent[:, :3]
-            + MATERIALS.specular[seen.material] * sent[:, 3:]
-        )
+        kd, ks = MATERIALS.diffuse[seen.material], MATERIALS.specular[seen.material]
+        shown = seen.radiance + kd * sent[:, :3] + ks * sent[:, 3:]
     return msgspec.structs.replace(seen, radiance=shown)
+
+
+@cache
+def lit_rooms(seed: int) -> list[Observations]:
+    return [lit_bowls(f"room{i}", seed + i) for i in range(2)]
 
 
 @pytest.fixture(scope="module")
 def lit():
-    return [blocks_of_observations(lit_bowls(f"room{i}", 20 + i), Noise(0.02, 0.02))[0] for i in range(2)]
+    return [blocks_of_observations(seen, Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
 
 
 def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
@@ -71,10 +73,8 @@ def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_t
         solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
         found = solution.point.materials
         factor = factor_between(found, MATERIALS)
-        error[choice] = (
-            np.abs(found.diffuse * factor / MATERIALS.diffuse - 1).mean(),
-            np.abs(found.roughness - MATERIALS.roughness).mean(),
-        )
+        off = found.diffuse * factor / MATERIALS.diffuse - 1, found.roughness - MATERIALS.roughness
+        error[choice] = [np.abs(each).mean() for each in off]
     assert solution.shadows.kept and solution.shadows.margin > FOR
     assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
     assert error["auto"][0] < 0.5 * error["off"][0], error
@@ -85,9 +85,8 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
     error = {}
     for choice in ("off", "auto"):
         solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
-        error[choice] = np.abs(
-            solution.point.materials.diffuse / MATERIALS.diffuse - 1
-        ).mean()  # absolute: no factor is taken out
+        off = solution.point.materials.diffuse / MATERIALS.diffuse - 1  # absolute: no factor is taken out
+        error[choice] = np.abs(off).mean()
     assert solution.interreflection.kept and solution.interreflection.margin > FOR
     assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
     assert error["auto"] < 0.5 * error["off"], error
@@ -107,7 +106,7 @@ def tilted(seen, seed, degrees):
 def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
     """Where the photos show no bounces, those computed from the mesh still explain a little of what wrong normals cause.  They fit best
     when they are weak, so a solve that kept them would make all reflectances ten times too small."""
-    lit = [lit_bowls(f"room{i}", 40 + i) for i in range(2)]
+    lit = lit_rooms(40)
     direct = [bowls(f"room{i}", rough_light(40 + i), size=12, count=256) for i in range(2)]
     shown = [
         one if bounced else msgspec.structs.replace(one, radiance=other.radiance)
@@ -117,14 +116,6 @@ def test_wrong_normals_are_no_evidence_of_bounces_and_do_not_hide_them(bounced):
     solution = solved(blocks, OF_SHAPES, self_shadowing="on")
     assert solution.interreflection.kept == bounced, solution.interreflection
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
-
-
-def test_off_is_the_solve_of_the_same_observations_without_codes(lit):
-    quick = msgspec.structs.replace(QUICK, cells=30, observations=100, self_shadowing="on", tone="off")
-    one = solved(lit, quick, interreflection="off")
-    other = solved([room.without_bounces() for room in lit], quick)
-    assert not one.interreflection.kept and not other.interreflection.kept
-    np.testing.assert_array_equal(one.point.materials.vector(), other.point.materials.vector())
 
 
 def hull(seen: Observations) -> Observations:
@@ -140,9 +131,8 @@ def hull(seen: Observations) -> Observations:
     )
 
 
-@pytest.mark.parametrize("seed", [20, 50])
-def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials(seed):
-    blocks = [blocks_of_observations(hull(lit_bowls(f"room{i}", seed + i)), Noise(0.02, 0.02))[0] for i in range(2)]
+def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
+    blocks = [blocks_of_observations(hull(seen), Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
     solution = solved(blocks, OF_SHAPES)
     assert not solution.interreflection.kept, solution.interreflection
     assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
@@ -179,22 +169,19 @@ def test_neither_the_order_of_photos_nor_rounding_nor_the_seed_flips_a_choice(li
 def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(shaded):
     rng = np.random.default_rng(0)
     open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
-    directions = np.stack([fibonacci_sphere(96)])
-    wrong = [
-        msgspec.structs.replace(
-            b, visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8), directions=directions
-        )
-        for b in open_
-    ]
-    few = msgspec.structs.replace(QUICK, cells=24, observations=150, tone="off")
-    found = solved(wrong, few)
+
+    def hiding(visibility):
+        how = {"directions": np.stack([fibonacci_sphere(96)])}
+        return [msgspec.structs.replace(b, visibility=visibility(b).astype(np.uint8), **how) for b in open_]
+
+    wrong, few = (
+        hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5)),
+        {"cells": 24, "observations": 150, "tone": "off"},
+    )
+    found = solved(wrong, **few)
     assert not found.shadows.kept and found.shadows.margin < AGAINST
-    assert solved(wrong, few, self_shadowing="on").shadows.kept
-    nothing = [
-        msgspec.structs.replace(b, visibility=np.full((len(b), 96), 255, np.uint8), directions=directions)
-        for b in open_
-    ]
-    assert solved(nothing, few).shadows.kept
+    assert solved(wrong, **few, self_shadowing="on").shadows.kept
+    assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.kept
 
 
 # ── tone curves ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -226,21 +213,12 @@ def curved():
     return [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
 
 
-@pytest.fixture(scope="module")
-def found(curved):
-    return solved(curved, MORE)
-
-
-def test_curves_are_found_and_spare_the_materials(curved, found):
-    without = solved(curved, MORE, tone="off")
-    np.testing.assert_allclose(
-        [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)], (1.3, 0.8, 1.0), rtol=0.05
-    )
+def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
+    found, without = (solved(curved, MORE, tone=tone) for tone in ("auto", "off"))
+    exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
+    np.testing.assert_allclose(exponents, (1.3, 0.8, 1.0), rtol=0.05)
     assert all(len(e) == 0 for e in exponents_of(without))
     assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
-
-
-def test_the_evidence_is_that_held_out_losses_fall(found):
     assert [one.kept for one in found.tone][:2] == [True, True]
     for one in found.tone:
         assert one.kept == (one.margin > FOR and one.held_out_loss_without > (1 + CURVED_GAIN) * one.held_out_loss_with)
@@ -262,9 +240,8 @@ def test_a_curve_that_no_camera_has_is_not_believed():
     blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
     solution = solved(blocks, cells=40, observations=200)
     assert len(exponents_of(solution)[0]) == 0
-    assert (
-        solution.tone[0].held_out_loss_with < 0.8 * solution.tone[0].held_out_loss_without and not solution.tone[0].kept
-    )
+    (one, *_) = solution.tone
+    assert one.held_out_loss_with < 0.8 * one.held_out_loss_without and not one.kept
 
 
 def test_an_exponent_near_its_bounds_is_named():
@@ -276,34 +253,16 @@ def test_an_exponent_near_its_bounds_is_named():
 # ── what is compared, and from where ─────────────────────────────────────────────────────────────────────────────────
 
 
-def test_nothing_is_decided_where_nothing_is_held_out(curved):
-    blocks = [block.with_none_held_out() for block in curved]
-    found = solved(blocks, cells=30, observations=100)
-    assert not any(one.kept for one in found.tone) and found.splitting == []
-
-
-def test_without_held_out_observations_shadows_stay_and_bounces_are_left_out(lit):
-    """Both would be judged by the observations that they were fitted to, which more always explains better."""
+def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decided(lit):
+    """All would be judged by the observations that they were fitted to, which more always explains better."""
     found = solved([block.with_none_held_out() for block in lit], QUICK, cells=24, observations=100)
     assert found.shadows.kept and found.shadows.margin is None
     assert not found.interreflection.kept and found.interreflection.margin is None
-
-
-def test_models_are_compared_on_few_observations_of_each_material(curved):
-    sample = sample_of(JointProblem(curved, OPERATOR), Choices(observations=50))
-    for block, whole in zip(sample.blocks, curved, strict=True):
-        assert (
-            0 < len(block) <= 50 + 50 // 3
-            and set(np.unique(block.material)) == set(np.unique(whole.material))
-            and block.held_out.any()
-        )
+    assert not any(one.kept for one in found.tone) and found.splitting == []
 
 
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     problem = JointProblem(rooms(), OPERATOR)
-    assert [len(from_nothing(n).points(problem, 30)) for n in (3, 40)] == [1, 1]
-    only = JointProblem([block.take(block.material < 2) for block in problem.blocks], OPERATOR)
-    points = from_nothing(2).points(only, 30)
-    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and all(
-        len(p.lights[0]) == len(even_cells(30)) for p in points
-    )
+    assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
+    points = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
+    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and {len(p.lights[0]) for p in points} == {30}

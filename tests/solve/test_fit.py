@@ -5,28 +5,39 @@ import numpy as np
 import pytest
 
 from factorlib.model.gauge import in_gauge
-from factorlib.model.loss import Loss
+from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
-from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
-from factorlib.solve.marginal import marginal
+from factorlib.solve.marginal import marginal, positive_definite_inverse
 from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS, DIFFUSE, LEVEL, TINT, MaterialPrior, unknowns_of
 from studies.scenes.problems import MATERIALS, factor_between
-from tests.solve.made import FEW, FREE, OPERATOR, PRIOR, START, begun, field, photographed, spheres
+from tests.solve.made import (
+    FEW,
+    OPERATOR,
+    PRIOR,
+    START,
+    WHOLE,
+    begun,
+    field,
+    light_of,
+    natural,
+    on_even_cells,
+    photographed,
+    spheres,
+)
 
-WHOLE, QUICK, LIGHTS = Schedule(4, (14, 10)), Schedule(4, (8, 6)), Schedule(together=(0, 10, 10))
+QUICK, LIGHTS = Schedule(4, (8, 6)), Schedule(together=(0, 10, 10), given=True)
 
 
-def materials_in(problem, cells=FEW, start=START, schedule=WHOLE, free=FREE) -> Fit:
-    return fitted(problem, begun(problem, cells, start), PRIOR, schedule, free)
+def materials_in(problem, cells=FEW, start=START, schedule=WHOLE) -> Fit:
+    return fitted(problem, begun(problem, cells, start), PRIOR, schedule)
 
 
 @pytest.fixture(scope="module")
 def solved():
-    problem, true = photographed(5, 3)
-    return problem, true, materials_in(problem)
+    return natural()
 
 
 def test_materials_in_natural_lights(solved):
@@ -50,21 +61,11 @@ def test_a_fit_lowers_its_value(solved):
     """Of materials and lights together, and of lights alone.  The prior on k_d is about the start, so the value of a fit that goes on is
     another, by little."""
     problem, _, found = solved
-    again, given = (
-        fitted(problem, found, PRIOR, step, FREE).value
-        for step in (Schedule(together=(0,), estimate=False), Schedule())
-    )
+    again = fitted(problem, found, PRIOR, Schedule(together=(0,), estimate=False)).value
+    given = fitted(problem, found, PRIOR, Schedule(given=True)).value
     assert again == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
-    for step, before in ((Schedule(together=(3,), estimate=False), again), (Schedule(lights=3), given)):
-        assert fitted(problem, found, PRIOR, step, FREE).value <= before + 1e-9 * abs(before)
-
-
-def test_what_is_not_free_stays_to_the_last_bit_and_what_is_moves():
-    problem, _ = photographed(6, 1, cells=40, size=10)
-    free = np.zeros((3, 7), bool)
-    free[1, 6] = True
-    found = materials_in(problem, 40, schedule=Schedule(2, (4,)), free=free).point.materials
-    assert (found.rows() == START.rows()).reshape(3, 7)[~free].all() and found.roughness[1] != START.roughness[1]
+    for step, before in ((Schedule(together=(3,), estimate=False), again), (Schedule(lights=3, given=True), given)):
+        assert fitted(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
 
 
 def test_what_starts_nil_is_found_too():
@@ -78,7 +79,7 @@ def test_what_starts_nil_is_found_too():
 
 def test_order_of_lights_changes_nothing():
     problem, _ = photographed(7, 2, cells=40, size=10)
-    turned = JointProblem(problem.blocks[::-1], OPERATOR, Loss())
+    turned = JointProblem(problem.blocks[::-1], OPERATOR)
     one, other = (materials_in(p, 40, schedule=QUICK).point.materials.vector() for p in (problem, turned))
     assert np.allclose(one, other, rtol=1e-3, atol=1e-4)
 
@@ -97,7 +98,7 @@ def test_gold_among_paints_is_not_taken_for_a_paint():
 
 def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
     problem, _, found = solved
-    again = fitted(problem, found, PRIOR, LIGHTS, ~FREE)
+    again = fitted(problem, found, PRIOR, LIGHTS)
     assert np.array_equal(again.point.materials.vector(), found.point.materials.vector())
     for one, how, light, after in zip(
         problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True
@@ -111,13 +112,11 @@ def test_lights_from_all_show_what_the_others_alone_see(solved):
     """Found from a half of the observations, given the true materials, lights explain the other half better afterwards."""
     problem, _, found = solved
     half = [msgspec.structs.replace(b, confidence=np.where(b.normal[:, 0] > 0, 0.9, 0.1)) for b in problem.blocks]
-    of_half = fitted(
-        sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE, FREE
-    )
+    of_half = fitted(sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE)
     others = msgspec.structs.replace(
         problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks]
     )
-    after = fitted(problem, of_half, PRIOR, LIGHTS, ~FREE)
+    after = fitted(problem, of_half, PRIOR, LIGHTS)
     assert others.held_out_loss(after.point) < 0.5 * others.held_out_loss(of_half.point)
 
 
@@ -154,19 +153,13 @@ def test_the_contrast_of_a_light_is_found(solved):
         assert Schedule().least <= one.temperature < 3  # noise is less than the noise model says
 
 
-def test_a_start_has_hyperparameters_for_each_light():
+def test_a_start_has_hyperparameters_for_each_light_which_stay_where_they_are_not_estimated():
     problem, _ = photographed(4, 2, cells=40, size=8)
     start = begun(problem, 40)
     assert start.hyperparameters == [Hyperparameters()] * 2 and start.value == float("inf")
-    kept = [Hyperparameters(3.0), Hyperparameters(7.0)]
-    assert start_of(start.point, kept).hyperparameters == kept
-    assert fitted(problem, start_of(start.point, kept), PRIOR, Schedule(lights=1), FREE).hyperparameters == kept
-    assert (
-        fitted(
-            problem, start_of(start.point, kept), PRIOR, Schedule(together=(1,), estimate=False), FREE
-        ).hyperparameters
-        == kept
-    )
+    kept = msgspec.structs.replace(start, hyperparameters=[Hyperparameters(3.0), Hyperparameters(7.0)])
+    for schedule in (Schedule(lights=1), Schedule(together=(1,), estimate=False)):
+        assert fitted(problem, kept, PRIOR, schedule).hyperparameters == kept.hyperparameters
 
 
 # ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -177,7 +170,7 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
     unsure = np.arange(len(one)) % 3 == 0
     rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
-    (kept,) = sure_ones(JointProblem([rated], OPERATOR, Loss())).blocks
+    (kept,) = sure_ones(JointProblem([rated], OPERATOR)).blocks
     assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
     noise = Noise(DARK * one.noise.absolute, one.noise.relative)
     assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
@@ -188,7 +181,7 @@ def test_what_is_alike_unsure_is_used():
     one = photographed(9, 1, cells=40, size=10)[0].blocks[0]
     rated = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
     for given in (rated, one):
-        assert len(sure_ones(JointProblem([given], OPERATOR, Loss())).blocks[0]) == len(one)
+        assert len(sure_ones(JointProblem([given], OPERATOR)).blocks[0]) == len(one)
 
 
 # ── the prior on materials ───────────────────────────────────────────────────────────────────────────────────────────
@@ -225,8 +218,71 @@ def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
     assert 30 < costs([1, 0.8, 0.3]) < 60
 
 
-def test_a_point_of_other_materials_in_the_same_gauge_is_a_start():
-    """Of a fit that is given the truth nothing moves far."""
-    problem, true = photographed(11, 2, cells=60, size=12, noise=0.0)
-    found = fitted(problem, start_of(Point(MATERIALS, true)), PRIOR, QUICK, FREE).point.materials
-    assert np.abs(found.roughness - MATERIALS.roughness).max() < 0.05
+# ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────
+
+
+def found_in(lights: list[Light], shown=(0, 1, 2)) -> Fit:
+    """The fit of noisy spheres of `shown` materials, one photo a light."""
+    return materials_in(spheres(lights, shown=shown))
+
+
+def contrast(light: Light) -> float:
+    """Standard deviation over the cells of the log radiance, the mean of the channels."""
+    return float(light.log_radiance.mean(0).std())
+
+
+def test_a_constant_light_stays_nearly_constant():
+    constant = light_of([[0, 0, 1.0]], 1e-4, [[1.0, 1.0, 1.0]])
+    assert contrast(found_in([constant]).point.lights[0]) < 0.3  # natural light has 1.2
+
+
+def test_a_light_of_one_colour():
+    """A channel without light says nothing, and spoils nothing."""
+    rng, lights = np.random.default_rng(1), []
+    for _ in range(2):
+        lights.append(light_of(rng.normal(size=(15, 3)), 12.0, rng.exponential(size=(15, 1)) * [1.0, 0.02, 0.005]))
+    found = found_in(lights).point.materials
+    assert np.abs(found.roughness - MATERIALS.roughness).max() < 0.15
+    whole = [(m.diffuse + m.specular)[:, 0] for m in (found, MATERIALS)]
+    assert np.allclose(whole[0] / whole[0].mean(), whole[1] / whole[1].mean(), rtol=0.15)
+
+
+def test_lamps_at_night_are_found_where_they_are():
+    axes = np.array([[0.6, -0.5, -0.6], [-0.7, -0.3, -0.6], [0.1, 0.6, -0.8]])
+    lamps = light_of(
+        np.vstack([axes, [0, 0, 1.0]]), [60, 60, 60, 1e-4], np.array([8.0, 6.0, 7.0, 0.02])[:, None] * np.ones(3)
+    )
+    light = found_in([lamps]).point.lights[0]
+    radiance = np.exp(light.log_radiance).mean(0)
+    near = np.degrees(np.arccos(np.clip(light.axis @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T, -1, 1)))
+    assert radiance[near.min(1) < 25].sum() > 0.6 * radiance.sum()
+    for lamp in near.T:
+        around = lamp < 30
+        assert lamp[around][radiance[around].argmax()] < 19  # cells are 18° apart
+
+
+@pytest.mark.parametrize("shown", [(0,), (2,)])
+def test_one_photo_of_one_material(shown):
+    light = on_even_cells(np.tile(1.5 * np.sin(3 * even_cells(FEW).axis[:, 0] + 1), (3, 1)))
+    found = found_in([light], shown).point
+    assert (
+        all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
+        and contrast(found.lights[0]) < 3
+    )
+
+
+def test_inverse_and_determinant_are_those_of_numpy_and_exactly_symmetric():
+    root = np.random.default_rng(0).normal(size=(60, 60))
+    matrix = root @ root.T + np.eye(60)
+    found = positive_definite_inverse(matrix)
+    np.testing.assert_allclose(found.matrix, np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
+    assert found.log_determinant == pytest.approx(np.linalg.slogdet(matrix).logabsdet, rel=1e-12)
+    assert (found.matrix == found.matrix.T).all()
+
+
+@pytest.mark.parametrize("spoilt", [-1.0, np.nan])
+def test_what_is_not_positive_definite_is_an_error(spoilt):
+    matrix = np.eye(4)
+    matrix[2, 2] = spoilt
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        positive_definite_inverse(matrix)

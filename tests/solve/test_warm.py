@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.materials import Materials
@@ -14,8 +13,8 @@ from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, from_nothing, solve
-from factorlib.solve.warm import from_earlier, known_point, with_decided
+from factorlib.solve.solve import Run, solve
+from factorlib.solve.start import from_earlier, from_nothing, known_point, with_decided
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
 
@@ -38,32 +37,22 @@ def truth(*numbers, shown=(0, 1, 2), photos=1, noise=0.0, size=10):
 
 
 def first(materials: Materials, count: int) -> Materials:
-    return Materials(*(getattr(materials, f)[:count] for f in materials.__struct_fields__))
+    return Materials.of_rows(materials.rows()[:count])
 
 
 def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> Earlier:
     """As the stage writes it and `read_earlier` reads it."""
-    rows = zip(
-        names, materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True
-    )
-    table = MaterialTable(
-        {name: Reflectance(tuple(d), tuple(s), r) for name, d, s, r in rows},
-        Gauge(component=dict(zip(names, component, strict=True))),
-        Model(),
-    )
-    lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in zip(blocks, lights, strict=True)}
-    exposures = {
-        p: (float(np.exp(e)),) * 3
-        for b, li in zip(blocks, lights, strict=True)
-        for p, e in zip(b.photos, li.log_exposure, strict=True)
-    }
-    return Earlier(table, lobes, exposures)
+    rows = materials.rows().tolist()
+    solved = {name: Reflectance(tuple(r[:3]), tuple(r[3:6]), r[6]) for name, r in zip(names, rows, strict=True)}
+    table = MaterialTable(solved, Gauge(component=dict(zip(names, component, strict=True))), Model())
+    pairs = list(zip(blocks, lights, strict=True))
+    lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in pairs}
+    photos = [pair for b, li in pairs for pair in zip(b.photos, li.log_exposure, strict=True)]
+    return Earlier(table, lobes, {photo: (float(np.exp(e)),) * 3 for photo, e in photos})
 
 
 def start_from(earlier, blocks, names=NAMES):
-    start = from_earlier(earlier, names)
-    (point,) = start.points(JointProblem(blocks, OPERATOR), CELLS)
-    assert start.earlier
+    (point,) = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)
     return point.materials, point.lights
 
 
@@ -83,9 +72,7 @@ def check_same_but_for_the_gauge(found: Materials, true=MATERIALS):
 
 def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
     blocks, lights = truth(0, 1)
-    turned = [
-        msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)
-    ]  # same scene, other unit
+    turned = [msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)]
     materials, found = start_from(written(blocks, MATERIALS, lights), turned)
     check_same_but_for_the_gauge(materials)
     explained(turned, materials, found)
@@ -106,7 +93,7 @@ def test_cells_that_split_stay_as_small_as_they_are():
 
 def test_materials_go_by_their_names():
     blocks, lights = truth(0)
-    swapped = Materials(*(getattr(MATERIALS, f)[[2, 0, 1]] for f in MATERIALS.__struct_fields__))
+    swapped = Materials.of_rows(MATERIALS.rows()[[2, 0, 1]])
     materials, _ = start_from(written(blocks, swapped, lights, ["blue", "red", "green"]), blocks)
     check_same_but_for_the_gauge(materials)
 
@@ -117,9 +104,8 @@ def test_a_light_nobody_knows_is_constant_and_the_known_ones_stay():
     check_same_but_for_the_gauge(materials)
     explained(blocks[:1], materials, found[:1])
     assert np.ptp(found[1].log_radiance, axis=1).max() < 1e-9 and len(found[1]) == CELLS
-    assert (
-        abs(np.log(Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean())) < 0.5
-    )  # a block's mean is 1
+    mean = Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean()
+    assert abs(np.log(mean)) < 0.5  # a block's is 1
 
 
 def test_a_material_nobody_knows_stands_beside_the_known_ones():
@@ -140,9 +126,7 @@ def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
     new, *others = blocks[0].photos
     factor = earlier.exposures[others[0]][0]
     relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
-    lobes = {
-        name: light.scaled(factor) for name, light in earlier.lights.items()
-    }  # as it was while `new` was not there
+    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was without `new`
     earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
     materials, (light,) = start_from(earlier, blocks)
     np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
@@ -184,7 +168,7 @@ def test_what_nothing_known_leads_to_starts_as_from_nothing(known):
         earlier = msgspec.structs.replace(earlier, table=MaterialTable({}))
     materials, found = start_from(earlier, blocks)
     problem = JointProblem(blocks, OPERATOR)
-    (nothing,) = from_nothing(3).points(problem, CELLS)
+    (nothing,) = from_nothing(3)(problem, CELLS)
     np.testing.assert_array_equal(materials.rows()[2], nothing.materials.rows()[2])
     np.testing.assert_allclose(found[1].weight, nothing.lights[1].weight)
     if not known:
@@ -204,42 +188,15 @@ def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
 
 @pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])
 def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kept, tried):
-    losses = (
-        {"held_out_loss_with": 1.0, "held_out_loss_without": 2.0, "margin": 3.0}
-        if tried
-        else {"held_out_loss_with": 1.0}
-    )
-    model = Model(
-        self_shadowing=kept, self_shadowing_chosen_by=losses, interreflection=not kept, interreflection_chosen_by=losses
-    )
+    losses = {"held_out_loss_with": 1.0} | ({"held_out_loss_without": 2.0, "margin": 3.0} if tried else {})
+    chosen = {"self_shadowing_chosen_by": losses, "interreflection_chosen_by": losses}
+    model = Model(self_shadowing=kept, interreflection=not kept, **chosen)
     earlier = Earlier(MaterialTable({}, Gauge(), model), {}, {})
-    found = with_decided(Choices(), earlier)
-    names = ["off", "on"]
-    assert [found.self_shadowing, found.interreflection] == (
-        [names[kept], names[not kept]] if tried else ["auto", "auto"]
-    )
+    found, names = with_decided(Choices(), earlier), ["off", "on"]
+    expected = [names[kept], names[not kept]] if tried else ["auto", "auto"]
+    assert [found.self_shadowing, found.interreflection] == expected
     asked = Choices(self_shadowing="off", interreflection="on")
     assert with_decided(asked, earlier) == asked
-
-
-def test_decided_shadows_are_kept_though_nothing_speaks_for_them():
-    blocks, lights = truth(0, size=8)
-    rng = np.random.default_rng(0)
-    hidden = [
-        msgspec.structs.replace(
-            b,
-            visibility=(255 * (rng.random((len(b), 96)) < 0.5)).astype(np.uint8),
-            directions=np.stack([fibonacci_sphere(96)]),
-        )
-        for b in blocks
-    ]
-    earlier = written(blocks, MATERIALS, lights)
-    both = {"held_out_loss_with": 1.0, "held_out_loss_without": 2.0}
-    model = Model(self_shadowing=True, self_shadowing_chosen_by=both)
-    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
-    choices = with_decided(msgspec.structs.replace(QUICK, cells=24, observations=80), earlier)
-    found = solve(JointProblem(hidden, OPERATOR), from_earlier(earlier, NAMES), Run(choices, prior=PRIOR))
-    assert found.shadows.kept and found.shadows.margin is None
 
 
 # ── whole answers ────────────────────────────────────────────────────────────────────────────────────────────────────

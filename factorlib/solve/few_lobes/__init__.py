@@ -4,12 +4,9 @@ Where normals, shadows and noise are what the model says, a light of few lobes i
 take up the errors of the model as features of the light, so this solver decides nothing for the default one: it takes shadows and
 interreflection as the problem has them, photos as linear, and has no prior on lights but the paper's on their tint.
 
-    solve             few_lobes: rounds, the choice of specular parts, polish
-    rounds            lobes are inserted where residuals are large (insertion), as long as held-out observations are explained better
-    descent           Levenberg–Marquardt on the system of all lights (arrow)
-    normal_equations  of one light, with weights fitted;  jacobian: derivatives;  unknowns: of a light as few lobes, 6 a lobe
-    roughness         is also searched for with the lights fixed;  specular: which materials need a specular part
-
-Every observation touches one material (7 unknowns) and one light, so the normal equations have an arrow shape and the lights are
-eliminated one by one (Schur).
+    solve      few_lobes: rounds, the choice of specular parts, polish
+    rounds     lobes are inserted where residuals are large (insertion), as long as held-out observations are explained better;
+               roughness is also searched for with the lights fixed
+    descent    Levenberg–Marquardt on the system of all lights
+    equations  of one light: derivatives, normal equations, weights;  unknowns: of a light as few lobes, 6 a lobe
 """

@@ -1,4 +1,15 @@
-"""Levenberg–Marquardt over all materials and lights: damped steps, taken when they lower the loss.
+"""Levenberg–Marquardt over all materials and lights of few lobes: damped steps, taken when they lower the loss.
+
+With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i per illumination) and gradients g_m, g_i, eliminating every
+light leaves
+
+    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ g_i),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                 (1)
+
+with 7 unknowns a material.  The Schur complement on the left is the information that the data hold about the materials when the
+lights are unknown too.  A light's C and M have rows for the unknowns of the materials that it shows alone, and so has what its
+elimination adds: with many materials, of which a photo shows few, cost and memory grow with those few.  Damping multiplies
+the diagonal, so that the step does not depend on the units of an unknown.  Rows and columns of unknowns that are not free become those of the
+identity.
 
 Radiance is linear in the lobes' weights, and its derivatives by axes and sharpnesses are proportional to the weights.  So the step
 predicts badly what happens where one lobe takes over the energy of another while it moves.  The weights of a step are therefore not
@@ -8,87 +19,170 @@ Hong et al. 2017).  That costs little, for the next system needs the same respon
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.model.point import Point
+from factorlib.model.lights import Light
+from factorlib.model.materials import SHARPNESS, Materials, Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.few_lobes.arrow import ArrowSystem, Bounds
-from factorlib.solve.few_lobes.normal_equations import normal_equations, with_weights_fitted
-from factorlib.solve.few_lobes.unknowns import materials_at_bound, moved_point
+from factorlib.solve.descent import damped, masked
+from factorlib.solve.few_lobes.equations import NormalEquations, normal_equations, with_weights_fitted
+from factorlib.solve.few_lobes.unknowns import light_at_bound, materials_at_bound, moved_point
 
 DAMPING, LEAST_DAMPING = 1e-3, 1e-9
 LESS, MORE = 2.5, 3.0  # the damping is divided by LESS after a good step, multiplied by MORE after a bad one
 GOOD, BAD = 0.6, 0.2  # a step is good or bad if the loss fell by more or less than this share of the predicted decrease
 ENOUGH = 2  # steps in a row that gain too little end a descent
+MOST_WIDTHS, MOST_TURN, MOST_S = 0.4, 0.3, 0.25  # of a lobe in one step: its own widths, radians, s
 TIGHTENINGS = 12
+DEFINITE = 1e-9  # damping that makes a light's block definite where the step itself is not damped
+
+
+class Bounds:
+    """The limits of one light's step.
+
+    free    [l] unknowns that the step may choose
+    fixed   [l] the step of those that are not free
+    extra   [l] damping of an unknown of its own, added to the common damping
+
+    At the start an unknown is not free if it is at a bound and the loss would fall beyond it.  `tighten` adds further limits.
+    """
+
+    def __init__(self, equations: NormalEquations, light: Light, materials: Materials):
+        self.light, self.diagonal = light, np.diag(equations.light_hessian)
+        self.free = ~light_at_bound(light, materials, equations.light_gradient)
+        self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
+        p = len(light)
+        self.low, self.high = np.full(len(self.free), -np.inf), np.full(len(self.free), np.inf)
+        s_now, s_low, s_high = (
+            -np.log(1 / x + materials.blur) for x in (light.sharpness, SHARPNESS[0], materials.sharpest)
+        )
+        self.low[2 * p : 3 * p], self.high[2 * p : 3 * p] = s_low - s_now, s_high - s_now
+
+    def tighten(self, step: Float[np.ndarray, " l"]) -> bool:
+        """Tighten the limits where the step violates them; returns whether any was changed.
+
+        A sharpness that would leave its range is fixed at the end of the range.  A lobe that moves too far gets more damping.
+        """
+        p = len(self.light)
+        outside = self.free & ((step < self.low) | (step > self.high))
+        self.free &= ~outside
+        self.fixed[outside] = np.clip(step, self.low, self.high)[outside]
+        turn = np.hypot(step[:p], step[p : 2 * p]) / np.minimum(MOST_WIDTHS / np.sqrt(self.light.sharpness), MOST_TURN)
+        far = np.zeros(len(step), bool)
+        far[: 2 * p] = np.tile(turn > 1, 2)
+        far[2 * p : 3 * p] = np.abs(step[2 * p : 3 * p]) > MOST_S
+        far &= self.free
+        self.extra[far] = np.maximum(6 * self.extra[far], 1e-3 * self.diagonal[far])
+        return bool(outside.any() or far.any())
 
 
 class Iterate(msgspec.Struct, frozen=True):
-    """A point, and the system of a problem there."""
+    """A point, and the normal equations of all illuminations there.  Sums are taken in their order, so that equal inputs give equal bits."""
 
     point: Point
-    system: ArrowSystem
+    parts: list[NormalEquations]
 
     @property
     def loss(self) -> float:
         """The loss of the point: robust losses of what is fitted, and priors."""
-        return self.system.loss
+        return sum(part.loss for part in self.parts)
 
+    def of_materials(self) -> tuple[Float[np.ndarray, "7m 7m"], Float[np.ndarray, " 7m"]]:
+        """M and g_m."""
+        M, g = np.zeros((7 * len(self.point.materials),) * 2), np.zeros(7 * len(self.point.materials))
+        for part in self.parts:
+            M[np.ix_(part.places, part.places)] += part.material_hessian
+            g[part.places] += part.material_gradient
+        return M, g
 
-class Step(msgspec.Struct, frozen=True):
-    """A step of all unknowns, and by how much the quadratic model falls with it."""
+    def solved(
+        self, free: Bool[np.ndarray, " 7m"], bounds: Sequence[Bounds], damping: float
+    ) -> tuple[Float[np.ndarray, " 7m"], list[Float[np.ndarray, " l"]]]:
+        """The damped step (1) of the `free` unknowns of the materials, and of each light within its bounds."""
+        M, g = self.of_materials()
+        reduced, right, solutions = damped(M, damping), -g, []
+        for part, bound in zip(self.parts, bounds, strict=True):
+            L = damped(part.light_hessian, damping) + np.diag(bound.extra)
+            C = part.cross_hessian * bound.free
+            gradient = (part.light_gradient + part.light_hessian @ bound.fixed) * bound.free
+            factor = cho_factor(masked(L, bound.free), check_finite=False)
+            solution = cho_solve(factor, np.column_stack([C.T, gradient]), check_finite=False)
+            reduced[np.ix_(part.places, part.places)] -= C @ solution[:, :-1]
+            right[part.places] += C @ solution[:, -1] - part.cross_hessian @ bound.fixed
+            solutions.append(solution)
+        dm = np.linalg.solve(masked(reduced, free), np.where(free, right, 0.0))
+        dl = [
+            bound.fixed - (solution[:, -1] + solution[:, :-1] @ dm[part.places]) * bound.free
+            for part, bound, solution in zip(self.parts, bounds, solutions, strict=True)
+        ]
+        return dm, dl
 
-    materials: Float[np.ndarray, " 7m"]
-    lights: list[Float[np.ndarray, " l"]]
-    predicted: float
+    def predicted_decrease(self, dm: Float[np.ndarray, " 7m"], dl: Sequence[Float[np.ndarray, " l"]]) -> float:
+        """By how much a step lowers the quadratic model of the loss."""
+        M, g = self.of_materials()
+        decrease = -dm @ (2 * g + M @ dm)
+        for part, step in zip(self.parts, dl, strict=True):
+            L, C = part.light_hessian, part.cross_hessian
+            decrease -= step @ (2 * part.light_gradient + L @ step + 2 * C.T @ dm[part.places])
+        return float(decrease)
 
-
-class Descent(msgspec.Struct, frozen=True):
-    """When a descent stops: after `iterations`, or after two steps in a row that gain less than `tolerance` of the loss."""
-
-    iterations: int = 10
-    tolerance: float = 1e-4
+    def information(self) -> tuple[Float[np.ndarray, "7m 7m"], list[Float[np.ndarray, "g 7m"]]]:
+        """The left side of (1), undamped, and after the same elimination the materials' scores of each illumination's clusters, if it has any."""
+        (reduced, _), scores = self.of_materials(), []
+        for part, light in zip(self.parts, self.point.lights, strict=True):
+            free, k = ~light_at_bound(light, self.point.materials, part.light_gradient), len(part.places)
+            factor = cho_factor(masked(damped(part.light_hessian, DEFINITE), free), check_finite=False)
+            C = part.cross_hessian * free
+            taken_up = cho_solve(factor, C.T, check_finite=False)  # by the light
+            reduced[np.ix_(part.places, part.places)] -= C @ taken_up
+            if part.scores is not None:
+                scores.append(np.zeros((len(part.scores), len(reduced))))
+                scores[-1][:, part.places] = part.scores[:, :k] - (part.scores[:, k:] * free) @ taken_up
+        return (reduced + reduced.T) / 2, scores
 
 
 def evaluate(problem: JointProblem, point: Point) -> Iterate:
     """The point with its system."""
-    parts = problem.spread(partial(normal_equations, loss=problem.loss), problem.illuminations(point))
-    return Iterate(point, ArrowSystem(list(parts), 7 * len(point.materials)))
+    return Iterate(
+        point, list(problem.spread(partial(normal_equations, loss=problem.loss), problem.illuminations(point)))
+    )
 
 
 def fit_weights(problem: JointProblem, point: Point) -> Iterate:
     """As `evaluate`, with the lobes' weights fitted first: those that lower the loss most while nothing else changes."""
-    fits = list(problem.spread(partial(with_weights_fitted, loss=problem.loss), problem.illuminations(point)))
-    system = ArrowSystem([one.equations for one in fits], 7 * len(point.materials))
-    return Iterate(Point(point.materials, [one.light for one in fits]), system)
+    fits = problem.spread(partial(with_weights_fitted, loss=problem.loss), problem.illuminations(point))
+    lights, parts = zip(*fits, strict=True)
+    return Iterate(Point(point.materials, list(lights)), list(parts))
 
 
 def descend(
     problem: JointProblem,
     start: Iterate,
-    descent: Descent,
+    iterations: int = 10,
+    tolerance: float = 1e-4,
     accepted: Callable[[int, Iterate], object] = lambda iteration, iterate: None,
-    fixed: Bool[np.ndarray, " 7m"] | None = None,
+    fixed: Bool[np.ndarray, " 7m"] | bool = False,
 ) -> Iterate:
-    """Lower the loss from `start`, an iterate of this problem; every accepted point is reported with the number of its iteration.
+    """Lower the loss from `start`, an iterate of this problem, until two steps in a row gain less than `tolerance` of it.
 
-    fixed: unknowns of the materials that stay as they are
+    accepted: called with every point that is taken and the number of its iteration;  fixed: unknowns of the materials that stay as they are
     """
     current, damping, small = start, DAMPING, 0
-    for iteration in range(descent.iterations):
-        step = damped_step(current, damping, fixed)
-        trial = fit_weights(problem, moved_point(current.point, step.materials, step.lights))
-        gained, least = current.loss - trial.loss, descent.tolerance * current.loss
+    for iteration in range(iterations):
+        dm, dl, predicted = damped_step(current, damping, fixed)
+        trial = fit_weights(problem, moved_point(current.point, dm, dl))
+        gained, least = current.loss - trial.loss, tolerance * current.loss
         if gained > 0:
             small = small + 1 if gained < least else 0
         else:
-            small += step.predicted < least
-        share = gained / max(step.predicted, 1e-300)
+            small += predicted < least
+        share = gained / max(predicted, 1e-300)
         damping = max(damping / LESS, LEAST_DAMPING) if share > GOOD else damping if share > BAD else damping * MORE
         if gained > 0:
             current = trial
@@ -98,20 +192,22 @@ def descend(
     return current
 
 
-def damped_step(at: Iterate, damping: float, fixed: Bool[np.ndarray, " 7m"] | None = None) -> Step:
-    """The step at the given Levenberg–Marquardt `damping`.
+def damped_step(
+    at: Iterate, damping: float, fixed: Bool[np.ndarray, " 7m"] | bool = False
+) -> tuple[Float[np.ndarray, " 7m"], list[Float[np.ndarray, " l"]], float]:
+    """The step at the given Levenberg–Marquardt `damping`, of materials and of lights, and by how much the quadratic model falls with it.
 
     fixed: unknowns of the materials that stay as they are
     An unknown at a bound stays there if the loss would fall beyond it.  Other unknowns are clipped to their ranges after the step;
     weights are fitted anew instead.  While the step takes a sharpness out of its range, or moves a lobe farther than the quadratic
     model holds, it is solved again with tighter limits (`Bounds.tighten`), at most `TIGHTENINGS` times.
     """
-    materials, system = at.point.materials, at.system
-    free = ~materials_at_bound(materials, system.material_gradient) & (True if fixed is None else ~fixed)
-    bounds = [Bounds(part, light, materials) for part, light in zip(system.parts, at.point.lights, strict=True)]
+    materials = at.point.materials
+    free = ~materials_at_bound(materials, at.of_materials()[1]) & ~np.asarray(fixed)
+    bounds = [Bounds(part, light, materials) for part, light in zip(at.parts, at.point.lights, strict=True)]
     for _ in range(TIGHTENINGS):
-        by_materials, by_lights = system.solved(free, bounds, damping)
-        tightened = [bound.tighten(step) for bound, step in zip(bounds, by_lights, strict=True)]
+        dm, dl = at.solved(free, bounds, damping)
+        tightened = [bound.tighten(step) for bound, step in zip(bounds, dl, strict=True)]
         if not any(tightened):
             break
-    return Step(by_materials, by_lights, system.predicted_decrease(by_materials, by_lights))
+    return dm, dl, at.predicted_decrease(dm, dl)

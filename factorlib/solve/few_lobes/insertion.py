@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.solve.few_lobes.unknowns import joined
@@ -44,31 +43,16 @@ class Candidates(msgspec.Struct, frozen=True):
 
 def candidates(illumination: Illumination, seed: int, sample: int = SAMPLE) -> Candidates:
     """At `sample` of the observations, or all of fewer, drawn by `seed`."""
-    rows, lobes = _sampled_rows(illumination.block, seed, sample), dictionary(illumination.materials.sharpest)
+    rows, lobes = np.flatnonzero(~illumination.block.held_out), dictionary(illumination.materials.sharpest)
+    if len(rows) > sample:
+        rows = np.sort(np.random.default_rng(seed).choice(rows, sample, replace=False))
     return Candidates(rows, lobes, illumination.atoms(rows, lobes))
 
 
 def lobes_inserted(illumination: Illumination, count: int, candidates: Candidates) -> Light:
     """The light with up to `count` further lobes that explain what it leaves unexplained."""
-    residual, lobes = -illumination.residuals()[candidates.rows], candidates.lobes
-    chosen, weights = _pursuit(candidates.atoms, residual, lobes, count)
-    return joined(
-        illumination.light, UnitLobes(lobes.axis[chosen], lobes.sharpness[chosen]), np.array(weights).reshape(-1, 3)
-    )
-
-
-def _sampled_rows(block: Block, seed: int, sample: int) -> Int[np.ndarray, " n"]:
-    fit = np.flatnonzero(~block.held_out)
-    if len(fit) <= sample:
-        return fit
-    return np.sort(np.random.default_rng(seed).choice(fit, sample, replace=False))
-
-
-def _pursuit(
-    atoms: Float[np.ndarray, "3 n j"], residual: Float[np.ndarray, "n 3"], lobes: UnitLobes, count: int
-) -> tuple[list[int], list[Float[np.ndarray, "3"]]]:
-    """Numbers and weights of the chosen lobes."""
-    axis, sharpness = lobes.axis, lobes.sharpness
+    residual, atoms = -illumination.residuals()[candidates.rows], candidates.atoms
+    axis, sharpness = candidates.lobes.axis, candidates.lobes.sharpness
     norm = np.maximum(np.sum(atoms**2, axis=1), 1e-12)  # [3, j]
     correlation = np.einsum("cnj,nc->cj", atoms, residual)
     allowed = norm.sum(0) > 1e-6 * norm.sum(0).max()
@@ -85,4 +69,4 @@ def _pursuit(
         width = TOO_NEAR * np.sqrt(2 / np.minimum(sharpness, sharpness[best]))
         apart = np.linalg.norm(axis - axis[best], axis=1)
         allowed &= (apart > width) | (np.abs(np.log(sharpness / sharpness[best])) > 1)
-    return chosen, weights
+    return joined(illumination.light, UnitLobes(axis[chosen], sharpness[chosen]), np.array(weights).reshape(-1, 3))

@@ -8,68 +8,55 @@ by the one of least loss, if that is less than `BETTER` times the loss of the pr
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import nnls
 
-from factorlib.model.blocks import Block
-from factorlib.model.bounds import LEAST_REFLECTANCE
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.materials import LEAST_REFLECTANCE, Materials, Point
 from factorlib.model.problem import JointProblem
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
 ROWS = 300  # observations of each material in each light that are used
 BETTER = 0.95  # of the present loss
 
-
-class Material(NamedTuple):
-    """k_d and k_s [3], and roughness."""
-
-    diffuse: Float[np.ndarray, "3"]
-    specular: Float[np.ndarray, "3"]
-    roughness: float
+Material = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]  # k_d, k_s, roughness
 
 
 def materials_of_best_roughness(problem: JointProblem, point: Point) -> Materials:
     """The materials, each replaced where another roughness explains a sample of the observations clearly better."""
     searched = partial(_searched, materials=point.materials, loss=problem.loss)
-    found = list(problem.spread(searched, [(m, _voters(problem, point, m)) for m in range(len(point.materials))]))
-    diffuse, specular, roughness = (np.array(values) for values in zip(*found, strict=True))
-    return Materials(diffuse, specular, roughness)
+    found = problem.spread(searched, [(m, _voters(problem, point, m)) for m in range(len(point.materials))])
+    return Materials(*(np.array(values) for values in zip(*found, strict=True)))
 
 
 def _voters(problem: JointProblem, point: Point, m: int) -> list[Illumination]:
     """At most ROWS fitted observations of material m in each light, so that a worker is not sent all observations."""
-    voting = [block.take(_voting_rows(block, m)) for block in problem.blocks]
-    pairs = zip(voting, point.lights, strict=True)
-    return [Illumination(block, light, point.materials, problem.operator) for block, light in pairs if len(block)]
-
-
-def _voting_rows(block: Block, m: int) -> np.ndarray:
-    rows = np.flatnonzero((block.material == m) & ~block.held_out)
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), ROWS)).astype(int)]
+    voters = []
+    for one in problem.illuminations(point):
+        rows = np.flatnonzero((one.block.material == m) & ~one.block.held_out)
+        if len(rows):
+            some = rows[np.linspace(0, len(rows) - 1, min(len(rows), ROWS)).astype(int)]
+            voters.append(msgspec.structs.replace(one, block=one.block.take(some)))
+    return voters
 
 
 def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Loss) -> Material:
     m, voters = of
-    present = Material(materials.diffuse[m], materials.specular[m], float(materials.roughness[m]))
+    present = materials.diffuse[m], materials.specular[m], float(materials.roughness[m])
     if not voters:
         return present
     weight = np.concatenate([_weight(one, loss) for one in voters])
     radiance = np.concatenate([one.block.radiance for one in voters])
     trials = []
-    for roughness in (present.roughness, *GRID):
-        diffuse, specular = (
-            np.concatenate(part) for part in zip(*(_exposed(one, roughness) for one in voters), strict=True)
-        )
-        trials.append((*reflectances(diffuse, specular, radiance, weight), roughness))
+    for roughness in (present[2], *GRID):
+        parts = zip(*(_exposed(one, roughness) for one in voters), strict=True)
+        trials.append((*reflectances(*map(np.concatenate, parts), radiance, weight), roughness))
     best = min(trials, key=lambda trial: trial[0])
-    return Material(*best[1:]) if best[0] < BETTER * trials[0][0] else present
+    return best[1:] if best[0] < BETTER * trials[0][0] else present
 
 
 def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:

@@ -1,6 +1,6 @@
 """Rounds, which find the lobes.
 
-round:  insert up to `insert` lobes per illumination (insertion), refit the weights (weights),
+round:  insert up to `insert` lobes per illumination (insertion), refit the weights,
         descend on all unknowns (descent), look for a better roughness (roughness), prune, fix the gauge
         (all on a sample of the observations, which finds the lobes as well as all of them do)
 best:   a round becomes the best if its held-out loss is lower than the best one's by `least_gain` and by `LEAST_DECREASE`
@@ -13,6 +13,7 @@ stop:   when `PATIENCE` rounds in a row neither become the best nor halve the fi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import msgspec
@@ -22,15 +23,14 @@ from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
-from factorlib.model.point import Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
-from factorlib.solve.few_lobes.descent import Descent, Iterate, descend, evaluate, fit_weights
-from factorlib.solve.few_lobes.history import Recorder, Run
+from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate, fit_weights
 from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
-from factorlib.solve.few_lobes.options import FewLobes
+from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.roughness import materials_of_best_roughness
-from factorlib.solve.few_lobes.unknowns import blurred, pruned, starting_light
+from factorlib.solve.few_lobes.unknowns import pruned, starting_light
 from factorlib.solve.history import Event
 from factorlib.solve.start import starting_materials
 
@@ -44,6 +44,9 @@ HALVED = (
 )
 
 
+Record = Callable[[int, Iterate], None]  # called with the number of an iteration, and where it led
+
+
 class Fit(msgspec.Struct, frozen=True):
     """The chosen round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
 
@@ -51,6 +54,19 @@ class Fit(msgspec.Struct, frozen=True):
     held_out: float
     loss: Loss
     history: list[Event]
+
+
+def recorder(problem: JointProblem, history: list[Event], run: Run, number: int, phase: str) -> Record:
+    """What appends the events of a round to `history` and reports them, with the held-out loss at a round's end (iteration −1)."""
+
+    def record(iteration: int, iterate: Iterate) -> None:
+        """Record an iterate."""
+        held_out = problem.held_out_loss(iterate.point) if iteration < 0 else np.nan
+        loss, lobes = iterate.loss / problem.fitted_values, sum(map(len, iterate.point.lights))
+        history.append(Event(number, phase, iteration, loss, held_out, lobes))
+        run.report(history[-1])
+
+    return record
 
 
 def chosen_round(problem: JointProblem, materials: int, run: Run) -> Fit:
@@ -84,14 +100,18 @@ def sampled_for(problem: JointProblem, point: Point, options: FewLobes, more: in
 
 def round_after(sample: JointProblem, point: Point, run: Run, history: list[Event], number: int) -> Point:
     """The point after one round; its events join the history."""
-    record, options = Recorder(sample, history, run).record, run.options
-    fitting = sample.with_loss(robust(sample, point))
+    fitting, options = sample.with_loss(robust(sample, point)), run.options
+    record = recorder(sample, history, run, number, "descent")
     current = with_new_lobes(fitting, point, options, number)
-    descent = Descent(options.iterations, options.tolerance)
-    current = _with_best_roughness(fitting, descend(fitting, current, descent, partial(record, number, "descent")))
+    current = descend(fitting, current, options.iterations, options.tolerance, record)
+    materials = materials_of_best_roughness(fitting, current.point)
+    if (
+        materials.roughness != current.point.materials.roughness
+    ).any():  # that lowers the loss of the whole sample too?
+        current = min(current, evaluate(fitting, Point(materials, current.point.lights)), key=lambda one: one.loss)
     lights = [pruned(light) for light in current.point.lights]
     current = evaluate(fitting, in_gauge(Point(current.point.materials, lights), fitting.blocks))
-    record(number, "round", -1, current)
+    recorder(sample, history, run, number, "round")(-1, current)
     return current.point
 
 
@@ -130,19 +150,3 @@ def _grown(one: tuple[Illumination, int], options: FewLobes) -> Light:
     illumination, seed = one
     count = min(options.insert, options.lobes - len(illumination.light))
     return lobes_inserted(illumination, count, candidates(illumination, seed)) if count > 0 else illumination.light
-
-
-def _with_best_roughness(problem: JointProblem, current: Iterate) -> Iterate:
-    """The iterate with other roughnesses, if they lower the loss of the whole sample too; else as it is."""
-    materials = materials_of_best_roughness(problem, current.point)
-    if (materials.roughness == current.point.materials.roughness).all():
-        return current
-    trial = evaluate(problem, Point(materials, current.point.lights))
-    return trial if trial.loss < current.loss else current
-
-
-def answer_of(problem: JointProblem, point: Point) -> Point:
-    """The final point: no lobe is sharper than the materials resolve, weights fit all observations, pruned, in the gauge."""
-    lights = [blurred(light, point.materials.sharpest) for light in point.lights]
-    fitted = fit_weights(problem, Point(point.materials, lights)).point
-    return in_gauge(Point(fitted.materials, [pruned(light) for light in fitted.lights]), problem.blocks)

@@ -19,10 +19,8 @@ from jaxtyping import Bool, Float
 
 from factorlib.light.lobes import lobe_integral
 from factorlib.model.blocks import Block
-from factorlib.model.bounds import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, sharpest_resolved
-from factorlib.model.lights import Light, UnitLobes, tangents
-from factorlib.model.materials import Materials
-from factorlib.model.point import Point
+from factorlib.model.lights import Light, UnitLobes
+from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Materials, Point
 
 MOST_TURN, MOST_S, MOST_EXPOSURE = 0.3, 1.0, 1.0  # largest change of an unknown in one step
 
@@ -52,15 +50,23 @@ def sharpness_slopes(light: Light, blur: float) -> tuple[Float[np.ndarray, " p"]
     return by_s, by_s * (1 - doubled / np.expm1(np.minimum(doubled, 700.0)))
 
 
-def moved_light(light: Light, step: Float[np.ndarray, " l"], blur: float) -> Light:
-    """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1; blur is b."""
-    p = len(light)
+def tangents(axis: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+    """Two unit vectors that span the tangent plane of each unit `axis`."""
+    helper = np.where(np.abs(axis[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(axis, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)
+
+
+def moved_light(light: Light, step: Float[np.ndarray, " l"], materials: Materials) -> Light:
+    """The light after a step in the unknowns [tangent 1, tangent 2, s, e_R, e_G, e_B] × p, exposures 1…f−1."""
+    p, b = len(light), materials.blur
     by = step[: 6 * p].reshape(6, p)
     first, second = tangents(light.axis)
     turn = np.clip(by[:2], -MOST_TURN, MOST_TURN)
     axis = light.axis + turn[0][:, None] * first + turn[1][:, None] * second
-    variance = (1 / light.sharpness + blur) * np.exp(-np.clip(by[2], -MOST_S, MOST_S)) - blur
-    log_sharpness = -np.log(np.clip(variance, 1 / sharpest_resolved(blur), 1 / SHARPNESS[0]))
+    variance = (1 / light.sharpness + b) * np.exp(-np.clip(by[2], -MOST_S, MOST_S)) - b  # 1/λ
+    log_sharpness = -np.log(np.clip(variance, 1 / materials.sharpest, 1 / SHARPNESS[0]))
     return Light(
         axis / np.linalg.norm(axis, axis=1, keepdims=True),
         log_sharpness,
@@ -73,8 +79,7 @@ def moved_point(
     point: Point, by_materials: Float[np.ndarray, " 7m"], by_lights: Sequence[Float[np.ndarray, " l"]]
 ) -> Point:
     """The nearest point within bounds after a step in all unknowns."""
-    blur = point.materials.blur
-    lights = [moved_light(light, by, blur) for light, by in zip(point.lights, by_lights, strict=True)]
+    lights = [moved_light(light, by, point.materials) for light, by in zip(point.lights, by_lights, strict=True)]
     return Point(Materials.of_vector(point.materials.vector() + by_materials), lights)
 
 
@@ -92,8 +97,8 @@ def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarra
     at_bound = np.zeros(len(gradient), bool)
     low, high = np.log([SHARPNESS[0], materials.sharpest])
     by_sharpness = gradient[2 * p : 3 * p]
-    at_bound[2 * p : 3 * p] = ((light.log_sharpness <= low) & (by_sharpness > 0)) | (
-        (light.log_sharpness >= high) & (by_sharpness < 0)
+    at_bound[2 * p : 3 * p] = np.where(
+        by_sharpness > 0, light.log_sharpness <= low, (light.log_sharpness >= high) & (by_sharpness < 0)
     )
     at_bound[3 * p : 6 * p] = (light.weight.T.reshape(-1) <= 0) & (gradient[3 * p : 6 * p] > 0)
     at_bound[: 3 * p] |= np.tile(light.weight.sum(1) <= 0, 3)
@@ -103,13 +108,6 @@ def light_at_bound(light: Light, materials: Materials, gradient: Float[np.ndarra
 def specular_unknowns(which: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " 7m"]:
     """Which unknowns are the specular ones (k_s and roughness) of the materials `which`."""
     return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)
-
-
-def taken(light: Light, rows: np.ndarray | slice) -> Light:
-    """The lobes `rows` alone, by numbers or a mask."""
-    return msgspec.structs.replace(
-        light, axis=light.axis[rows], log_sharpness=light.log_sharpness[rows], weight=light.weight[rows]
-    )
 
 
 def joined(light: Light, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
@@ -133,4 +131,6 @@ def pruned(light: Light, least_share: float = 1e-5) -> Light:
     """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
     energy = lobe_integral(light.sharpness) * light.weight.sum(1)
     kept = energy > least_share * max(float(energy.sum()), 1e-30)
-    return taken(light, kept if kept.any() else slice(0, 1))
+    rows = kept if kept.any() else slice(0, 1)
+    lobes = {name: getattr(light, name)[rows] for name in ("axis", "log_sharpness", "weight")}
+    return msgspec.structs.replace(light, **lobes)

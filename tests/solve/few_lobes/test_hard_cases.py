@@ -1,6 +1,7 @@
 """Never a NaN, never a silent failure: an answer within its bound, or a message that says why there is none."""
 
 import logging
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.jsonfile import read_json
 from factorlib.model.illumination import material_slices
+from factorlib.model.materials import Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
-from factorlib.model.point import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.stage import Inputs, silent
@@ -32,6 +33,17 @@ from studies.scenes.hard_cases import (
 )
 
 ONE = "1 material × 1 light"
+# One of each kind; the others are worse or better by degrees, or another kind's arithmetic (radiances times a factor).
+QUICK_ONES = (
+    *(ONE, "flat objects", "an object of 30 pixels", "a single pixel", "all Lambertian", "a black material"),
+    *("a light of one point", "constant light", "half the values clipped", "20 % of normals wrong by 40°"),
+    *("two equal materials", "a material without pixels", "NaN, infinite, no direction"),
+)
+
+
+@cache
+def answer_to(name: str) -> Answer:
+    return answered(CASES[name](0))
 
 
 def bytes_of(answer: Answer) -> bytes:
@@ -43,35 +55,25 @@ def bytes_of(answer: Answer) -> bytes:
 
 
 def scaled(given: Case, factor: float) -> Case:
-    parts = {
-        name: msgspec.structs.replace(o, radiance=o.radiance * factor)
-        for name, o in (("seen", given.seen), ("clean", given.clean))
-    }
-    return msgspec.structs.replace(given, **parts)
+    replaced = msgspec.structs.replace
+    return replaced(
+        given, **{n: replaced(o, radiance=factor * o.radiance) for n in ("seen", "clean") for o in [getattr(given, n)]}
+    )
 
 
 def run_stage(folder, seen, **params):
     """The stage on one URM per photo; returns its materials."""
     (folder / "urm").mkdir(parents=True), (folder / "out").mkdir()
     for i, name in enumerate(seen.photos):
-        own = msgspec.structs.replace(
-            seen.take(seen.photo == i), photos=(name,), illuminations=(name,), photo=np.zeros(int((seen.photo == i).sum()), int),
-            illumination=np.zeros(int((seen.photo == i).sum()), int),
-        )  # fmt: skip
+        own = seen.take(seen.photo == i)
+        zero = np.zeros(len(own), int)
+        own = msgspec.structs.replace(own, photos=(name,), illuminations=(name,), photo=zero, illumination=zero)
         write_observations(folder / "urm" / f"{name}.parquet", own)
     light = {name: {"illumination": name, "world_from_camera": None} for name in seen.photos}
-    inputs = Inputs(
-        {"urm": folder / "urm", "train": folder}, {"dataset.materials": list(seen.materials), "dataset.light": light}
-    )
-    quick = {
-        "solver": "few_lobes",
-        "operator": "closed_form",
-        "lobes": 4,
-        "insert": 4,
-        "rounds": 1,
-        "iterations": 4,
-        "polish": 3,
-    }
+    facts = {"dataset.materials": list(seen.materials), "dataset.light": light}
+    inputs = Inputs({"urm": folder / "urm", "train": folder}, facts)
+    quick = {"solver": "few_lobes", "operator": "closed_form", "lobes": 4, "insert": 4, "rounds": 1}
+    quick |= {"iterations": 4, "polish": 3}
     stage.main(stage.Params(**(quick | params)), inputs, folder / "out", silent)
     return read_json(folder / "out" / "materials.json")["materials"]
 
@@ -82,17 +84,19 @@ def numbers(value) -> list[float]:
     return [n for v in value for n in numbers(v)] if isinstance(value, list) else [value]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [n if n in QUICK_ONES else pytest.param(n, marks=pytest.mark.long) for n in CASES])
 def test_the_answer_is_within_its_bound_or_says_why_not(name):
-    answer, bound = answered(CASES[name](0)), BOUNDS[name]
-    assert answer.finite()
-    assert answer.radiance <= bound.radiance
+    answer, bound = answer_to(name), BOUNDS[name]
+    assert answer.finite() and answer.radiance <= bound.radiance
     assert bound.k is None or answer.k <= bound.k
     assert bound.roughness is None or answer.roughness <= bound.roughness
     for words in bound.says:
         assert any(words in sentence for sentence in answer.said), answer.said
     if not bound.says:
         assert [sentence for sentence in answer.said if bound.may_say is None or bound.may_say not in sentence] == []
+    if name == "two equal materials":
+        found = answer.materials.rows()
+        np.testing.assert_allclose(found[0], found[1], atol=0.03)
 
 
 def test_what_cannot_be_told_is_said():
@@ -100,52 +104,36 @@ def test_what_cannot_be_told_is_said():
     assert all(bound.says for bound in BOUNDS.values() if bound.k is None or bound.roughness is None)
 
 
-def test_two_equal_materials_come_out_equal():
-    found = answered(CASES["two equal materials"](0)).materials.vector().reshape(2, 7)
-    np.testing.assert_allclose(found[0], found[1], atol=0.03)
-
-
-def test_ten_random_starts_find_one_answer():
-    answers = of_random_starts(CASES[ONE](0))
+@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.long)])
+def test_random_starts_find_one_answer(count):
+    answers = of_random_starts(CASES[ONE](0), count)
     assert all(a.finite() for a in answers)
-    assert sum(a.k < BOUNDS[ONE].k and a.roughness < BOUNDS[ONE].roughness for a in answers) >= 8
+    assert sum(a.k < BOUNDS[ONE].k and a.roughness < BOUNDS[ONE].roughness for a in answers) >= 0.8 * count
 
 
 def test_the_unit_of_radiance_changes_no_bit_of_the_answer():
-    one = answered(CASES[ONE](0))
     for power in (-40, 40):  # powers of two round nothing
-        assert bytes_of(answered(scaled(CASES[ONE](0), 2.0**power))) == bytes_of(one)
+        assert bytes_of(answered(scaled(CASES[ONE](0), 2.0**power))) == bytes_of(answer_to(ONE))
 
 
 def test_observations_and_photos_in_another_order_are_the_same_blocks():
     seen = CASES["unconnected: 2 × 1 and 3 × 1"](0).seen
     other = seen.take(np.random.default_rng(0).permutation(len(seen)))
-    other = msgspec.structs.replace(
-        other,
-        photo=1 - other.photo,
-        illumination=1 - other.illumination,
-        photos=seen.photos[::-1],
-        illuminations=seen.illuminations[::-1],
-    )
-    for a, b in zip(blocks_of_observations(seen, Noise()), blocks_of_observations(other, Noise()), strict=True):
-        for field in a.__struct_fields__:
-            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
-
-
-def test_photos_of_one_light_in_another_order_are_the_same_block():
-    seen = observed(chosen([1]), ROOMS[:2], [[0], [0]])
-    one = np.zeros(len(seen), int)
-    shared = msgspec.structs.replace(seen, illumination=one, illuminations=("room",), x=seen.x % (len(seen) // 2))
-    other = msgspec.structs.replace(shared, photo=1 - shared.photo, photos=shared.photos[::-1])
-    (a,), (b,) = (blocks_of_observations(o, Noise()) for o in (shared, other))
-    np.testing.assert_array_equal(a.photo, b.photo)
-    np.testing.assert_array_equal(a.radiance, b.radiance)
+    names = {"photos": seen.photos[::-1], "illuminations": seen.illuminations[::-1]}
+    other = msgspec.structs.replace(other, photo=1 - other.photo, illumination=1 - other.illumination, **names)
+    shared = observed(chosen([1]), ROOMS[:2], [[0], [0]])
+    one, x = np.zeros(len(shared), int), shared.x % (len(shared) // 2)
+    shared = msgspec.structs.replace(shared, illumination=one, illuminations=("room",), x=x)
+    turned = msgspec.structs.replace(shared, photo=1 - shared.photo, photos=shared.photos[::-1])
+    for pair in ((seen, other), (shared, turned)):
+        for a, b in zip(*(blocks_of_observations(of, Noise()) for of in pair), strict=True):
+            for field in a.__struct_fields__:
+                np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
 
 
 def test_single_precision_of_the_operator_is_enough():
-    given = CASES[ONE](0)
-    single, double = answered(given), answered(given, operator=reflection_operator("network", dtype="float64"))
-    np.testing.assert_allclose(single.materials.vector(), double.materials.vector(), atol=0.03)
+    double = answered(CASES[ONE](0), operator=reflection_operator("network", dtype="float64"))
+    np.testing.assert_allclose(answer_to(ONE).materials.vector(), double.materials.vector(), atol=0.03)
 
 
 def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp_path, caplog):

@@ -11,8 +11,7 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes, even_cells
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.reflected import NODES, Reflections, lagrange
-from factorlib.model.responses import diffuse_response, specular_response
+from factorlib.model.responses import NODES, Reflections, diffuse_response, lagrange, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
@@ -85,41 +84,31 @@ def check_derivatives(one: Illumination) -> None:
     """Of the residuals by every unknown."""
     replaced, light, materials = msgspec.structs.replace, one.light, one.materials
     rng, m, k = np.random.default_rng(0), len(one.materials), len(one.block.photos)
-    du = rng.normal(size=light.log_radiance.shape)
-    found = linear(one, lambda part, by: (part.diffuse + part.specular) @ by[part.channel], du)
-    check_against_differences(
-        one, lambda s: replaced(one, light=light.with_log_radiance(light.log_radiance + s * du)), found, 5e-3
-    )
 
-    dm = rng.normal(size=(m, 7)) * np.array([1.0] * 6 + [0.05])
-
-    def by_material(part, by):
-        return part.by_material @ by.reshape(-1)[part.places]
+    def with_u(change):
+        return replaced(one, light=light.with_log_radiance(light.log_radiance + change))
 
     def with_materials(change):
         kd, ks = materials.diffuse * np.exp(change[:, :3]), materials.specular * np.exp(change[:, 3:6])
         return replaced(one, materials=Materials(kd, ks, materials.roughness + change[:, 6]))
 
-    for places in (slice(0, 3), slice(3, 6), slice(6, 7)):
-        alone = np.zeros_like(dm)
-        alone[:, places] = dm[:, places]
-        check_against_differences(
-            one, lambda s, by=alone: with_materials(s * by), linear(one, by_material, alone), 1e-2
-        )
+    def with_photos(change):
+        exposure = light.log_exposure + np.concatenate([[0.0], change[: k - 1]])
+        return replaced(one, light=replaced(light, log_exposure=exposure, log_tone=light.log_tone + change[k - 1 :]))
 
+    def by_material(part, by):
+        return part.by_material @ by.reshape(-1)[part.places]
+
+    du, dm = rng.normal(size=light.log_radiance.shape), rng.normal(size=(m, 7)) * np.array([1.0] * 6 + [0.05])
     dp = rng.normal(size=k - 1 + len(light.log_tone))
-    for own in ([True] * (k - 1) + [False] * len(light.log_tone), [False] * (k - 1) + [True] * len(light.log_tone)):
-        by = np.where(own, dp, 0.0)
-        if not any(own):
-            continue
-
-        def with_photos(s, by=by):
-            exposure = light.log_exposure + s * np.concatenate([[0.0], by[: k - 1]])
-            return replaced(
-                one, light=replaced(light, log_exposure=exposure, log_tone=light.log_tone + s * by[k - 1 :])
-            )
-
-        check_against_differences(one, with_photos, linear(one, lambda part, by: part.by_photo @ by, by), 5e-3)
+    kinds = np.repeat([0, 1, 2], [3, 3, 1])  # k_d, k_s, roughness
+    exposures = np.arange(len(dp)) < k - 1
+    changes = [(with_u, lambda part, by: (part.diffuse + part.specular) @ by[part.channel], du, 5e-3)]
+    changes += [(with_materials, by_material, dm * (kinds == kind), 1e-2) for kind in range(3)]
+    changes += [(with_photos, lambda part, by: part.by_photo @ by, dp * own, 5e-3) for own in (exposures, ~exposures)]
+    for moved, of, by, step in changes:
+        if by.any():
+            check_against_differences(one, lambda s, moved=moved, by=by: moved(s * by), linear(one, of, by), step)
 
 
 @FEW_EXAMPLES

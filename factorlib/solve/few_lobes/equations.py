@@ -1,8 +1,12 @@
-"""The derivatives of an illumination's residuals by the unknowns of the materials and of its light as few lobes.
+"""One light of few lobes at a point: responses, derivatives, normal equations, and its lobes' weights given everything else.
 
 Channels share the unknowns of geometry (axis, sharpness) and have their own weights.  So the Jacobian is one dense block
 [n, 4p + …] per channel instead of a sparse matrix [3n, 6p + …].  Shadows multiply responses and their derivatives; that they change as a lobe
 turns is left out of the Jacobian, for a step is taken only if it lowers the loss itself.
+
+Normal equations are half the gradient and half the Gauss–Newton Hessian of the loss (for Σ r²: Jᵀr and JᵀJ).  The weights are a non-negative
+least-squares problem per channel.  They are solved for on the Cholesky factor of the Gram matrix, so its size is the number of lobes, not of
+observations.  Clipped channels and outliers get the weights that they have at the current residual.
 """
 
 from __future__ import annotations
@@ -14,17 +18,20 @@ import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
 from torch import Tensor
 
 from factorlib.elementary import product, square_root
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination, material_slices
-from factorlib.model.lights import Light, tangents
+from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.responses import cosines
-from factorlib.model.shadowing import shadowed_diffuse, shadowed_specular
-from factorlib.solve.few_lobes.unknowns import sharpness_slopes, unit_energy, unknowns
+from factorlib.model.responses import cosines, shadowed
+from factorlib.solve.few_lobes.unknowns import sharpness_slopes, tangents, unit_energy, unknowns
+
+KEPT = 1 << 20  # responses of observations to lobes that stay in memory; if there are more, they are computed twice
 
 
 class Responses(msgspec.Struct, frozen=True):
@@ -67,45 +74,35 @@ class Linearised(msgspec.Struct, frozen=True):
     loss: float
 
 
-class Whitened(NamedTuple):
-    """Residual and loss of one channel of n rows; a derivative of radiance times `scale` is a derivative of the residual."""
+class NormalEquations(msgspec.Struct, frozen=True):
+    """Gauss–Newton system of one illumination: gradient and Hessian blocks of the materials that it shows (k unknowns) and its light (l).
 
-    residual: Float[Tensor, " n"]
-    scale: Float[Tensor, " n"]
+    places: numbers of the k unknowns among those of all materials, ascending
+    scores: the gradient's part from each of g clusters of observations, where they were asked for
+    """
+
     loss: float
+    places: Int[np.ndarray, " k"]
+    material_gradient: Float[np.ndarray, " k"]
+    light_gradient: Float[np.ndarray, " l"]
+    material_hessian: Float[np.ndarray, "k k"]
+    cross_hessian: Float[np.ndarray, "k l"]
+    light_hessian: Float[np.ndarray, "l l"]
+    scores: Float[np.ndarray, "g k+l"] | None = None
 
 
 class Quadratic(NamedTuple):
-    """A value, and half its gradient and half its Gauss–Newton Hessian by the l unknowns of a light (`unknowns.moved_light`)."""
+    """A value, and half its gradient and half its Gauss–Newton Hessian by some unknowns."""
 
     value: float
-    gradient: Float[np.ndarray, " l"]
-    hessian: Float[np.ndarray, "l l"]
+    gradient: Float[np.ndarray, "*k"]
+    hessian: Float[np.ndarray, "*k l"]
 
 
 def places_of(illumination: Illumination) -> Int[np.ndarray, " k+l"]:
     """Numbers of the unknowns on which its radiance depends, ascending: 7 of each material that it shows, then the light's l."""
-    shown = 7 * np.unique(illumination.block.material)[:, None] + np.arange(7)
-    return np.concatenate(
-        [shown.reshape(-1), 7 * len(illumination.materials) + np.arange(unknowns(illumination.light))]
-    )
-
-
-def fitted(illumination: Illumination) -> Illumination:
-    """With the observations alone that are not held out."""
-    return msgspec.structs.replace(illumination, block=illumination.block.fitted())
-
-
-def with_light(illumination: Illumination, light: Light) -> Illumination:
-    """The same observations and materials in another light."""
-    return msgspec.structs.replace(illumination, light=light)
-
-
-def fit_loss(illumination: Illumination, loss: Loss) -> float:
-    """The loss of the observations that are not held out, with the prior."""
-    block = illumination.block
-    residual = illumination.residuals()[~block.held_out]
-    return float(np.sum(loss.of_residuals(residual))) + tint_prior(loss, block, illumination.light).value
+    shown = (7 * np.unique(illumination.block.material)[:, None] + np.arange(7)).reshape(-1)
+    return np.concatenate([shown, 7 * len(illumination.materials) + np.arange(unknowns(illumination.light))])
 
 
 def tint_prior(loss: Loss, block: Block, light: Light) -> Quadratic:
@@ -128,14 +125,13 @@ def responses(illumination: Illumination) -> Iterator[Responses]:
     block, light, operator = illumination.block, illumination.light, illumination.operator
     for m, rows in material_slices(block):
         roughness = float(illumination.materials.roughness[m])
-        exposure = torch.from_numpy(np.exp(light.log_exposure)[block.photo[rows]])[:, None]
+        exposure = torch.from_numpy(illumination.exposure[rows])
         inputs = np.float64(roughness), light.sharpness, *cosines(block.normal[rows], block.view[rows], light.axis)
         response = operator.response(*(torch.as_tensor(value).to(operator.dtype) for value in inputs))
         parts = {name: getattr(response, name).double() * exposure for name in response.__struct_fields__}
         if block.visibility is not None:
             every = torch.ones_like(parts["diffuse"])
-            diffuse = shadowed_diffuse(every, block, rows, light.unit_lobes)
-            specular = shadowed_specular(every, block, rows, light.unit_lobes, roughness)
+            diffuse, specular = (shadowed(every, block, rows, light.unit_lobes, how) for how in (None, roughness))
             parts = {name: part * (diffuse if name.startswith("diffuse") else specular) for name, part in parts.items()}
         yield Responses(m, rows, parts)
 
@@ -176,6 +172,14 @@ def _places(light: Light, materials: int, m: int, c: int) -> Int[np.ndarray, " k
     return np.concatenate([first + light_, [7 * m + c, 7 * m + 3 + c, 7 * m + 6]])
 
 
+class Whitened(NamedTuple):
+    """Residual and loss of one channel of n rows; a derivative of radiance times `scale` is a derivative of the residual."""
+
+    residual: Float[Tensor, " n"]
+    scale: Float[Tensor, " n"]
+    loss: float
+
+
 def whitened(block: Block, rows: slice, c: int, radiance: Float[Tensor, " n"], loss: Loss) -> Whitened:
     """Channel c of `rows`, whose radiance is `radiance`."""
     fit = torch.from_numpy((~block.held_out[rows]).astype(float))
@@ -187,3 +191,86 @@ def whitened(block: Block, rows: slice, c: int, radiance: Float[Tensor, " n"], l
     pull = square_root(fit / root * ~satisfied)
     lost = float((2 * loss.robust_scale**2 * (root - 1) * fit).sum())
     return Whitened(residual * pull, precision * pull, lost)
+
+
+def normal_equations(
+    illumination: Illumination, loss: Loss, known: Iterable[Responses] | None = None, clustered: bool = False
+) -> NormalEquations:
+    """The system of the observations that are not held out.
+
+    known: responses of what is fitted to the light, where they were computed before;  clustered: with scores of clusters
+    """
+    light, own, total = illumination.light, illumination.fitted(), 0.0
+    every = places_of(own)
+    size, k = len(every), len(every) - unknowns(light)
+    hessian, gradient, scores = np.zeros((size, size)), np.zeros(size), None
+    if clustered:
+        numbers = illumination.block.clusters()
+        scores, clusters = np.zeros((int(numbers.max(initial=-1)) + 1, size)), numbers[~illumination.block.held_out]
+    for part in linearise(own, loss, known):
+        total += part.loss
+        places, jacobian, residual = np.searchsorted(every, part.places), part.jacobian, part.residual
+        hessian[np.ix_(places, places)] += product(jacobian.T, jacobian).numpy()
+        gradient[places] += product(jacobian.T, residual).numpy()
+        if scores is not None:
+            np.add.at(scores, (clusters[part.rows][:, None], places[None]), (jacobian * residual[:, None]).numpy())
+    prior = tint_prior(loss, own.block, light)
+    gradient[k:] += prior.gradient
+    hessian[k:, k:] += prior.hessian
+    blocks = (hessian[:k, :k], hessian[:k, k:], hessian[k:, k:])
+    return NormalEquations(total + prior.value, every[:k], gradient[:k], gradient[k:], *blocks, scores)
+
+
+def energy_equations(illumination: Illumination, known: Iterable[Responses], loss: Loss) -> Quadratic:
+    """The part of `normal_equations` by the lobes' energies of each channel alone, [3, p] and [3, p, p], the same numbers.
+
+    known: responses of all observations to the light
+    """
+    block, light, materials = illumination.block, illumination.light, illumination.materials
+    p, total = len(light), 0.0
+    gradient, hessian = np.zeros((3, p)), np.zeros((3, p, p))
+    per_energy = torch.from_numpy(unit_energy(light))
+    for some in known:
+        for c in range(3):
+            seen = whitened(block, some.rows, c, some.linear(block, light, materials, c), loss)
+            scaled = some.basis(materials, c) / per_energy * seen.scale[:, None]
+            hessian[c] += product(scaled.T, scaled).numpy()
+            gradient[c] += product(scaled.T, seen.residual).numpy()
+            total += seen.loss
+    prior = tint_prior(loss, block, light)
+    for c in range(3):
+        own = slice((3 + c) * p, (4 + c) * p)
+        gradient[c] += prior.gradient[own]
+        hessian[c] += prior.hessian[own, own]
+    return Quadratic(total + prior.value, gradient, hessian)
+
+
+def with_weights_fitted(illumination: Illumination, loss: Loss) -> tuple[Light, NormalEquations]:
+    """The light with the weights that lower the loss most, while nothing else changes, and the normal equations there.
+
+    With clipped observations or outliers the loss is not quadratic in the weights.  If the fitted weights would raise the loss, the
+    light keeps its own.
+    """
+    own = illumination.fitted()
+    kept = list(responses(own)) if len(own.block) * len(own.light) <= KEPT else None
+    before = energy_equations(own, responses(own) if kept is None else kept, loss)
+    light = of_least_loss(own.light, before)
+    after = normal_equations(msgspec.structs.replace(own, light=light), loss, kept)
+    return (light, after) if after.loss <= before.value else (own.light, normal_equations(own, loss, kept))
+
+
+def of_least_loss(light: Light, equations: Quadratic) -> Light:
+    """The non-negative weights that minimise the quadratic model by the energies of each channel, all else as it is."""
+    energy = light.energy
+    for c, (gradient, hessian) in enumerate(zip(equations.gradient, equations.hessian, strict=True)):
+        energy[:, c] = nonnegative_minimum(hessian, hessian @ energy[:, c] - gradient)
+    return msgspec.structs.replace(light, weight=energy / unit_energy(light)[:, None])
+
+
+def nonnegative_minimum(hessian: Float[np.ndarray, "p p"], target: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """argmin over w ≥ 0 of ½ wᵀHw − tᵀw, H made definite by 1e-9 of its mean diagonal."""
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12 * max(float(np.diag(hessian).max()), 1e-30)))
+    normalised = hessian / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    upper = cholesky(normalised)
+    right = solve_triangular(upper, target / scale, trans="T")
+    return nnls(upper, right, maxiter=50 * len(scale))[0] / scale
