@@ -62,15 +62,10 @@ def _depth_jumps(maps: Maps) -> Bool[np.ndarray, "h w"]:
         first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
         both = mesh[first] & mesh[second]
         step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
-        steep = step > STEEPER * _least_beside(step, axis)
+        padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
+        before, after = (np.take(padded, range(k, k + step.shape[axis]), axis) for k in (0, 2))
+        steep = step > STEEPER * np.minimum(before, after)
         jump = both & (((step > limit) & steep) | (maps.object[first] != maps.object[second]))
         result[first] |= jump
         result[second] |= jump
     return result
-
-
-def _least_beside(step: Float[np.ndarray, "i j"], axis: int) -> Float[np.ndarray, "i j"]:
-    """The lesser of the steps before and after each along `axis`; infinite where there is neither."""
-    padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
-    size = step.shape[axis]
-    return np.minimum(np.take(padded, range(size), axis), np.take(padded, range(2, size + 2), axis))

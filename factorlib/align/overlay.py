@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 
 from factorlib.align.silhouette import Silhouette
@@ -22,14 +22,8 @@ def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhou
     picture[unknown] = 0.7 * picture[unknown] + 0.3 * np.array([0.4, 0.5, 0.7])
     width = max(1, round(max(mesh.shape) / 600))
     for label, colour in ((np.maximum(silhouette.label, 0), MASK), (maps.label + 1000 * maps.object, MESH)):
-        contour = _outline(label)
+        contour = np.zeros(label.shape, bool)  # whose label differs from the one right of or below them
+        contour[:, :-1] |= label[:, :-1] != label[:, 1:]
+        contour[:-1] |= label[:-1] != label[1:]
         picture[binary_dilation(contour, iterations=width) if width > 1 else contour] = colour
     return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-
-
-def _outline(label: Int[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose label differs from the one right of or below them."""
-    result = np.zeros(label.shape, bool)
-    result[:, :-1] |= label[:, :-1] != label[:, 1:]
-    result[:-1] |= label[:-1] != label[1:]
-    return result

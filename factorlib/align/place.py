@@ -11,17 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from factorlib.align.keypoints import Keypoints, state_of_keypoints
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import (
-    CLEARLY_BETTER,
-    WELL_FOUND,
-    Found,
-    RunnerUp,
-    Search,
-    find,
-    focal_prior,
-    found_near,
-    refined_finest,
-)
+from factorlib.align.search import Found, RunnerUp, Search, find, focal_prior, found_near, refined_finest
 from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
@@ -30,6 +20,8 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectEntry
 
+WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
+CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 log = logging.getLogger("factorlib.align")
 
 
@@ -93,11 +85,15 @@ def placed(
             continue
         if not obj.silhouette.inside.any():
             cure = "remove the object from this photo, or check its mask and materials"
-            raise InputError(
-                f"no pixel of the mask shows object {obj.name!r}", file="dataset.yaml", key=photo, cure=cure
-            )
-        if obj.earlier is not None:
-            found[k] = _found_before(obj, camera, sigma, search)
+            fault = f"no pixel of the mask shows object {obj.name!r}"
+            raise InputError(fault, file="dataset.yaml", key=photo, cure=cure)
+        if obj.earlier is not None:  # as it is, scored anew, with its runner-up where that still counts
+            start, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
+            known_camera = FocalPrior(camera.focal, 0.0)
+            score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
+            if other is not None:
+                other = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
+            found[k] = Found(start, score, sigma, other, earlier=True)
         elif obj.keypoints is None:
             found[k] = find(obj.caster, obj.silhouette, camera, prior, search)
         else:
@@ -107,21 +103,10 @@ def placed(
             found[k], source = _judged(obj, camera, found[k], source, photo, search)
             sigma, camera = found[k].log_focal_sigma, found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [  # what was said or found before is used to the last digit
-        obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster))
-        for k, obj in enumerate(objects)
-    ]
-    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
-
-
-def _found_before(obj: ObjectToPlace, camera: Camera, sigma: float, search: Search) -> Found:
-    """An earlier answer as it is, scored anew at the finest resolution, with its runner-up where that still counts."""
-    state, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
-    prior = FocalPrior(camera.focal, 0.0)
-    score = refined_finest(obj.caster, obj.silhouette, camera, state, prior, search, 0).score
-    if other is not None:
-        other = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
-    return Found(state, score, sigma, other, earlier=True)
+    answers = [found.get(k) for k in range(len(objects))]
+    before = [obj.pose or (obj.earlier and obj.earlier.pose) for obj in objects]  # used to the last digit
+    poses = [pose or one.state.pose(obj.caster) for pose, one, obj in zip(before, answers, objects, strict=True)]
+    return Placed(camera, source or "estimated", sigma, poses, answers, beforehand)
 
 
 def _judged(
@@ -148,14 +133,10 @@ def _judged(
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    fixed = [
-        (t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200))
-        for t in objects
-        if t.pose and t.silhouette.inside.any()
-    ]
+    shown = [t for t in objects if t.pose and t.silhouette.inside.any()]
+    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
 
     def at(log_focal: float) -> Camera:
-        """The camera with the focal length exp(log_focal)."""
         return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
 
     def misfit(log_focal: float) -> float:

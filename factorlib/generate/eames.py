@@ -28,7 +28,7 @@ from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
-Progress = Callable[[int, int, str], None]
+Progress, Maps = Callable[[int, int, str], None], Sequence[Path]
 
 
 class Parameters(msgspec.Struct, frozen=True):
@@ -84,22 +84,16 @@ SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
 
 
 def generate(
-    out: Path,
-    seed: int,
-    lat_longs: Sequence[Path],
-    parameters: Parameters,
-    progress: Progress,
-    shots: Sequence[Shot] = SET.shots,
+    out: Path, seed: int, lat_longs: Maps, parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
 ) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
     rng, spread = np.random.default_rng([11, seed]), 0.0 if seed == 0 else 1.0
     materials, rough = random_materials(rng, 0.2 * spread, SET.materials), rough_chair(rng)
-    if parameters.exact:
-        folder.write_exact_obj(out / "meshes/chair.obj", {name: smooth(*part) for name, part in chair().items()})
-    else:
-        folder.write_obj(out / "meshes/chair.obj", rough)
+    exact = {name: smooth(*part) for name, part in chair().items()} if parameters.exact else {}
+    parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
+    folder.write_obj(out / "meshes/chair.obj", parts)
     photos, poses = [], {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
@@ -130,9 +124,11 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 def laid_out(
-    shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, spread: float, parameters: Parameters
+    shot: Shot, number: int, lat_longs: Maps, rng: np.random.Generator, spread: float, parameters: Parameters
 ) -> Scene:
-    """Camera, chairs and surroundings of a shot; a spread turns the chairs and moves the camera."""
+    """Camera, chairs and surroundings of a shot: a sky, a room, or a user's map over a grey ground (without it where light is
+    `distant`); nothing stands between camera and chairs.  A spread turns the chairs and moves the camera.
+    """
     yaw, width, height = rng.uniform(0, 360), parameters.width, parameters.height
     distance = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1))
     eye = shot.eye + 0.15 * spread * rng.uniform(-1, 1)
@@ -146,22 +142,16 @@ def laid_out(
         turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])  # the chair's +z toward the camera
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
-    around = surroundings(shot, yaw, number, lat_longs, rng, parameters)
-    return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
-
-
-def surroundings(
-    shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
-) -> SceneDict:
-    """A sky, a room, or a user's map over a grey ground (without it where light is `distant`); nothing stands between camera and chairs."""
     if lat_longs:
-        light = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
-        ground = {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
-        return light if parameters.distant else light | ground
-    if shot.sun:
+        around = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
+        if not parameters.distant:
+            around["ground"] = lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
+    elif shot.sun:
         up, aside = shot.sun
-        return lights.daylight(rng, up, yaw_deg + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
-    return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
+        around = lights.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
+    else:
+        around = lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw + 180, clear_half_deg=120)
+    return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
 def write_shot(

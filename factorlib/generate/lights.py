@@ -26,6 +26,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
+Rotation = Float[np.ndarray, "3 3"]
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 # about x, about y, of +z
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
@@ -45,12 +46,7 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
 
 
 def random_light(
-    number: int,
-    world_from_camera: Float[np.ndarray, "3 3"],
-    lat_longs: Sequence[Path],
-    rng: np.random.Generator,
-    rows: int,
-    spp: int,
+    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: np.random.Generator, rows: int, spp: int
 ) -> Float[np.ndarray, "h w 3"]:
     """The light of photo `number`, in the camera's y-up frame: daylight for photo 0, the sun behind the camera to its left
     or right, and for the others rooms with as many lamps as their number.
@@ -86,15 +82,12 @@ def daylight(
     }  # fmt: skip
     seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
     scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
-    return scene | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
-
-
-def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> SceneDict:
-    """A coloured block some metres away; none stands before the sun."""
-    angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
-    size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
-    place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
-    return block(place, size, np.degrees(angle), _vivid(rng))
+    for k in range(4):  # coloured blocks some metres away; none stands before the sun
+        angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
+        size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
+        place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
+        scene[f"facade_{k}"] = block(place, size, np.degrees(angle), _vivid(rng))
+    return scene
 
 
 def room(
@@ -110,7 +103,8 @@ def room(
     sides = ["+x", "-x", "+z", "-z"]
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
-        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), _wall_colour(rng), (0, 0.25))
+        paint = np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
+        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), paint, (0, 0.25))
         size, colour = rng.uniform(0.3, 0.6, 2), _vivid(rng)
         shift = rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
         scene[f"picture{side}"] = wall(side, distance - 0.02, size, colour, shift)
@@ -132,24 +126,14 @@ def room(
     return scene
 
 
-def _wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A light paint."""
-    return np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
-
-
 def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A strong colour."""
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
 
 def wall(
-    side: str,
-    distance: float,
-    half: Sequence[float] | np.ndarray,
-    colour: Colour,
-    shift: tuple[float, float] = (0.0, 0.0),
-    glow: Colour | None = None,
-) -> SceneDict:
+    side: str, distance: float, half: Sequence[float], colour: Colour, shift: Sequence[float] = (0.0, 0.0), glow: Colour | None = None
+) -> SceneDict:  # fmt: skip
     """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
 
     shift: of its middle in its own plane (along, up);  glow: the radiance it emits, None for a wall that only reflects
@@ -173,11 +157,10 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     radiance = read_photo(path, "linear").radiance.astype(float)
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows:
-        fault, cure = f"{columns} × {rows} pixels is no lat-long map", "its width must be twice its height"
-        raise InputError(fault, file=path, cure=cure)
+        fault = f"{columns} × {rows} pixels is no lat-long map"
+        raise InputError(fault, file=path, cure="its width must be twice its height")
     if rows % height:
-        fault, cure = f"{rows} rows do not divide into {height}", f"resize it to a multiple of {height} rows"
-        raise InputError(fault, file=path, cure=cure)
-    finer = max(1, rows // height)
-    radiance = radiance.reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
+        fault = f"{rows} rows do not divide into {height}"
+        raise InputError(fault, file=path, cure=f"resize it to a multiple of {height} rows")
+    radiance = radiance.reshape(height, rows // height, 2 * height, rows // height, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

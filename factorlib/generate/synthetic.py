@@ -18,7 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
-from factorlib.generate.lights import random_light, random_materials
+from factorlib.generate.lights import Rotation, random_light, random_materials
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
@@ -121,9 +121,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
-def placements(
-    shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float
-) -> dict[str, Pose]:
+def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
     """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
     poses = {}
     for placed in shot.placed:
@@ -153,10 +151,10 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         exposure = float(0.25 / brightest.mean())
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
-    objects = []
-    for placed in shot.placed:
-        pose = {"pose": folder.pose_entry(scene.poses[placed.name])} if placed.posed else {}
-        objects.append({"name": placed.name, "mesh": placed.name, **pose})
+    entries = [
+        ({"name": p.name, "mesh": p.name}, {"pose": folder.pose_entry(scene.poses[p.name])}) for p in shot.placed
+    ]
+    objects = [own | pose if p.posed else own for p, (own, pose) in zip(shot.placed, entries, strict=True)]
     return {
         "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
         "camera": {"focal_px": parameters.focal_px}, "objects": objects,

@@ -101,32 +101,15 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
         wins = (hits.face >= 0) & (hits.depth < nearest)
         nearest[wins] = hits.depth[wins]
         maps.depth[wins], maps.view[wins], maps.object[wins] = hits.depth[wins], view[wins], number
-        _fill(maps, wins, hits, caster.mesh, pose)
+        mesh, face, seen_along = caster.mesh, hits.face[wins], view[wins]
+        smooth, own = smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T, face_normals(mesh, face)
+        facing = np.sum((own @ pose.rotation.T) * seen_along, axis=1)
+        side = np.where(facing < 0, -1.0, 1.0)
+        maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], seen_along)
+        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], side < 0, np.abs(facing)
+        cosine = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own)).min(1)
+        maps.facet[wins] = np.arccos(np.minimum(cosine, 1.0))
     return maps
-
-
-def _fill(maps: Maps, wins: Bool[np.ndarray, "h w"], hits: Hits, mesh: Mesh, pose: Pose) -> None:
-    """What the surface of `mesh` adds to `maps` where it `wins`: normals, labels, sides; views are there already."""
-    corners = mesh.faces[hits.face[wins]]  # [n, 3]
-    smooth = smooth_normals(mesh, hits.face[wins], hits.uv[wins]) @ pose.rotation.T
-    own, view = face_normals(mesh, hits.face[wins]), maps.view[wins]
-    flat = own @ pose.rotation.T
-    facing = np.sum(flat * view, axis=1)
-    side = np.where(facing < 0, -1.0, 1.0)
-    maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
-    maps.label[wins] = mesh.face_label[hits.face[wins]]
-    maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
-    maps.facet[wins] = facets(mesh.normals[corners], own)
-
-
-def facets(corner: Float[np.ndarray, "n 3 3"], face: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """The largest angle, in radians, between unit normals of a face's three corners and its own, whichever way each points.
-
-    >>> facets(np.array([[[0, 0, 1.0], [0, 0, -1], [0, 1, 0]]]), np.array([[0, 0, 1.0]])).round(3).tolist()
-    [1.571]
-    """
-    cosine = np.abs(np.einsum("nkd,nd->nk", corner, face)).min(1)
-    return np.arccos(np.minimum(cosine, 1.0))
 
 
 def toward_viewer(

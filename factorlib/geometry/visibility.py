@@ -93,13 +93,11 @@ class Occluders:
             along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
             hidden = self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy()
             seen[rows][row, k] = np.where(hidden, 0, 255)
-            met[rows][row[hidden], k[hidden]] = self._codes(place[hidden], along[hidden])
+            distance, face, normal = self._first(place[hidden], along[hidden])
+            met[rows][row[hidden], k[hidden]] = met_codes(
+                np.where(np.isfinite(distance), self.material[face], -1), normal
+            )
         return Sight(seen, met)
-
-    def _codes(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
-        """Of what rays meet first."""
-        distance, face, normal = self._first(start, along)
-        return met_codes(np.where(np.isfinite(distance), self.material[face], -1), normal)
 
     def _first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
         """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and the face's normal
@@ -133,7 +131,10 @@ def sight(
         return None
     if len(cast) == len(x):
         return seen
-    near = nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)
+    # of the cast points the nearest one, in place (in units of their spacing) and in normal
+    spacing = max(float(np.median(cKDTree(some.place).query(some.place, k=2)[0][:, 1])), 1e-12)
+    places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
+    near = cKDTree(places[cast]).query(places)[1]
     return Sight(seen.visibility[near], seen.met[near])
 
 
@@ -146,15 +147,3 @@ def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int)
     """
     size = int(np.ceil(np.sqrt(len(x) / most)))
     return np.sort(np.unique(np.column_stack([y // size, x // size]), axis=0, return_index=True)[1])
-
-
-def nearest(
-    place: Float[np.ndarray, "m 3"],
-    normal: Float[np.ndarray, "m 3"],
-    place_asked: Float[np.ndarray, "n 3"],
-    normal_asked: Float[np.ndarray, "n 3"],
-) -> Int[np.ndarray, " n"]:
-    """Of the m surface points the one nearest to each of n, in place (in units of their spacing) and in normal."""
-    spacing = max(float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])), 1e-12)
-    tree = cKDTree(np.column_stack([place / spacing, NORMAL_WEIGHT * normal]))
-    return tree.query(np.column_stack([place_asked / spacing, NORMAL_WEIGHT * normal_asked]))[1]

@@ -33,11 +33,6 @@ class Layers(msgspec.Struct, frozen=True):
         weights, biases = ([t.to(dtype) for t in tensors] for tensors in (self.weights, self.biases))
         return Layers(self.mean.to(dtype), self.scale.to(dtype), weights, biases)
 
-    def copy(self) -> Layers:
-        """The same weights, apart from the network's own and off torch's graph."""
-        weights, biases = ([t.detach().clone() for t in tensors] for tensors in (self.weights, self.biases))
-        return Layers(self.mean, self.scale, weights, biases)
-
 
 def fading(sharpness: Tensor) -> Tensor:
     """What is left of the correction of lobes sharper than in training: 1, then 1/√λ."""

@@ -4,6 +4,8 @@ The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at it
 falls to zero by a cosine.  Samples of large error are drawn more often, because the worst case matters as much as the mean.  The
 weights of the least held-out error are kept, and training stops when that error has not fallen for PATIENCE points of the curve.
 Seeds and threads are fixed, so that the same parameters give the same bytes, also after a kill and a restart.
+
+The paper's networks are trained plainly on rendered pixels (`trained_plainly`): what improves the project's own stays out of it.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from torch import Tensor
 from factorlib.checkpoint import Checkpoint
 from factorlib.reflection.closed_form import diffuse
 from factorlib.reflection.filtering import filtered_specular
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
 from factorlib.reflection.samples import DiffuseSamples, Samples
 
@@ -47,13 +50,13 @@ class Problem(msgspec.Struct, frozen=True):
     exact: Float[Tensor, " n"]
     unit: Float[Tensor, " n"]
 
-    def rows(self, index: Tensor) -> Problem:
-        """The problem of some samples, by index [k]."""
-        return Problem(*(getattr(self, name)[index] for name in self.__struct_fields__))
+    def each(self, change: Callable[[Tensor], Tensor]) -> Problem:
+        """The problem with `change` made to every field."""
+        return Problem(*(change(getattr(self, name)) for name in self.__struct_fields__))
 
     def float(self) -> Problem:
         """The same in float32, in which networks are trained."""
-        return Problem(*(getattr(self, name).float() for name in self.__struct_fields__))
+        return self.each(Tensor.float)
 
     def errors(self, layers: Layers) -> Float[Tensor, " n"]:
         """(R − S) / unit of every sample: the network's value R against the exact value S."""
@@ -88,15 +91,10 @@ class Step(msgspec.Struct, frozen=True):
 
 
 def train(
-    problem: Problem,
-    held_out: Problem,
-    schedule: Schedule,
-    report: Callable[[Step], None],
-    checkpoint: Checkpoint | None = None,
-) -> tuple[Layers, list[Step]]:
+    problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None], checkpoint: Checkpoint | None = None
+) -> tuple[Layers, list[Step]]:  # fmt: skip
     """The network of least held-out error, and the curve; goes on from `checkpoint`, to the same bytes."""
-    run = Run(problem.float(), held_out.float(), schedule)
-    checkpoint = checkpoint or Checkpoint(None)
+    run, checkpoint = Run(problem.float(), held_out.float(), schedule), checkpoint or Checkpoint(None)
     if (state := checkpoint.load()) is not None:
         run.load_state(state)
     while not run.finished():
@@ -127,29 +125,22 @@ class Run:
         """Train to the next point of the curve."""
         total, first = 0.0, len(self.curve) * self.stretch
         for step in range(first, first + self.stretch):
-            for group in self.optimiser.param_groups:
-                group["lr"] = self.schedule.rate * share_of_rate(step, self.schedule.steps)
-            error = self._batch().errors(self.layers)
+            if len(self.order) < self.schedule.batch:
+                self.order = self._reshuffled()
+            rows, self.order = self.order[: self.schedule.batch], self.order[self.schedule.batch :]
+            error = self.problem.each(lambda field, rows=rows: field[rows]).errors(self.layers)
             # about |e|, smooth at 0, plus 2e², so that single large errors count more
             loss = (torch.sqrt(error * error + 1e-6) + 2 * error * error).mean()
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimiser.step()
-            total += float(loss.detach())
+            total += descended(self.optimiser, loss, step, self.schedule)
         with torch.no_grad():
             error = self.held_out.errors(self.layers).abs()
         quantiles = (float(error.quantile(q)) for q in (0.5, 0.95, 0.999))
         point = Step(first + self.stretch, total / self.stretch, *quantiles)
         if all(point.score() < earlier.score() for earlier in self.curve):
-            self.best = self.layers.copy()
+            kept = ([t.detach().clone() for t in tensors] for tensors in (self.layers.weights, self.layers.biases))
+            self.best = Layers(self.layers.mean, self.layers.scale, *kept)
         self.curve.append(point)
         return point
-
-    def _batch(self) -> Problem:
-        if len(self.order) < self.schedule.batch:
-            self.order = self._reshuffled()
-        rows, self.order = self.order[: self.schedule.batch], self.order[self.schedule.batch :]
-        return self.problem.rows(rows)
 
     def _reshuffled(self) -> Tensor:
         """Every sample once, and those of large error up to REPEATED times more, in random order."""
@@ -196,7 +187,42 @@ def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator
     return Layers(features.mean(0), 1 / (features.std(0) + 1e-3), weights, biases)
 
 
-def share_of_rate(step: int, steps: int) -> float:
-    """Of the greatest step: it warms up and falls to zero by a cosine."""
-    warm = min(1.0, (step + 1) / max(1, steps // 30))
-    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
+def descended(optimiser: torch.optim.Optimizer, loss: Tensor, step: int, schedule: Schedule) -> float:
+    """The loss before step `step` down its gradient, whose rate warms up and falls to zero by a cosine."""
+    warm = min(1.0, (step + 1) / max(1, schedule.steps // 30))
+    share = warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / schedule.steps)))
+    for group in optimiser.param_groups:
+        group["lr"] = schedule.rate * share
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    optimiser.step()
+    return float(loss.detach())
+
+
+def pixels_problem(
+    inputs: Float[Tensor, "n f"], sharpness: Float[Tensor, " n"], radiance: Float[Tensor, " n"]
+) -> Problem:
+    """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
+    energy, radiance = lobe_integral(sharpness.float()), radiance.float()
+    return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
+
+
+def trained_plainly(problem: Problem, schedule: Schedule, report: Callable[[int, float], None]) -> Layers:
+    """The network of the last step; Adam sees every sample equally often, in random order.
+
+    report: takes the step and the mean error since the last report
+    """
+    generator = torch.Generator().manual_seed(schedule.seed)
+    layers = initial_layers(problem.features, schedule, generator)
+    optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+    every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
+    for step in range(schedule.steps):
+        if len(order) < schedule.batch:
+            order = torch.randperm(len(problem.exact), generator=generator)
+        rows, order = order[: schedule.batch], order[schedule.batch :]
+        error = problem.each(lambda field, rows=rows: field[rows]).errors(layers)
+        total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
+        if (step + 1) % every == 0:
+            report(step + 1, total / every)
+            total = 0.0
+    return layers

@@ -18,9 +18,8 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
     known = dict(zip(observations.photos, observations.exposures))
     relative = {}
     for light in np.unique(observations.illumination):
-        photos = sorted(
-            observations.photos[k] for k in np.unique(observations.photo[observations.illumination == light])
-        )
+        of_light = np.unique(observations.photo[observations.illumination == light])
+        photos = sorted(observations.photos[k] for k in of_light)
         exposures = [known.get(photo) for photo in photos]
         first = exposures[0] if None not in exposures else None
         relative |= {photo: exposure / first if first else 1.0 for photo, exposure in zip(photos, exposures)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 import pytest
 
 from factorlib.geometry.camera import Camera
@@ -16,7 +17,8 @@ def test_projection_is_colmaps():
     _, camera, pose = photo_of(blob(), seed=0)
     points = RNG.normal(size=(20, 3))
     in_camera = pose.apply(points)
-    assert np.allclose(in_camera, np.array([pose.colmap() * p for p in points]))
+    there = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+    assert np.allclose(in_camera, np.array([there * p for p in points]))
     assert np.allclose(camera.project(in_camera), camera.colmap().img_from_cam(in_camera))
 
 

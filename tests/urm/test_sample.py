@@ -83,14 +83,13 @@ def test_the_mean_of_a_stratum_is_kept_within_its_noise():
 
 
 def test_names_exposures_and_the_rest_stay():
-    seen = msgspec.structs.replace(
-        many(), visibility=np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8)
-    )
+    visibility = np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8)
+    seen = msgspec.structs.replace(many(), visibility=visibility)
     kept = sample(seen, 3000)
     assert (kept.materials, kept.photos, kept.exposures) == (seen.materials, seen.photos, seen.exposures)
     row = kept.y * 200 + kept.x
-    np.testing.assert_array_equal(kept.visibility, seen.visibility[row])
-    np.testing.assert_array_equal(kept.radiance, seen.radiance[row])
+    for name in ("visibility", "radiance"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(seen, name)[row])
 
 
 def test_a_sampled_ball_merges_to_what_the_whole_ball_merges_to():
