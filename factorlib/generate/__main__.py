@@ -67,13 +67,11 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
         rmtree(fresh, ignore_errors=True)
         with Progress() as bar:
             task = bar.add_task(f"{out}", total=1)
-            set_.generate(
-                fresh,
-                seed,
-                maps,
-                parameters,
-                lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
-            )
+
+            def report(done: float, total: float, text: str) -> None:
+                bar.update(task, completed=done, total=total, description=text)
+
+            set_.generate(fresh, seed, maps, parameters, report)
         sync_tree(fresh)
     except (InputError, OSError) as error:
         known = error if isinstance(error, InputError) else disk_error(error, fresh)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import chair, labelled, rough_chair
-from factorlib.generate.lights import EYE, SceneDict, random_materials
+from factorlib.generate.lights import EYE, Rng, SceneDict, random_materials
 from factorlib.generate.shapes import smooth
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
@@ -123,9 +122,7 @@ class Scene(msgspec.Struct, frozen=True):
         return {name: Pose(matrix[:3, :3], matrix[:3, 3]) for name, matrix in matrices.items()}
 
 
-def laid_out(
-    shot: Shot, number: int, lat_longs: Maps, rng: np.random.Generator, spread: float, parameters: Parameters
-) -> Scene:
+def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, parameters: Parameters) -> Scene:
     """Camera, chairs and surroundings of a shot: a sky, a room, or a user's map over a grey ground (without it where light is
     `distant`); nothing stands between camera and chairs.  A spread turns the chairs and moves the camera.
     """
@@ -154,9 +151,7 @@ def laid_out(
     return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
-def write_shot(
-    out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int
-) -> dict[str, Any]:
+def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict:
     """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry.
 
     The entry has poses only if `exact`, the focal length only then and where the user is to give it there.

@@ -21,13 +21,12 @@ from factorlib.images.write import write_image
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 
+Image = Float[np.ndarray, "h w 3"]
 Poses = Mapping[str, Mapping[str, Pose]]  # cam_from_object by photo and object
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
 
 
-def write_photo(
-    path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None, quality: int = 95
-) -> None:
+def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, quality: int = 95) -> None:
     """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, EXIF focal if given)."""
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
@@ -60,19 +59,17 @@ def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> No
     write_image(path, spec, codes)
 
 
-def write_light(path: Path, lat_long: Float[np.ndarray, "h w 3"]) -> None:
+def write_light(path: Path, lat_long: Image) -> None:
     """Write a map of linear radiance, lat-long as in `factorlib.conventions`, as EXR."""
     write_rgb_exr(path, lat_long, LAT_LONG)
 
 
-def write_normals(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
+def write_normals(path: Path, normal: Image) -> None:
     """Unit normals in the camera frame, 0 where there is no object."""
     write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
 
 
-def write_shot(
-    out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Float[np.ndarray, "h w 3"], maps: Maps
-) -> None:
+def write_shot(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Image, maps: Maps) -> None:
     """The mask of one photo, and its truth: the light in the photo's units, and the normals."""
     write_labels(out / f"masks/{name}.png", labels)
     write_light(out / f"truth/{name}_light.exr", light)
@@ -164,13 +161,8 @@ def write_records(
     out: Path, comment: str, materials: Mapping[str, Any], meshes: dict[str, Any], photos: list[Any], poses: Poses
 ) -> None:
     """dataset.yaml, whose first line is the comment, and truth/truth.yaml; poses: by photo and object."""
-    record = {
-        "format": 1,
-        "materials": list(materials),
-        "meshes": meshes,
-        "photos": photos,
-        "truth": "truth/truth.yaml",
-    }
+    record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos}
+    record["truth"] = "truth/truth.yaml"
     write_yaml(out / "dataset.yaml", record, comment)
     write_truth(out, materials, poses)
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.photo import read_photo
-from factorlib.tracing.scene import Material, envmap, light_seen, rgb, rigid, transform
+from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin over the ground
@@ -26,7 +25,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
-Rotation = Float[np.ndarray, "3 3"]
+Rotation, Rng = Float[np.ndarray, "3 3"], np.random.Generator
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 # about x, about y, of +z
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
@@ -45,29 +44,7 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
     return result
 
 
-def random_light(
-    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: np.random.Generator, rows: int, spp: int
-) -> Float[np.ndarray, "h w 3"]:
-    """The light of photo `number`, in the camera's y-up frame: daylight for photo 0, the sun behind the camera to its left
-    or right, and for the others rooms with as many lamps as their number.
-
-    lat_longs: maps that replace them;  rows, spp: of the map, and samples a pixel
-    """
-    if lat_longs:
-        return captured(lat_longs[number % len(lat_longs)], rows)
-    seed = int(rng.integers(1 << 24))
-    if number:
-        scene = room(rng, windows=2, lamps=number)
-    else:
-        forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
-        scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
-    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
-
-
-def daylight(
-    rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256
-) -> SceneDict:
+def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> SceneDict:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
     elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
@@ -90,9 +67,7 @@ def daylight(
     return scene
 
 
-def room(
-    rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0
-) -> SceneDict:
+def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> SceneDict:
     """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE

@@ -11,7 +11,6 @@ Material Reflectances of 1: the model is linear in them, and its colour channels
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -27,8 +26,6 @@ MAP_ROWS, MAP_COLUMNS = 2048, 8
 SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
 LEAST_FACING = 0.01  # n·o of a pixel
 ALPHA, SHARPNESS = (0.008, 1.0), (0.05, 1e4)  # log-uniform
-
-Progress = Callable[[int, int], None]
 
 
 class Spheres(msgspec.Struct, frozen=True):
@@ -54,9 +51,7 @@ def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 
-def rendered(
-    spheres: Spheres, pixels: int, rng: np.random.Generator, progress: Progress = lambda done, total: None
-) -> Pixels:
+def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
     """`pixels` random pixels of each sphere, by Mitsuba; equal generators give equal bytes on one machine."""
     rows = []
     lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
@@ -67,7 +62,6 @@ def rendered(
         light, sensor = _envmap(axis, sharpness), _sensor(normal)
         glossy = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha)}
         rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (lambertian, glossy))))
-        progress(k + 1, len(spheres.axis))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 

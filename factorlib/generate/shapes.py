@@ -46,8 +46,7 @@ def blob() -> Mesh:
 
 def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     """The surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
-    theta = np.arange(1, ROWS) / ROWS * np.pi
-    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    theta, phi = np.arange(1, ROWS) / ROWS * np.pi, np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     sin = np.sin(theta)[:, None]
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
     poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
@@ -64,9 +63,7 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
 
 
-def closed_grid(
-    points: Float[np.ndarray, "r c 3"], top: Float[np.ndarray, "3"], bottom: Float[np.ndarray, "3"]
-) -> Mesh:
+def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.ndarray) -> Mesh:
     """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)

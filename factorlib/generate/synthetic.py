@@ -18,13 +18,13 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
-from factorlib.generate.lights import Rotation, random_light, random_materials
+from factorlib.generate.lights import Rng, Rotation, captured, daylight, random_materials, room
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
-from factorlib.tracing.scene import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
@@ -85,9 +85,8 @@ SHOTS = (
 class Scene(msgspec.Struct, frozen=True):
     """What one photo shows: objects in one light.
 
-    light      lat-long map in the camera's y-up frame, radiance in the light's own unit
-    materials  by name, in the order of their labels;  meshes: by shape
-    poses      cam_from_object by the object's name, in the order of `shot.placed`
+    light: lat-long map in the camera's y-up frame, radiance in its own unit;  materials: by name, in the order of their labels
+    meshes: by shape;  poses: cam_from_object by the object's name, in the order of `shot.placed`
     """
 
     shot: Shot
@@ -110,7 +109,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = random_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
+        light = light_of(number, world_from_camera, lat_longs, rng, parameters)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = placements(shot, world_from_camera, rng, spread)
         photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
@@ -119,6 +118,25 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     comment = "Generated: python -m factorlib.generate synthetic"
     folder.write_records(out, comment, materials, entries, photos, poses)
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
+
+
+def light_of(
+    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, parameters: Parameters
+) -> Float[np.ndarray, "h w 3"]:
+    """The light of photo `number`, in the camera's y-up frame: one of `lat_longs`, or daylight for photo 0, the sun behind the camera
+    to its left or right, and for the others rooms with as many lamps as their number.
+    """
+    rows = parameters.light_rows
+    if lat_longs:
+        return captured(lat_longs[number % len(lat_longs)], rows)
+    seed = int(rng.integers(1 << 24))
+    if number:
+        scene = room(rng, windows=2, lamps=number)
+    else:
+        forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
+        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
+        scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
+    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, parameters.light_spp, seed)
 
 
 def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:

@@ -47,7 +47,7 @@ WIDE = 0.03  # a lobe's V is no wider than 1/WIDE: p ends at the unit circle
 RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
 # where o and z point, in the frame with n = (0, 0, 1) and o = (so, 0, no), z = (zx, zy, nz): so, no, zx, zy, nz
 Directions = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-PEAK = 3.0  # −∂²/∂p² of log D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
+PEAK = 3.0  # of the curvature of −log D at p as the step to the mode takes it: −∂²/∂p² of log D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
 
 
 class Filtered(msgspec.Struct):
@@ -103,7 +103,7 @@ def filtered(
     at = _expansion(lam, px, py, directions)
     misfit = 0.5 * sharpness * (1 - at.along) ** 2
     density, spread = _student(k, lam, at, sharpness / lam, misfit)
-    r = _curvature(k, px, py) / lam
+    r = PEAK * k / (1 + k * (px * px + py * py)) / lam
     mx, my, total = _product(r, at)
     ni = at.ni + at.nix * (mx - px) + at.niy * (my - py)
     spread_of_ni = (at.nix * at.nix * (at.yy + r) + at.niy * at.niy * (at.xx + r) - 2 * at.nix * at.niy * at.xy) / total
@@ -137,7 +137,7 @@ def _blend(k: Tensor, lam: Tensor, oz: Tensor, directions: Directions) -> tuple[
 def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> tuple[Tensor, Tensor]:
     """One Gauss–Newton step from p to the mode of light times D: (JᵀJ + r)⁻¹ JᵀJ c, kept inside the disc."""
     at = _expansion(lam, px, py, directions)
-    x, y, _ = _product(_curvature(k, px, py) / lam, at)
+    x, y, _ = _product(PEAK * k / (1 + k * (px * px + py * py)) / lam, at)
     outside = torch.sqrt((x * x + y * y) / LARGEST_P + 1e-12).clamp_min(1.0)
     return x / outside, y / outside
 
@@ -148,11 +148,6 @@ def _product(r: Tensor, at: Expansion) -> tuple[Tensor, Tensor, Tensor]:
     shrink = r / total
     x = at.cx - shrink * ((at.yy + r) * at.cx - at.xy * at.cy)
     return x, at.cy - shrink * ((at.xx + r) * at.cy - at.xy * at.cx), total
-
-
-def _curvature(k: Tensor, px: Tensor, py: Tensor) -> Tensor:
-    """Curvature of −log D at p, as the step to the mode takes it; PEAK says why."""
-    return PEAK * k / (1 + k * (px * px + py * py))
 
 
 def _expansion(lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> Expansion:

@@ -170,9 +170,7 @@ def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[...,
     return (inner * w * (high - low)[:, :, 0]).sum(1)
 
 
-def over_arcs(
-    nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable[[Tensor], Tensor]
-) -> Float[Tensor, " b"]:
+def over_arcs(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable) -> Tensor:
     """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], beyond which light comes from below the surface; their length goes
     like a root at both ends."""
     x, w = gauss(nodes, low.dtype)

@@ -100,9 +100,7 @@ def _sobol(dimensions: int, count: int, seed: int) -> Float[np.ndarray, "count d
     return sequence.random_base2(max(1, math.ceil(math.log2(count))))[:count]
 
 
-def _turned(
-    axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"], azimuth: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 3"]:
+def _turned(axis: np.ndarray, angle: np.ndarray, azimuth: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """`axis` (in the plane y = 0) turned away from itself by `angle` in the direction `azimuth`."""
     across = np.stack([axis[:, 2], 0 * angle, -axis[:, 0]], 1)
     sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]

@@ -199,9 +199,7 @@ def descended(optimiser: torch.optim.Optimizer, loss: Tensor, step: int, schedul
     return float(loss.detach())
 
 
-def pixels_problem(
-    inputs: Float[Tensor, "n f"], sharpness: Float[Tensor, " n"], radiance: Float[Tensor, " n"]
-) -> Problem:
+def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Float[Tensor, " n"]) -> Problem:
     """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
     energy, radiance = lobe_integral(sharpness.float()), radiance.float()
     return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)

@@ -28,7 +28,7 @@ from factorlib.tracing.variant import mitsuba
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
-Entry, Matrix, Image = dict[str, Any], Float[np.ndarray, "4 4"], Float[np.ndarray, "h w 3"]
+Entry, Matrix, Image = dict[str, Any], Float[np.ndarray, "4 4"], Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
@@ -116,9 +116,7 @@ def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, 
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
-def rendered(
-    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False
-) -> Float[np.ndarray, "h w c"]:
+def rendered(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False) -> Image:
     """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
 
     hide_emitters: the light itself is not seen (where the sensor has alpha, it is 0 there)

@@ -159,21 +159,46 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
         columns[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    for name, (dtype, nothing, _) in WIDE.items():  # those without see everything
+    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()} | {"confidence": (np.dtype("f4"), 1)}
+    for name, (dtype, fill) in fills.items():  # parts without see everything, and are sure
         given = [getattr(part, name) for part in parts]
-        counts = {values.shape[1] for values in given if values is not None}
-        if len(counts) > 1:
-            raise InputError(f"reflectance maps whose {name} has {sorted(counts)} directions", cure=cure)
-        for k in counts:
-            filled = (
-                np.full((len(part), k), nothing, dtype) if own is None else own for part, own in zip(parts, given)
-            )
-            columns[name] = np.concatenate([*filled])
-    if any(part.confidence is not None for part in parts):
-        sure = [np.ones(len(part), "f4") if part.confidence is None else part.confidence for part in parts]
-        columns["confidence"] = np.concatenate(sure)
+        shapes = {values.shape[1:] for values in given if values is not None}
+        if len(shapes) > 1:
+            counts = sorted(count for (count,) in shapes)
+            raise InputError(f"reflectance maps whose {name} has {counts} directions", cure=cure)
+        for shape in shapes:
+            filled = [
+                np.full((len(part), *shape), fill, dtype) if own is None else own for part, own in zip(parts, given)
+            ]
+            columns[name] = np.concatenate(filled)
     of_photos = tuple(exposures.get(photo) for photo in names["photos"])
     return Observations(**columns, materials=materials, **names, exposures=of_photos)
+
+
+def relative_exposures(observations: Observations) -> dict[str, float]:
+    """Of each photo that has observations, over the first one (by name) in its light; 1 unless all photos of the light say theirs.
+
+    Two photos of one light differ by a factor, which the solve finds.  From a factor of 8 it may not find back; what the cameras
+    wrote, t·S/N², is right within rounding and what a camera's own rendering does.  So radiance is brought to the exposure of
+    the light's first photo by EXIF, and what is solved for is what EXIF leaves.
+    """
+    known = dict(zip(observations.photos, observations.exposures))
+    relative = {}
+    for light in np.unique(observations.illumination):
+        of_light = np.unique(observations.photo[observations.illumination == light])
+        photos = sorted(observations.photos[k] for k in of_light)
+        exposures = [known.get(photo) for photo in photos]
+        first = exposures[0] if None not in exposures else None
+        relative |= {photo: exposure / first if first else 1.0 for photo, exposure in zip(photos, exposures)}
+    return relative
+
+
+def at_one_exposure(observations: Observations, relative: dict[str, float]) -> Observations:
+    """With the radiance of each photo over its relative exposure; unchanged where all are 1."""
+    factors = np.array([relative.get(photo, 1.0) for photo in observations.photos])
+    if (factors == 1).all():
+        return observations
+    return msgspec.structs.replace(observations, radiance=observations.radiance / factors[observations.photo][:, None])
 
 
 def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:

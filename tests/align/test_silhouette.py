@@ -8,8 +8,7 @@ import trimesh
 
 from factorlib.align import silhouette as masks
 from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import FACET, TURN, confidence, turns
-from factorlib.align.overlay import overlay
+from factorlib.align.confidence import FACET, TURN, confidence, overlay, turns
 from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import rasterise

@@ -21,10 +21,8 @@ OPERATOR, EXACT = reflection_operator("paper_network"), reflection_operator("pap
 
 def test_the_shipped_weights_are_small_and_load_without_a_renderer():
     assert sum(path.stat().st_size for path in SHIPPED.glob("paper_*")) < 1_000_000
-    code = (
-        "import sys; from factorlib.reflection import reflection_operator; reflection_operator('paper_network')\n"
-        "sys.exit('mitsuba' in sys.modules)"
-    )
+    made = "import sys; from factorlib.reflection import reflection_operator; reflection_operator('paper_network')"
+    code = f"{made}; sys.exit('mitsuba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False).returncode == 0
 
 

@@ -1,4 +1,4 @@
-"""Poses found from masks alone, against rendered truth: right, where the mesh is exact, or said to be doubtful."""
+"""Poses found from masks alone and from keypoints, against rendered truth: right, where the mesh is exact, or said to be doubtful."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.align.coarse import is_cut
-from factorlib.align.place import KnownFocal, ObjectToPlace, placed
+from factorlib.align.coarse import is_cut, looking_along, toward
+from factorlib.align.place import Keypoints, KnownFocal, ObjectToPlace, placed, state_of_keypoints
+from factorlib.align.refine import FocalPrior
 from factorlib.align.search import Search, find, focal_prior
 from factorlib.align.silhouette import UNKNOWN, Silhouette, label_agreement, labelled_iou, silhouette_iou
+from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
-from factorlib.align.trust import Standards, doubts, trust_in
+from factorlib.align.trust import Standards, contour_error, doubts, mirrored_score, normal_stderr_deg, trust_in
+from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
+from factorlib.geometry.sphere import fibonacci_directions
 from factorlib.meshes.read import CREASE_DEG, usable
 from factorlib.meshes.soup import Soup, no_normals
 from tests.align.scenes import at, ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
@@ -91,15 +95,18 @@ def test_a_tiny_mask_does_not_break_it():
     assert 90 < rows.mean() < 114 and 40 < columns.mean() < 65
 
 
-def test_the_same_twice_and_winner_and_runner_up_are_scored_in_one_window():
+def test_the_same_twice():
     first, second = (searched(chair(), 14, known=False, **SMALL)[0] for _ in range(2))
     assert np.array_equal(first.state.rotation, second.state.rotation)
     assert first.state.log_focal == second.state.log_focal
+
+
+def test_winner_and_runner_up_are_scored_in_one_window():
     caster, camera, pose = photo_of(chair(), 3, width=640, height=480)
     search = msgspec.structs.replace(BRIEF, keep=(14, 6, 3, 1))
     found, _ = searched(chair(), 3, search=search, width=640, height=480)
-    labels, size = caster.mesh.labels, (search.resolution[-1], search.margin[-1])
-    target = target_of(true_silhouette(caster, camera, pose), labels, *size)
+    size = search.resolution[-1], search.margin[-1]
+    target = target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, *size)
     for one in (found, found.runner_up):
         hits = caster.cast(target.camera(one.state.camera(camera)), one.state.pose(caster))
         assert one.score == labelled_iou(target.silhouette, caster.labels(hits))
@@ -177,3 +184,132 @@ def test_standards_are_what_doubts_are_measured_by():
     below, above = (Standards(most_contour_error=trust.contour_error * factor) for factor in (0.9, 1.1))
     assert doubts(1.0, 1.0, trust, None, below) and not doubts(1.0, 1.0, trust, None, above)
     assert not doubts(1.0, 1.0, msgspec.structs.replace(trust, contour_error=0.0), None)
+
+
+TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip
+
+
+def named(camera, pose, points=TIPS, off=0.0, seed=0) -> Keypoints:
+    """The points where the camera sees them, each up to `off` pixels away from there."""
+    shift = np.random.default_rng(seed).uniform(-off, off, (len(points), 2))
+    return Keypoints(camera.project(pose.apply(points)) + shift, points)
+
+
+def placed_by(caster, camera, keypoints, silhouette, focal):
+    obj = ObjectToPlace("chair", caster, silhouette, keypoints=keypoints)
+    return placed([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo")
+
+
+def state_by(keypoints, caster, camera):
+    prior = focal_prior(camera.focal, "dataset", camera.width, camera.height)
+    obj = ObjectToPlace("chair", caster, Silhouette(np.zeros((1, 1), np.int16)), keypoints=keypoints)
+    return state_of_keypoints(obj, camera, prior, "photo")
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_careless_keypoints_and_the_mask_give_the_pose(seed, known):
+    caster, camera, pose = photo_of(chair(), seed)
+    keypoints, silhouette = named(camera, pose, off=2.0, seed=seed), true_silhouette(caster, camera, pose)
+    result = placed_by(caster, camera, keypoints, silhouette, camera.focal if known else None)
+    assert normal_error_deg(caster, camera, pose, result.camera, result.poses[0]) < 2
+    assert result.found[0].by_keypoints and result.found[0].runner_up is None
+
+
+def test_keypoints_decide_where_the_mask_cannot():
+    """A ball looks the same from everywhere; the turn is the keypoints'."""
+    caster, camera, pose = photo_of(mesh_of([ball()]), 3)
+    keypoints = named(camera, pose, np.vstack([np.eye(3), -np.eye(3)]))
+    result = placed_by(caster, camera, keypoints, true_silhouette(caster, camera, pose), camera.focal)
+    assert np.allclose(result.poses[0].rotation, pose.rotation, atol=0.02)
+
+
+def test_two_wrong_keypoints_of_eight_change_nothing():
+    caster, camera, pose = photo_of(chair(), 4)
+    pixel = named(camera, pose).pixel.copy()
+    pixel[[1, 5]] = pixel[[5, 1]] + 30
+    first, again = (state_by(Keypoints(pixel, TIPS), caster, camera) for _ in range(2))
+    assert np.allclose(first.rotation, pose.rotation, atol=1e-3) and np.array_equal(first.rotation, again.rotation)
+
+
+def test_units_and_origin_of_the_mesh_do_not_matter():
+    caster, camera, pose = photo_of(chair(), 5)
+    near, mesh, shift = named(camera, pose, off=1.0), caster.mesh, np.array([4e6, -1e6, 2e6])
+    far = Caster(type(mesh)(mesh.vertices * 1000 + shift, mesh.faces, mesh.normals, mesh.face_label))
+    one, other = state_by(near, caster, camera), state_by(Keypoints(near.pixel, near.point * 1000 + shift), far, camera)
+    assert np.allclose(one.rotation, other.rotation, atol=1e-6)
+    assert np.isclose(np.exp(other.log_depth), 1000 * np.exp(one.log_depth))
+
+
+def test_keypoints_that_do_not_agree_are_refused():
+    caster, camera, _ = photo_of(chair(), 6)
+    keypoints = Keypoints(np.random.default_rng(0).uniform(0, 240, (8, 2)), TIPS)
+    with pytest.raises(InputError, match=r"of the 8 keypoints of 'chair' agree") as caught:
+        placed_by(caster, camera, keypoints, Silhouette(np.ones((240, 320), np.int16)), camera.focal)
+    assert caught.value.key == "photo.chair.keypoints" and caught.value.cure
+
+
+KNOWN = FocalPrior(1.0, 0.0)
+
+
+def seen(mesh, **how):
+    """The caster, a target of the mask, the photo's camera, and the true state."""
+    caster, camera, pose = photo_of(mesh, 1, **how)
+    target = target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, 200, 0.2)
+    return caster, target, camera, state_of(pose, camera, caster)
+
+
+def test_state_and_pose_are_one():
+    caster, camera, pose = photo_of(blob(), seed=1, shift=(0.2, -0.1))
+    back = state_of(pose, camera, caster).pose(caster)
+    assert np.allclose(back.rotation, pose.rotation) and np.allclose(back.translation, pose.translation)
+
+
+def test_focal_length_moves_neither_place_nor_size():
+    state = State(np.eye(3), 0.1, -0.05, np.log(50.0), np.log(500.0))
+    jacobian = state.jacobian(np.array([[0.0, 0, 0], [1.0, 0, 0]]))
+    assert np.allclose(jacobian[0, :, 6], 0) and np.allclose(jacobian[1, :, 6], 0, atol=1e-9)
+
+
+def test_rotations_look_where_they_say():
+    for direction in fibonacci_directions(20):
+        turn = looking_along(direction)
+        assert np.allclose(turn @ direction, (0, 0, 1)) and np.isclose(np.linalg.det(turn), 1)
+    slope = np.array([0.3, -0.2])
+    assert np.allclose(np.cross(toward(slope) @ [0, 0, 1], [*slope, 1]), 0, atol=1e-12)
+    assert np.isclose(angle_between(toward(slope), np.eye(3)), np.rad2deg(np.arctan(np.linalg.norm(slope))))
+
+
+@pytest.mark.parametrize("larger", [0.04, -0.04, 0.1])
+def test_a_ball_too_large_by_a_share_is_off_by_half_that_share_of_its_extent(larger):
+    *given, state = seen(mesh_of([ball(subdivisions=5)]), focal=8.0)
+    nearer = msgspec.structs.replace(state, log_depth=state.log_depth - np.log(1 + larger))
+    assert contour_error(*given, state) < 0.002
+    assert contour_error(*given, nearer) == pytest.approx(abs(larger) / 2, abs=0.003)
+
+
+def test_contour_error_is_the_same_at_any_size():
+    errors = []
+    for fill in (0.9, 0.3):
+        *given, state = seen(blob(), focal=20.0, fill=fill, width=640, height=480)
+        errors.append(contour_error(*given, msgspec.structs.replace(state, log_depth=state.log_depth - 0.1)))
+    assert errors[0] == pytest.approx(errors[1], rel=0.1)
+
+
+def test_fewer_pixels_and_an_unknown_focal_length_tell_normals_less_and_the_turn_of_a_ball_costs_nothing():
+    stderr = [normal_stderr_deg(*seen(chair(), fill=fill, width=640, height=480), KNOWN) for fill in (0.8, 0.2, 0.05)]
+    assert stderr[0] < 1 and stderr[0] < stderr[1] < stderr[2] and stderr[2] > 3
+    given = seen(chair())
+    assert normal_stderr_deg(*given, FocalPrior(given[2].focal, 0.5)) >= 0.99 * normal_stderr_deg(*given, KNOWN)
+    assert normal_stderr_deg(*seen(mesh_of([ball(subdivisions=5)])), KNOWN) < 2
+
+
+def test_the_mirror_image_of_a_photo_off_centre_scores_as_the_photo_did():
+    caster, camera, pose = photo_of(chair(), 21, focal=1.0, shift=(0.1, 0.05))
+    camera = msgspec.structs.replace(camera, centre=(camera.centre[0] - 12.0, camera.centre[1] + 3.0))
+    silhouette = true_silhouette(caster, camera, pose)
+    flipped = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
+    mirrored = msgspec.structs.replace(camera, centre=(camera.width - camera.centre[0], camera.centre[1]))
+    prior = focal_prior(camera.focal, "dataset", camera.width, camera.height)
+    right, wrong = mirrored_score(caster, flipped, mirrored, prior), mirrored_score(caster, silhouette, camera, prior)
+    assert right > 0.98 and 1 - right < (1 - wrong) / 2
