@@ -62,8 +62,3 @@ def half_of_normal_and_view(normal: Vectors, view: Vectors) -> Vectors:
     """
     cosine = np.sum(normal * view, axis=-1, keepdims=True)
     return (2 * cosine * normal - view + FRONT) / 2
-
-
-def alpha_of_roughness(roughness: float | np.ndarray) -> float | np.ndarray:
-    """GGX α = roughness²."""
-    return roughness**2

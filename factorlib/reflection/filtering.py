@@ -20,6 +20,8 @@ part of the light above the horizon.
 
 from __future__ import annotations
 
+from collections import namedtuple
+
 import msgspec
 import torch
 from torch import Tensor
@@ -45,9 +47,10 @@ LEAST_HN, LARGEST_P = 1e-3, 0.998  # (n·h)² and |p|² where h is perpendicular
 SHARE = 2.0  # curvature of −log D at its peak over k, as the blend takes it
 WIDE = 0.03  # a lobe's V is no wider than 1/WIDE: p ends at the unit circle
 RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
+# PEAK k / (1 + kp²): curvature of −log D as the step to the mode takes it, between its 4k at the peak and 2k as a whole
+PEAK = 3.0
 # where o and z point, in the frame with n = (0, 0, 1) and o = (so, 0, no), z = (zx, zy, nz): so, no, zx, zy, nz
 Directions = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-PEAK = 3.0  # of the curvature of −log D at p as the step to the mode takes it: −∂²/∂p² of log D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
 
 
 class Filtered(msgspec.Struct):
@@ -68,19 +71,8 @@ class Filtered(msgspec.Struct):
     cosine: Tensor  # mean n·i of that
 
 
-class Expansion(msgspec.Struct):
-    """The lobe about p*: JᵀJ with its determinant, c of (2), i*·z, n·i* and the derivatives of n·i by p."""
-
-    xx: Tensor
-    yy: Tensor
-    xy: Tensor
-    det: Tensor
-    cx: Tensor
-    cy: Tensor
-    along: Tensor
-    ni: Tensor
-    nix: Tensor
-    niy: Tensor
+# the lobe about p*: JᵀJ with its determinant, c of (2), i*·z, n·i* and the derivatives of n·i by p
+Expansion = namedtuple("Expansion", ("xx", "yy", "xy", "det", "cx", "cy", "along", "ni", "nix", "niy"))
 
 
 def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:

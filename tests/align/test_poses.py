@@ -124,10 +124,8 @@ def untidy(vertices, faces):
 def torn(vertices, faces):
     """Fins inside the body make edges of three faces, and no face shares a vertex with another."""
     a, b, _ = faces[::50].T
-    vertices, fins = (
-        np.vstack([vertices, vertices.mean(axis=0)]),
-        np.stack([a, b, np.full(len(a), len(vertices))], axis=1),
-    )
+    fins = np.stack([a, b, np.full(len(a), len(vertices))], axis=1)
+    vertices = np.vstack([vertices, vertices.mean(axis=0)])
     return vertices[np.vstack([faces, fins])].reshape(-1, 3), np.arange(3 * (len(faces) + len(fins))).reshape(-1, 3)
 
 
