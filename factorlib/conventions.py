@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+Vectors = Float[np.ndarray, "*n 3"]
 FRONT = np.array([0.0, 0.0, -1.0])  # direction from the scene to the viewer, camera frame
 YUP_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])  # a rotation by π about x, its own inverse
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
 
 def lat_long_directions(height: int, width: int) -> Float[np.ndarray, "height width 3"]:
@@ -54,9 +54,7 @@ def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, " height
     return (edges[:-1] - edges[1:]) * 2 * np.pi / width
 
 
-def half_of_normal_and_view(
-    normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]
-) -> Float[np.ndarray, "*n 3"]:
+def half_of_normal_and_view(normal: Vectors, view: Vectors) -> Vectors:
     """The URM's `half` = (2(n·o)n − o + (0,0,−1)) / 2, as in the paper (not of unit length).
 
     >>> half_of_normal_and_view(FRONT, FRONT).tolist()
@@ -64,8 +62,3 @@ def half_of_normal_and_view(
     """
     cosine = np.sum(normal * view, axis=-1, keepdims=True)
     return (2 * cosine * normal - view + FRONT) / 2
-
-
-def alpha_of_roughness(roughness: float | np.ndarray) -> float | np.ndarray:
-    """GGX α = roughness²."""
-    return roughness**2

@@ -7,11 +7,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.confidence import confidence
+from factorlib.align.confidence import confidence, overlay
 from factorlib.align.given import check_before_camera, focal_and_centre, warn_of_camera, warn_of_materials
-from factorlib.align.keypoints import Keypoints
-from factorlib.align.overlay import overlay
-from factorlib.align.place import KnownFocal, ObjectToPlace, Placed, placed
+from factorlib.align.place import Keypoints, KnownFocal, ObjectToPlace, Placed, placed
 from factorlib.align.search import Search
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.align.trust import Standards, doubts, trust_in

@@ -57,16 +57,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         progress(done, len(sightings), mesh)
         verdict = proportions([sighting for _, sighting in each.values()], params)
         report[mesh] = {
-            "factors": verdict.fitted.factors.tolist(),
+            "factors": verdict.factors.tolist(),
             "used": verdict.used,
             "reason": verdict.reason,
             "held_out_unexplained": {"as_it_is": verdict.held_out_before, "fitted": verdict.held_out_after},
             "sightings": [f"{photo}.{name}" for photo, name in each],
         }
         if verdict.used:
-            factors = verdict.fitted.factors
+            factors = verdict.factors
             log.warning("mesh '%s' fits better with its axes times %s", mesh, ", ".join(f"{f:.3f}" for f in factors))
-            for (photo, name), state in zip(each, verdict.fitted.states, strict=True):
+            for (photo, name), state in zip(each, verdict.states, strict=True):
                 poses[photo] = placed(poses[photo], name, *each[photo, name], state, factors)
     write_json(out / "meshes.json", report)
     write_json(out / FILE, poses)

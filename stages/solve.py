@@ -49,8 +49,7 @@ from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, solve
 from factorlib.solve.start import from_earlier, from_nothing, with_decided
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.exposure import at_one_exposure, relative_exposures
-from factorlib.urm.observations import Observations, concatenate
+from factorlib.urm.observations import Observations, at_one_exposure, concatenate, relative_exposures
 
 log = logging.getLogger("factorlib.solve")
 PAPER, NOISE, LOSS = Paper(), Noise(), Loss()  # where defaults stand

@@ -13,9 +13,8 @@ import torch
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.jsonfile import write_json
-from factorlib.reflection.accuracy import diffuse_table, specular_table
 from factorlib.reflection.network import Layers, write_layers
-from factorlib.reflection.samples import diffuse_samples, specular_samples
+from factorlib.reflection.samples import diffuse_samples, diffuse_table, specular_samples, specular_table
 from factorlib.reflection.training import Problem, Schedule, Step, diffuse_problem, specular_problem, train
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import writing

@@ -32,6 +32,7 @@ SIZES_OF_WHOLE = (0.95, 1.05)  # relative to the size that the areas say
 SIZES_OF_CUT = (0.95, 1.15, 1.4, 1.75, 2.2)
 CUT_SHARE = 0.03  # of the contour on the frame or on broad unknown areas: more, and the mask is taken to be cut
 BROAD = 0.03  # of the mask's extent: narrower unknown bands, as along a contour, hide nothing
+Rotation = Float[np.ndarray, "3 3"]
 
 
 class Guess(msgspec.Struct, frozen=True):
@@ -39,13 +40,17 @@ class Guess(msgspec.Struct, frozen=True):
     (x, y), and the focal length; the last two in grid pixels."""
 
     error: float
-    turn: Float[np.ndarray, "3 3"]
+    turn: Rotation
     angle: float
     shift: Int[np.ndarray, "2"]
     focal: float
 
+    def roll(self) -> Rotation:
+        """The photo's turn undone."""
+        return rotation_of_vector(np.array([0, 0, -self.angle]))
 
-def looking_along(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+
+def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
     """A rotation cam_from_object that looks along `direction` of the object's frame."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
     x /= np.linalg.norm(x)
@@ -76,44 +81,41 @@ def candidates(
     pixel, middle = extent / (CUT if cut else WHOLE), (low + high) / 2
     angles = np.arange(rolls) * 2 * np.pi / rolls
     area = np.count_nonzero(silhouette.inside) / pixel**2
-    labels = caster.mesh.labels
-    costs = _cost_images(silhouette, labels, middle, pixel, angles)
+    costs = _cost_images(silhouette, caster.mesh.labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
     guesses = []
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
     for direction in fibonacci_directions(views):
         turn = looking_along(direction)
-        for template, focal in _templates(caster, labels, turn, distance, area, cut):
+        for template, focal in _templates(caster, turn, distance, area, SIZES_OF_CUT if cut else SIZES_OF_WHOLE):
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
             errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(rolls, -1)
             best = errors.argmin(axis=1)
             error = 1 + errors[np.arange(rolls), best] / area
             shift = (np.stack([best % GRID, best // GRID], axis=1) + GRID // 2) % GRID - GRID // 2
             guesses += [Guess(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
-
-    def state(guess: Guess) -> State:
-        """The guess in the photo's camera: shift and roll undone, seen along the ray to where it lies."""
+    states = []
+    for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
         (x, y), cos, sin = guess.shift, np.cos(guess.angle), np.sin(guess.angle)
         place = middle + pixel * np.array([cos * x + sin * y, -sin * x + cos * y])
         slope = (place - np.array(camera.centre)) / camera.focal
-        depth = camera.focal * distance / (guess.focal * pixel)
-        rotation = toward(slope) @ _roll(guess) @ guess.turn
-        return State(rotation, float(slope[0]), float(slope[1]), float(np.log(depth)), float(np.log(camera.focal)))
-
-    return [state(guess) for guess in _apart(guesses, keep, apart_deg)]
+        logs = np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
+        states.append(State(toward(slope) @ guess.roll() @ guess.turn, *map(float, (*slope, *logs))))
+    return states
 
 
 def _cost_images(
-    silhouette: Silhouette,
-    labels: tuple[int, ...],
-    middle: Float[np.ndarray, "2"],
-    pixel: float,
-    angles: Float[np.ndarray, " rolls"],
+    silhouette: Silhouette, labels: tuple[int, ...], middle: np.ndarray, pixel: float, angles: np.ndarray
 ) -> Float[np.ndarray, "rolls labels GRID GRID"]:
     """E_l of the photo turned by each angle about `middle`."""
     step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
-    costs = (np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0)) for label in labels)
-    means = [_block_means(cost, step) for cost in costs]
+    height, width = (-(-n // step) * step for n in silhouette.label.shape)
+    means = []
+    for label in labels:
+        cost = np.zeros((height, width))
+        of_photo = np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0))
+        cost[: len(of_photo), : of_photo.shape[1]] = of_photo
+        means.append(cost.reshape(height // step, step, width // step, step).mean(axis=(1, 3)))
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
@@ -125,39 +127,29 @@ def _cost_images(
     return images
 
 
-def _block_means(image: Float[np.ndarray, "h w"], step: int) -> Float[np.ndarray, "i j"]:
-    height, width = (-(-n // step) * step for n in image.shape)
-    padded = np.pad(image, [(0, height - image.shape[0]), (0, width - image.shape[1])])
-    return padded.reshape(height // step, step, width // step, step).mean(axis=(1, 3))
-
-
 def _templates(
-    caster: Caster, labels: tuple[int, ...], turn: Float[np.ndarray, "3 3"], distance: float, area: float, cut: bool
+    caster: Caster, turn: Rotation, distance: float, area: float, sizes: tuple[float, ...]
 ) -> Iterator[tuple[Float[np.ndarray, "labels GRID GRID"], float]]:
-    """Label images of the mesh at each size, and the focal length (grid pixels) that gives it."""
+    """Label images of the mesh at each size, scaled about the middle to the nearest pixel, and the focal length (grid
+    pixels) that gives it."""
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
     own = np.count_nonzero(image)
-    for size in SIZES_OF_CUT if cut else SIZES_OF_WHOLE:
+    for size in sizes:
         zoom = np.sqrt(area / max(own, 1)) * size
         if zoom < 4:  # else seen edge-on: nothing like the mask
-            sized = _zoomed(image, zoom)
-            yield np.stack([sized == label for label in labels]).astype(np.float32), focal * zoom
-
-
-def _zoomed(image: Int[np.ndarray, "n n"], zoom: float) -> Int[np.ndarray, "n n"]:
-    """The image scaled about its middle, nearest pixel, in its own frame."""
-    index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
-    there = (index >= 0) & (index < GRID)
-    index = np.clip(index, 0, GRID - 1)
-    return np.where(there[:, None] & there, image[np.ix_(index, index)], 0)
+            index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
+            there = (index >= 0) & (index < GRID)
+            index = np.clip(index, 0, GRID - 1)
+            sized = np.where(there[:, None] & there, image[np.ix_(index, index)], 0)
+            yield np.stack([sized == label for label in caster.mesh.labels]).astype(np.float32), focal * zoom
 
 
 def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
     """The best of the guesses, none within `apart_deg` of a better one."""
     order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
-    rotations = np.stack([_roll(guesses[k]) @ guesses[k].turn for k in order])
+    rotations = np.stack([guesses[k].roll() @ guesses[k].turn for k in order])
     chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:
@@ -168,11 +160,7 @@ def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
     return chosen
 
 
-def _roll(guess: Guess) -> Float[np.ndarray, "3 3"]:
-    return rotation_of_vector(np.array([0, 0, -guess.angle]))
-
-
-def toward(slope: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
+def toward(slope: Float[np.ndarray, "2"]) -> Rotation:
     """The smallest rotation that takes the optical axis to the ray (slope, 1)."""
     ray = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1 + slope @ slope)
     axis = np.cross([0.0, 0.0, 1.0], ray)

@@ -1,4 +1,4 @@
-"""How far to believe the normal of each pixel, 0 to 1.
+"""How far to believe the normal of each pixel, 0 to 1, and a picture to judge a pose by.
 
 A coarse mesh does not say how its surface runs within a face, nor a thin part how it turns within a pixel.  The normal's variance then
 is that of everything else times
@@ -12,11 +12,12 @@ over that, times what contours, depth jumps, slant and sides say.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filter
 
 from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.raster import Maps
+from factorlib.images.picture import picture as sdr_picture
 
 FULL_DISTANCE = 0.01  # of the mask's extent: nearer to a contour, a small error of pose or mesh shows another place
 FULL_COSINE = 0.3  # flatter than this, a small error of shape turns the normal much
@@ -27,6 +28,7 @@ STEEPER = 3.0  # and does if the step is this many times the next one beside it,
 # data/eames, whose true normals are known: their median error is 1.1° where facet is less than 5°, 2.3° from 10° to 16°, 8° beyond; 20° on flat
 # faces where turn is more than 20°.  Of two values tried, 12° gave better lights than 5°
 FACET, TURN = np.radians(12.0), np.radians(20.0)
+MESH, MASK = np.array([1.0, 0.15, 0.75]), np.array([0.2, 1.0, 0.2])  # contour colours
 
 
 def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
@@ -62,15 +64,26 @@ def _depth_jumps(maps: Maps) -> Bool[np.ndarray, "h w"]:
         first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
         both = mesh[first] & mesh[second]
         step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
-        steep = step > STEEPER * _least_beside(step, axis)
+        padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
+        before, after = (np.take(padded, range(k, k + step.shape[axis]), axis) for k in (0, 2))
+        steep = step > STEEPER * np.minimum(before, after)
         jump = both & (((step > limit) & steep) | (maps.object[first] != maps.object[second]))
         result[first] |= jump
         result[second] |= jump
     return result
 
 
-def _least_beside(step: Float[np.ndarray, "i j"], axis: int) -> Float[np.ndarray, "i j"]:
-    """The lesser of the steps before and after each along `axis`; infinite where there is neither."""
-    padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)
-    size = step.shape[axis]
-    return np.minimum(np.take(padded, range(size), axis), np.take(padded, range(2, size + 2), axis))
+def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhouette) -> UInt8[np.ndarray, "h w 3"]:
+    """sRGB picture; magenta: contour of the mesh and of its parts, green: of the mask; grey-blue: left out."""
+    picture = 0.55 / 255 * sdr_picture(radiance).astype(float)
+    mesh, unknown = maps.label > 0, ~silhouette.known
+    tint = (maps.normal * (1, -1, -1) + 1) / 2  # the usual colours: x red right, y green up, z blue to the viewer
+    picture[mesh] = 0.6 * picture[mesh] + 0.4 * tint[mesh]
+    picture[unknown] = 0.7 * picture[unknown] + 0.3 * np.array([0.4, 0.5, 0.7])
+    width = max(1, round(max(mesh.shape) / 600))
+    for label, colour in ((np.maximum(silhouette.label, 0), MASK), (maps.label + 1000 * maps.object, MESH)):
+        contour = np.zeros(label.shape, bool)  # whose label differs from the one right of or below them
+        contour[:, :-1] |= label[:, :-1] != label[:, 1:]
+        contour[:-1] |= label[:-1] != label[1:]
+        picture[binary_dilation(contour, iterations=width) if width > 1 else contour] = colour
+    return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)

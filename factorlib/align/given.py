@@ -85,43 +85,29 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
 
     Raises InputError where the photo is not the image at another size: it was cropped, turned or squeezed.
     """
-    across, down = _scale(external, width, height, photo)
-    point = external.principal_point
+    size, point, fault = external.size, external.principal_point, None
+
+    def is_resized(size: tuple[float, float]) -> bool:
+        """By the longer side, to a pixel of the shorter one."""
+        (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
+        return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
+
+    # photo pixels per image pixel: one number, but for the rounding of the photo's shorter side
+    across = down = 1.0 if size is None else width / size[0]
+    if size is not None and size[1] is not None:
+        down = height / size[1]
+        sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{size[1]:g}"
+        if not is_resized(size):
+            cure = "give the image itself, or the same at another size, and masks of it"
+            fault = f"{sizes}: it was cropped or squeezed"
+            if is_resized(size[::-1]):
+                fault = f"{sizes}: it was made of the photo before its EXIF orientation was applied"
+                cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
     centre = (width / 2, height / 2) if point is None else (point[0] * across, point[1] * down)
-    inside = all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre))
-    if external.size is None and not inside:
+    if size is None and not all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre)):
         where = f"({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels"
+        fault = f"its principal point {where}"
         cure = "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose of its objects)"
-        raise _refused(external, photo, f"its principal point {where}", cure)
+    if fault:
+        raise InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)
     return external.focal_px * (across if width >= height else down), centre
-
-
-def _scale(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, float]:
-    """Photo pixels per image pixel, across and down: one number, but for the rounding of the photo's shorter side."""
-    size = external.size
-    if size is None:
-        return 1.0, 1.0
-    if size[1] is None:
-        return width / size[0], width / size[0]
-    if _is_resized(size, width, height):
-        return width / size[0], height / size[1]
-    sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{size[1]:g}"
-    if _is_resized(size[::-1], width, height):
-        fault = "it was made of the photo before its EXIF orientation was applied"
-        cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
-    else:
-        fault, cure = (
-            "it was cropped or squeezed",
-            "give the image itself, or the same at another size, and masks of it",
-        )
-    raise _refused(external, photo, f"{sizes}: {fault}", cure)
-
-
-def _is_resized(size: tuple[float, float], width: int, height: int) -> bool:
-    """By the longer side, to a pixel of the shorter one."""
-    (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
-    return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
-
-
-def _refused(external: ExternalCamera, photo: str, fault: str, cure: str) -> InputError:
-    return InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.refine import DAMPING as OF_POSES
-from factorlib.align.refine import Equations, FocalPrior, normal_equations, refined, rendered
+from factorlib.align.refine import FocalPrior, normal_equations, refined, rendered
 from factorlib.align.state import State
 from factorlib.align.target import Target
 from factorlib.geometry.camera import Camera
@@ -32,6 +32,7 @@ DAMPING = np.append(OF_POSES, np.array([0.1, 0.1]) ** -2.0)  # of d, too
 LARGEST_STEP = 0.15  # of the logarithms d; of other unknowns twice as much
 STILL = 1e-4  # a step of d that ends the descent
 PARTS = 4  # that are left out in turn, at most
+Factors = Float[np.ndarray, "3"]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
@@ -56,70 +57,57 @@ class Sighting(msgspec.Struct, frozen=True):
     state: State
 
 
-class Fitted(msgspec.Struct, frozen=True):
-    """factors [3], their product 1, and the state of each sighting with them."""
-
-    factors: Float[np.ndarray, "3"]
-    states: list[State]
-
-
 class Verdict(msgspec.Struct, frozen=True):
-    """What was found, and whether it is used; shares of the mask that silhouettes leave unexplained, mean over the sightings.
+    """Whether factors are used, the factors, their product 1, and the state of each sighting with them; shares of the mask
+    that silhouettes leave unexplained, mean over the sightings.
 
     held_out_before, held_out_after: with the mesh as it is and with factors of other photos, poses fitted to both alike
     """
 
     used: bool
     reason: str
-    fitted: Fitted
+    factors: Factors
+    states: list[State]
     held_out_before: float | None = None
     held_out_after: float | None = None
 
 
 def proportions(sightings: Sequence[Sighting], standards: Standards = Standards()) -> Verdict:
     """Factors of the one mesh that all sightings show; exactly 1 where they are not used."""
-    as_it_is = Fitted(np.ones(3), [one.state for one in sightings])
+    as_it_is = np.ones(3), [one.state for one in sightings]
     if len(sightings) < 2:
-        return Verdict(False, "one photo alone can take a wrong proportion for a turn", as_it_is)
+        return Verdict(False, "one photo alone can take a wrong proportion for a turn", *as_it_is)
     before, after = [], []
-    for part in parts(len(sightings)):
+    count = len(sightings)
+    for part in ([*range(first, count, PARTS)] for first in range(min(count, PARTS))):  # left out together
         others = [one for k, one in enumerate(sightings) if k not in part]
-        factors = fitted(others, standards.steps).factors
+        factors, _ = fitted(others, standards.steps)
         for k in part:
             before.append(unexplained(sightings[k], np.ones(3), standards.steps))
             after.append(unexplained(sightings[k], factors, standards.steps))
     losses = float(np.mean(before)), float(np.mean(after))
     gain = losses[0] - losses[1]
     if gain < max(standards.least_gain * losses[0], standards.least_share):
-        return Verdict(False, "photos left out are explained no better", as_it_is, *losses)
-    return Verdict(True, "photos left out are explained better", fitted(sightings, standards.steps), *losses)
+        return Verdict(False, "photos left out are explained no better", *as_it_is, *losses)
+    return Verdict(True, "photos left out are explained better", *fitted(sightings, standards.steps), *losses)
 
 
-def parts(count: int) -> list[list[int]]:
-    """Which are left out together.
-
-    >>> parts(2), parts(6)
-    ([[0], [1]], [[0, 4], [1, 5], [2], [3]])
-    """
-    return [list(range(first, count, PARTS)) for first in range(min(count, PARTS))]
-
-
-def unexplained(one: Sighting, factors: Float[np.ndarray, "3"], steps: int) -> float:
+def unexplained(one: Sighting, factors: Factors, steps: int) -> float:
     """The share of the mask at the best pose of the mesh with these factors."""
     return 1 - refined(Caster(scaled(one.mesh, factors)), one.target, one.camera, one.state, one.prior, steps).score
 
 
-def fitted(sightings: Sequence[Sighting], steps: int) -> Fitted:
-    """Factors and states together, by Gauss-Newton from the mesh as it is; the best met."""
+def fitted(sightings: Sequence[Sighting], steps: int) -> tuple[Factors, list[State]]:
+    """Factors, of product 1, and states together, by Gauss-Newton from the mesh as it is; the best met."""
     shape, states, best, most = np.zeros(2), [one.state for one in sightings], None, -np.inf
     for k in range(steps + 1):
-        equations, scores = [], []
+        equations, scores, factors = [], [], np.exp(SHAPES @ shape)
         for one, state in zip(sightings, states, strict=True):
-            seen = rendered(Caster(scaled(one.mesh, factors_of(shape))), one.target, one.camera, state)
+            seen = rendered(Caster(scaled(one.mesh, factors)), one.target, one.camera, state)
             equations.append(normal_equations(seen, one.target, one.prior, jacobian_with_shape))
             scores.append(seen.score(one.target))
         if (score := float(np.mean(scores))) > most:
-            best, most = Fitted(factors_of(shape), states), score
+            best, most = (factors, states), score
         if k == steps:
             break
         by_shape, moves = _joint_step(equations, [one.prior.free for one in sightings])
@@ -127,15 +115,6 @@ def fitted(sightings: Sequence[Sighting], steps: int) -> Fitted:
         if np.abs(by_shape).max() < STILL:
             break
     return best
-
-
-def factors_of(shape: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-    """Of product 1.
-
-    >>> float(factors_of(np.array([0.3, -0.1])).prod().round(12))
-    1.0
-    """
-    return np.exp(SHAPES @ shape)
 
 
 def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
@@ -149,16 +128,16 @@ def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[n
 
 
 def _joint_step(
-    equations: Sequence[Equations], free: Sequence[int]
+    equations: Sequence[tuple[np.ndarray, np.ndarray]], free: Sequence[int]
 ) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
     """The damped step of d, and the sightings' own steps, in which the first `free` unknowns move."""
     shared, pull, own = np.diag(DAMPING[7:]), np.zeros(2), []
-    for one, k in zip(equations, free, strict=True):
-        matrix = one.information + np.diag(DAMPING * (np.arange(9) < 7))
+    for (information, gradient), k in zip(equations, free, strict=True):
+        matrix = information + np.diag(DAMPING * (np.arange(9) < 7))
         cross = matrix[:k, 7:]
-        away = np.linalg.solve(matrix[:k, :k], np.column_stack([cross, one.gradient[:k]]))
-        shared = shared + one.information[7:, 7:] - cross.T @ away[:, :2]
-        pull = pull + one.gradient[7:] - cross.T @ away[:, 2]
+        away = np.linalg.solve(matrix[:k, :k], np.column_stack([cross, gradient[:k]]))
+        shared = shared + information[7:, 7:] - cross.T @ away[:, :2]
+        pull = pull + gradient[7:] - cross.T @ away[:, 2]
         own.append(away)
     by_shape = np.clip(-np.linalg.solve(shared, pull), -LARGEST_STEP, LARGEST_STEP)
     steps = [np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP) for away in own]

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.align.silhouette import labelled_iou
 from factorlib.align.state import State
-from factorlib.align.target import Region, Target, border_pairs
+from factorlib.align.target import Target, border_pairs
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Hits
 from factorlib.robust import robust_deviation
@@ -37,7 +37,7 @@ HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
 MOST_SCALE = 0.05  # of the mask's extent
 DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
 LARGEST_STEP = 0.3  # of each unknown, in its own unit
-Points, Jacobian = Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 k"]
+Points = Float[np.ndarray, "n 2"]
 
 
 class FocalPrior(msgspec.Struct, frozen=True):
@@ -88,16 +88,16 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
     state, best, failures = start, None, 0
     for k in range(steps + 1):
         seen = rendered(caster, target, camera, state)
-        score, equations = seen.score(target), normal_equations(seen, target, prior)
+        score, (information, gradient) = seen.score(target), normal_equations(seen, target, prior)
         if best is None or score > best.score:
-            best, failures = Refined(state, score, equations.information), 0
+            best, failures = Refined(state, score, information), 0
         else:
             failures += 1
         if k == steps or failures > 4:
             break
         step = np.zeros(7)
-        matrix, free = equations.information + np.diag(DAMPING), prior.free
-        step[:free] = -np.linalg.solve(matrix[:free, :free], equations.gradient[:free])
+        matrix, free = information + np.diag(DAMPING), prior.free
+        step[:free] = -np.linalg.solve(matrix[:free, :free], gradient[:free])
         step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         state = state.moved(step)
         if np.abs(step).max() < 2e-5:
@@ -105,20 +105,11 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
     return best
 
 
-class Equations(msgspec.Struct, frozen=True):
-    """Normal equations of k unknowns, the first seven those of `State.moved`."""
-
-    information: Float[np.ndarray, "k k"]
-    gradient: Float[np.ndarray, " k"]
-
-
 def normal_equations(
-    seen: Rendered,
-    target: Target,
-    prior: FocalPrior,
-    jacobian_of: Callable[[State, np.ndarray], np.ndarray] = State.jacobian,
-) -> Equations:
-    """The contours' residuals by all unknowns, robustly weighted, with the prior of the focal length.
+    seen: Rendered, target: Target, prior: FocalPrior, jacobian_of: Callable[..., np.ndarray] = State.jacobian
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
+    """Information and gradient of the contours' residuals by all unknowns, the first seven those of `State.moved`, robustly
+    weighted, with the prior of the focal length.
 
     jacobian_of: derivative of image points by all unknowns, from the state and the points' arms, as `State.jacobian`
     """
@@ -128,9 +119,13 @@ def normal_equations(
         if len(points) == 0:
             continue
         jacobian = jacobian_of(seen.state, arms) / target.pixel
-        for residual, row in (_mesh_to_mask(region, points, jacobian), _mask_to_mesh(region, points, jacobian)):
-            residuals.append(residual)
-            rows.append(row)
+        slope_x, slope_y = (at_points(region.slope[..., k], points)[:, None] for k in (0, 1))
+        residuals.append(at_points(region.distance, points))
+        rows.append(slope_x * jacobian[:, 0] + slope_y * jacobian[:, 1])
+        if len(region.contour):
+            nearest = cKDTree(points).query(region.contour)[1]
+            residuals.append(np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour))
+            rows.append(np.einsum("nd,ndk->nk", region.outward, jacobian[nearest]))
     residual, row = np.concatenate(residuals), np.concatenate(rows)
     spread = robust_deviation(residual) if len(residual) else LEAST_SPREAD
     scale = float(np.clip(spread, LEAST_SPREAD, max(MOST_SCALE * target.extent, LEAST_SPREAD)))
@@ -139,7 +134,7 @@ def normal_equations(
     if prior.sigma > 0:
         information[6, 6] += prior.sigma**-2
         gradient[6] += (seen.state.log_focal - np.log(prior.focal)) / prior.sigma**2
-    return Equations(information, gradient)
+    return information, gradient
 
 
 def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 3"]]:
@@ -163,16 +158,3 @@ def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 
 def at_points(image: Float[np.ndarray, "h w"], points: Points) -> Float[np.ndarray, " n"]:
     """An image's values at points (x, y), pixel centres at 0.5, linear between pixels."""
     return map_coordinates(image, points.T[::-1] - 0.5, order=1, mode="nearest")
-
-
-def _mesh_to_mask(region: Region, points: Points, jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
-    slope_x, slope_y = (at_points(region.slope[..., k], points)[:, None] for k in (0, 1))
-    return at_points(region.distance, points), slope_x * jacobian[:, 0] + slope_y * jacobian[:, 1]
-
-
-def _mask_to_mesh(region: Region, points: Points, jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
-    if len(region.contour) == 0:
-        return np.zeros(0), np.zeros((0, jacobian.shape[-1]))
-    nearest = cKDTree(points).query(region.contour)[1]
-    residual = np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour)
-    return residual, np.einsum("nd,ndk->nk", region.outward, jacobian[nearest])

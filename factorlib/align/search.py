@@ -27,10 +27,8 @@ DISTINCT_DEG = 15.0  # a runner-up is turned by more than this
 UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected costs
 UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle .7, normal 1.4, portrait 2.5
 EXIF_SIGMA = 0.05  # whole millimetres, and focus
-WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
 GIVEN_UP_RATIO = 4.0  # times as much left unexplained as by the best, or GIVEN_UP_UNEXPLAINED: not refined further
 GIVEN_UP_UNEXPLAINED = 0.04
-CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
 
 
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,9 +94,9 @@ def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPri
     effort = search.cut_effort if is_cut(silhouette) else 1
     density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
     states, others = candidates(caster, silhouette, camera, *density), []
-    for keep, steps, resolution, margin in zip(search.keep, search.steps, search.resolution, search.margin):
+    for keep, steps, *window in zip(search.keep, search.steps, search.resolution, search.margin):
         states = states[: keep if others else effort * keep]
-        target = target_of(silhouette, caster.mesh.labels, resolution, margin)
+        target = target_of(silhouette, caster.mesh.labels, *window)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in states], prior)
         most = max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
         states = [result.state for result in ranked if 1 - result.score <= most]
@@ -122,8 +120,8 @@ def found_near(
 ) -> Found:
     """The pose refined from `start`, at the two finest resolutions; `start` itself where that leads far off."""
     camera, state = msgspec.structs.replace(camera, focal=prior.focal), start
-    for steps, resolution, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
-        target = target_of(silhouette, caster.mesh.labels, resolution, margin)
+    for steps, *window in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
+        target = target_of(silhouette, caster.mesh.labels, *window)
         result = refined(caster, target, camera, state, prior, steps)
         if angle_between(result.state.rotation, start.rotation) > DISTINCT_DEG:
             result = refined(caster, target, camera, start, prior, 0)
@@ -144,9 +142,8 @@ def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
 
     def value(result: Refined) -> float:
         """The score, less a little for an unlikely focal length."""
-        if prior.sigma == 0:
-            return result.score
-        return result.score - UNLIKELY_FOCAL * ((result.state.log_focal - np.log(prior.focal)) / prior.sigma) ** 2
+        off = (result.state.log_focal - np.log(prior.focal)) / prior.sigma if prior.sigma else 0.0
+        return result.score - UNLIKELY_FOCAL * off**2
 
     distinct: list[Refined] = []
     for result in sorted(results, key=lambda result: -value(result)):

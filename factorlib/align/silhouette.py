@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 UNKNOWN = -1
 Channels = Mapping[str, Float[np.ndarray, "h w"]]  # of the stage `masks`
-Labels = Int[np.ndarray, "h w"]
+Labels, Mask = Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]
 
 
 class Silhouette(msgspec.Struct, frozen=True):
@@ -23,12 +23,12 @@ class Silhouette(msgspec.Struct, frozen=True):
     label: Labels
 
     @property
-    def inside(self) -> Bool[np.ndarray, "h w"]:
+    def inside(self) -> Mask:
         """Where the photo shows some material of the object."""
         return self.label > 0
 
     @property
-    def known(self) -> Bool[np.ndarray, "h w"]:
+    def known(self) -> Mask:
         """Where the photo says what is seen."""
         return self.label != UNKNOWN
 
@@ -84,6 +84,6 @@ def labelled_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
     return _share(silhouette.inside & (silhouette.label == mesh_label), union)
 
 
-def _share(part: Bool[np.ndarray, "h w"], whole: Bool[np.ndarray, "h w"]) -> float:
+def _share(part: Mask, whole: Mask) -> float:
     total = np.count_nonzero(whole)
     return float(np.count_nonzero(part) / total) if total else 0.0

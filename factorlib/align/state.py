@@ -47,8 +47,7 @@ class State(msgspec.Struct, frozen=True):
     def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
         """Derivative of the image points (photo pixels) of points at `arms` from the centre (camera axes), by `moved`."""
         depth, focal = np.exp(self.log_depth), np.exp(self.log_focal)
-        point = arms + self.middle()
-        moves = np.zeros((len(arms), 3, 7))
+        point, moves = arms + self.middle(), np.zeros((len(arms), 3, 7))
         for k in range(3):
             moves[:, :, k] = np.cross(np.eye(3)[k], arms)
         moves[:, 0, 3] = moves[:, 1, 4] = depth

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.silhouette import UNKNOWN, Labels, Silhouette
+from factorlib.align.silhouette import UNKNOWN, Mask, Silhouette
 from factorlib.geometry.camera import Camera
-
-Mask = Bool[np.ndarray, "h w"]
 
 
 class Region(msgspec.Struct, frozen=True):
@@ -74,20 +72,22 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
     window = silhouette.label[np.ix_(y, x)]
+    padded = np.pad(window, 1, mode="edge")
     at_frame = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
-    regions = {label: _region(window, label, at_frame) for label in labels}
-    return Target(float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
-
-
-def _region(labels: Labels, label: int, at_frame: tuple[bool, bool, bool, bool]) -> Region:
-    """The region of one label; beyond the photo's frame, where the window's (top, bottom, left, right) touches it,
-    nothing is known."""
-    padded = np.pad(labels, 1, mode="edge")
     for touches, edge in zip(at_frame, (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]), strict=True):
         if touches:
             padded[edge] = UNKNOWN
-    inside, known = padded == label, padded != UNKNOWN
-    distance = np.where(inside, 0.5 - _distance_to(~inside), _distance_to(inside | ~known) - 0.5)
+    regions = {label: _region(padded == label, padded != UNKNOWN) for label in labels}
+    return Target(float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
+
+
+def _region(inside: Mask, known: Mask) -> Region:
+    """The region `inside`, from a window with a border of one pixel beyond it."""
+
+    def distance_to(where: Mask) -> Float[np.ndarray, "h w"]:
+        return distance_transform_edt(~where) if where.any() else np.full(where.shape, float(sum(where.shape)))
+
+    distance = np.where(inside, 0.5 - distance_to(~inside), distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
     slope = np.stack(np.gradient(distance)[::-1], axis=-1)
     a, b = border_pairs(inside, known & ~inside)
@@ -107,7 +107,3 @@ def border_pairs(inside: Mask, outside: Mask) -> tuple[Int[np.ndarray, "n 2"], I
         first, second = np.argwhere(inside[low] & outside[high]), np.argwhere(outside[low] & inside[high])
         pairs += [(first, first + step), (second + step, second)]
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
-
-
-def _distance_to(where: Mask) -> Float[np.ndarray, "h w"]:
-    return distance_transform_edt(~where) if where.any() else np.full(where.shape, float(sum(where.shape)))

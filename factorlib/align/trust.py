@@ -26,7 +26,6 @@ from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster
 
-RESOLUTION, MARGIN = 200, 0.2
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing
 FITS_TO_A_PIXEL = 0.995  # score from which no other pose fits clearly better
 QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 8, 6), rivals=0)
@@ -88,7 +87,7 @@ def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
     found, caster, silhouette, camera = placed.found[number], obj.caster, obj.silhouette, placed.camera
     if not silhouette.inside.any():
         return Trust(1.0)
-    target = target_of(silhouette, caster.mesh.labels, RESOLUTION, MARGIN)
+    target = target_of(silhouette, caster.mesh.labels, resolution=200)
     if found is None:
         return Trust(contour_error(caster, target, camera, state_of(placed.poses[number], camera, caster)))
     may_be_mirrored = found.score < FITS_TO_A_PIXEL and not found.by_keypoints
@@ -116,9 +115,9 @@ def contour_error(caster: Caster, target: Target, camera: Camera, state: State) 
 def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: State, prior: FocalPrior) -> float:
     """Root of the summed squares, over the independent directions of the unknowns, of the normals' median turn by one
     standard error."""
-    equations, free = normal_equations(rendered(caster, target, camera, state), target, prior), prior.free
-    turns = []
-    precisions, directions = np.linalg.eigh(equations.information[:free, :free])
+    information, _ = normal_equations(rendered(caster, target, camera, state), target, prior)
+    turns, free = [], prior.free
+    precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
         length = min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
         move = np.append(length * direction, np.zeros(7 - free))

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from factorlib.conventions import alpha_of_roughness, lat_long_directions, lat_long_solid_angles
+from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 
 SIDE = 128  # texels of the finest octahedral level: 1.6° across
 WIDE_SIDE = 64  # of the level that wide lobes are summed over
@@ -136,7 +136,7 @@ class NarrowLobe(msgspec.Struct, frozen=True):
 
 def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> WideLobe | NarrowLobe:
     """What `glossy_ball` computes alike for every light, which is most of its work."""
-    alpha = max(float(alpha_of_roughness(roughness)), 1e-3)
+    alpha = max(float(roughness**2), 1e-3)
     return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
 
 

@@ -19,6 +19,9 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 Seed = Annotated[
     int, typer.Option(min=0, help="0 is the set the project carries; others have other materials, views and lights.")
 ]
+EXACT = typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")
+DISTANT = typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")
+DIRECT = typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
 Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
 
@@ -36,24 +39,16 @@ def eames(
     seed: Seed = 0,
     out: Out = None,
     lights: Lights = None,
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")
-    ] = False,
-    distant: Annotated[
-        bool, typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")
-    ] = False,
-    direct: Annotated[
-        bool, typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
-    ] = False,
+    exact: Annotated[bool, EXACT] = False,
+    distant: Annotated[bool, DISTANT] = False,
+    direct: Annotated[bool, DIRECT] = False,
 ) -> None:
     """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
     from factorlib.generate import eames as set_
 
     if (exact or distant or direct) and out is None:
-        typer.echo(
-            "error: data/eames is the set without --exact, --distant and --direct\n  name another folder by --out",
-            err=True,
-        )
+        fault = "data/eames is the set without --exact, --distant and --direct"
+        typer.echo(f"error: {fault}\n  name another folder by --out", err=True)
         raise typer.Exit(2)
     parameters = set_.Parameters(exact=exact, distant=distant, direct=direct)
     _write(set_, out or Path("data/eames"), seed, lights, parameters)
@@ -74,7 +69,6 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
             task = bar.add_task(f"{out}", total=1)
 
             def report(done: float, total: float, text: str) -> None:
-                """The bar of this data set."""
                 bar.update(task, completed=done, total=total, description=text)
 
             set_.generate(fresh, seed, maps, parameters, report)

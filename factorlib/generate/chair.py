@@ -54,12 +54,8 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
     axes, phases = rng.normal(0, 5, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 1))
     shifts = rng.normal(0, 0.002, (4, 3))
 
-    def bent(part: Part) -> Part:
-        """The part, its vertices moved by smooth waves."""
-        vertices, faces = part
-        return vertices + np.sin(vertices @ axes.T + phases.T) @ shifts, faces
-
-    return {"shell": bent(shell(14, 22)), "legs": bent(legs(7, 3, radii=SHAPE.rough_leg_radii))}
+    parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=SHAPE.rough_leg_radii)}
+    return {name: (v + np.sin(v @ axes.T + phases.T) @ shifts, faces) for name, (v, faces) in parts.items()}
 
 
 def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import chair, labelled, rough_chair
-from factorlib.generate.lights import EYE, SceneDict, random_materials
+from factorlib.generate.lights import EYE, Rng, SceneDict, random_materials
 from factorlib.generate.shapes import smooth
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
@@ -28,7 +27,7 @@ from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
-Progress = Callable[[int, int, str], None]
+Progress, Maps = Callable[[int, int, str], None], Sequence[Path]
 
 
 class Parameters(msgspec.Struct, frozen=True):
@@ -84,22 +83,16 @@ SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
 
 
 def generate(
-    out: Path,
-    seed: int,
-    lat_longs: Sequence[Path],
-    parameters: Parameters,
-    progress: Progress,
-    shots: Sequence[Shot] = SET.shots,
+    out: Path, seed: int, lat_longs: Maps, parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
 ) -> None:
     """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
     rng, spread = np.random.default_rng([11, seed]), 0.0 if seed == 0 else 1.0
     materials, rough = random_materials(rng, 0.2 * spread, SET.materials), rough_chair(rng)
-    if parameters.exact:
-        folder.write_exact_obj(out / "meshes/chair.obj", {name: smooth(*part) for name, part in chair().items()})
-    else:
-        folder.write_obj(out / "meshes/chair.obj", rough)
+    exact = {name: smooth(*part) for name, part in chair().items()} if parameters.exact else {}
+    parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
+    folder.write_obj(out / "meshes/chair.obj", parts)
     photos, poses = [], {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
@@ -129,10 +122,10 @@ class Scene(msgspec.Struct, frozen=True):
         return {name: Pose(matrix[:3, :3], matrix[:3, 3]) for name, matrix in matrices.items()}
 
 
-def laid_out(
-    shot: Shot, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, spread: float, parameters: Parameters
-) -> Scene:
-    """Camera, chairs and surroundings of a shot; a spread turns the chairs and moves the camera."""
+def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, parameters: Parameters) -> Scene:
+    """Camera, chairs and surroundings of a shot: a sky, a room, or a user's map over a grey ground (without it where light is
+    `distant`); nothing stands between camera and chairs.  A spread turns the chairs and moves the camera.
+    """
     yaw, width, height = rng.uniform(0, 360), parameters.width, parameters.height
     distance = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1))
     eye = shot.eye + 0.15 * spread * rng.uniform(-1, 1)
@@ -146,27 +139,19 @@ def laid_out(
         turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])  # the chair's +z toward the camera
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
-    around = surroundings(shot, yaw, number, lat_longs, rng, parameters)
+    if lat_longs:
+        around = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
+        if not parameters.distant:
+            around["ground"] = lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
+    elif shot.sun:
+        up, aside = shot.sun
+        around = lights.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
+    else:
+        around = lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw + 180, clear_half_deg=120)
     return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
-def surroundings(
-    shot: Shot, yaw_deg: float, number: int, lat_longs: Sequence[Path], rng: np.random.Generator, parameters: Parameters
-) -> SceneDict:
-    """A sky, a room, or a user's map over a grey ground (without it where light is `distant`); nothing stands between camera and chairs."""
-    if lat_longs:
-        light = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
-        ground = {"ground": lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))}
-        return light if parameters.distant else light | ground
-    if shot.sun:
-        up, aside = shot.sun
-        return lights.daylight(rng, up, yaw_deg + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
-    return lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw_deg + 180, clear_half_deg=120)
-
-
-def write_shot(
-    out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int
-) -> dict[str, Any]:
+def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict:
     """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry.
 
     The entry has poses only if `exact`, the focal length only then and where the user is to give it there.

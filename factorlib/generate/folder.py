@@ -21,12 +21,12 @@ from factorlib.images.write import write_image
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 
+Image = Float[np.ndarray, "h w 3"]
+Poses = Mapping[str, Mapping[str, Pose]]  # cam_from_object by photo and object
 SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
 
 
-def write_photo(
-    path: Path, radiance: Float[np.ndarray, "h w 3"], focal_35mm: float | None = None, quality: int = 95
-) -> None:
+def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, quality: int = 95) -> None:
     """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, EXIF focal if given)."""
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
@@ -59,43 +59,35 @@ def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> No
     write_image(path, spec, codes)
 
 
-def write_light(path: Path, lat_long: Float[np.ndarray, "h w 3"]) -> None:
+def write_light(path: Path, lat_long: Image) -> None:
     """Write a map of linear radiance, lat-long as in `factorlib.conventions`, as EXR."""
     write_rgb_exr(path, lat_long, LAT_LONG)
 
 
-def write_normals(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
+def write_normals(path: Path, normal: Image) -> None:
     """Unit normals in the camera frame, 0 where there is no object."""
     write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
 
 
-def write_shot(
-    out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Float[np.ndarray, "h w 3"], maps: Maps
-) -> None:
+def write_shot(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Image, maps: Maps) -> None:
     """The mask of one photo, and its truth: the light in the photo's units, and the normals."""
     write_labels(out / f"masks/{name}.png", labels)
     write_light(out / f"truth/{name}_light.exr", light)
     write_normals(out / f"truth/{name}_normal.exr", maps.normal)
 
 
-def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Parts (name -> vertices [V, 3], faces [F, 3]) as groups of a Wavefront OBJ without normals."""
+def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, ...]]) -> None:
+    """Parts as groups of a Wavefront OBJ: name -> vertices [V, 3], faces [F, 3] and, where they are written to nine digits,
+    normals [V, 3].
+    """
     lines, first = [], 1
-    for name, (vertices, faces) in parts.items():
-        lines += [f"g {name}", *(f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices)]
-        lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + first]
+    for name, (vertices, faces, *normals) in parts.items():
+        lines += [f"g {name}", *("v " + " ".join(f"{x:{'.9g' if normals else '.5f'}}" for x in v) for v in vertices)]
+        lines += ["vn " + " ".join(f"{x:.9g}" for x in n) for n in (normals[0] if normals else [])]
+        lines += [
+            "f " + " ".join(f"{k}//{k}" if normals else f"{k}" for k in face) for face in np.asarray(faces) + first
+        ]
         first += len(vertices)
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def write_exact_obj(path: Path, parts: dict[str, Mesh]) -> None:
-    """Parts as groups of a Wavefront OBJ, with their vertex normals, to nine digits."""
-    lines, first = [], 1
-    for name, mesh in parts.items():
-        lines += [f"g {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices)]
-        lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals]
-        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in mesh.faces + first]
-        first += len(mesh.vertices)
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -106,9 +98,8 @@ def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[
 
 def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
     """Where each object fills at least half of the pixel."""
-    number = _subpixels(meshes, camera, poses).object
-    inside = number[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS]
-    inside = inside.reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
+    number = _subpixels(meshes, camera, poses).object[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS]
+    inside = number.reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
@@ -120,12 +111,10 @@ def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Map
 
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
     """Of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
-    reach = SUBPIXELS + 2
-    windows = np.lib.stride_tricks.sliding_window_view(fine, (reach, reach))
+    windows = np.lib.stride_tricks.sliding_window_view(fine, (SUBPIXELS + 2, SUBPIXELS + 2))
     windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
-    windows = windows[:height, :width].reshape(height, width, -1)
-    low, high = windows.min(axis=-1), windows.max(axis=-1)
+    low, high = (of(windows[:height, :width], axis=(-2, -1)) for of in (np.min, np.max))
     return np.where(low == high, low, LEFT_OUT)
 
 
@@ -169,26 +158,16 @@ def pose_entry(pose: Pose) -> dict[str, Any]:
 
 
 def write_records(
-    out: Path,
-    comment: str,
-    materials: Mapping[str, Any],
-    meshes: dict[str, dict[str, Any]],
-    photos: list[dict[str, Any]],
-    poses: Mapping[str, Mapping[str, Pose]],
+    out: Path, comment: str, materials: Mapping[str, Any], meshes: dict[str, Any], photos: list[Any], poses: Poses
 ) -> None:
     """dataset.yaml, whose first line is the comment, and truth/truth.yaml; poses: by photo and object."""
-    record = {
-        "format": 1,
-        "materials": list(materials),
-        "meshes": meshes,
-        "photos": photos,
-        "truth": "truth/truth.yaml",
-    }
+    record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos}
+    record["truth"] = "truth/truth.yaml"
     write_yaml(out / "dataset.yaml", record, comment)
     write_truth(out, materials, poses)
 
 
-def write_truth(out: Path, materials: Mapping[str, Any], poses: Mapping[str, Mapping[str, Pose]]) -> None:
+def write_truth(out: Path, materials: Mapping[str, Any], poses: Poses) -> None:
     """truth/truth.yaml: materials (structs), and by photo the light, the normals and the poses."""
     truth = {
         "materials": {name: msgspec.to_builtins(material) for name, material in materials.items()},

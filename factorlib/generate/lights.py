@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.photo import read_photo
-from factorlib.tracing.scene import Material, envmap, light_seen, rgb, rigid, transform
+from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin over the ground
@@ -26,6 +25,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
+Rotation, Rng = Float[np.ndarray, "3 3"], np.random.Generator
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 # about x, about y, of +z
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
@@ -44,34 +44,7 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
     return result
 
 
-def random_light(
-    number: int,
-    world_from_camera: Float[np.ndarray, "3 3"],
-    lat_longs: Sequence[Path],
-    rng: np.random.Generator,
-    rows: int,
-    spp: int,
-) -> Float[np.ndarray, "h w 3"]:
-    """The light of photo `number`, in the camera's y-up frame: daylight for photo 0, the sun behind the camera to its left
-    or right, and for the others rooms with as many lamps as their number.
-
-    lat_longs: maps that replace them;  rows, spp: of the map, and samples a pixel
-    """
-    if lat_longs:
-        return captured(lat_longs[number % len(lat_longs)], rows)
-    seed = int(rng.integers(1 << 24))
-    if number:
-        scene = room(rng, windows=2, lamps=number)
-    else:
-        forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
-        scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
-    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
-
-
-def daylight(
-    rng: np.random.Generator, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256
-) -> SceneDict:
+def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> SceneDict:
     """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
     elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
@@ -86,20 +59,15 @@ def daylight(
     }  # fmt: skip
     seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
     scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
-    return scene | {f"facade_{k}": facade(rng, azimuth_deg, k) for k in range(4)}
+    for k in range(4):  # coloured blocks some metres away; none stands before the sun
+        angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
+        size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
+        place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
+        scene[f"facade_{k}"] = block(place, size, np.degrees(angle), _vivid(rng))
+    return scene
 
 
-def facade(rng: np.random.Generator, azimuth_deg: float, k: int) -> SceneDict:
-    """A coloured block some metres away; none stands before the sun."""
-    angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
-    size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
-    place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
-    return block(place, size, np.degrees(angle), _vivid(rng))
-
-
-def room(
-    rng: np.random.Generator, windows: int = 2, lamps: int = 2, clear_deg: float = 0.0, clear_half_deg: float = 75.0
-) -> SceneDict:
+def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> SceneDict:
     """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
@@ -110,7 +78,8 @@ def room(
     sides = ["+x", "-x", "+z", "-z"]
     for side in sides:
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
-        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), _wall_colour(rng), (0, 0.25))
+        paint = np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
+        scene[f"wall{side}"] = wall(side, distance, (width, 1.6), paint, (0, 0.25))
         size, colour = rng.uniform(0.3, 0.6, 2), _vivid(rng)
         shift = rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
         scene[f"picture{side}"] = wall(side, distance - 0.02, size, colour, shift)
@@ -132,24 +101,14 @@ def room(
     return scene
 
 
-def _wall_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A light paint."""
-    return np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
-
-
 def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A strong colour."""
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
 
 def wall(
-    side: str,
-    distance: float,
-    half: Sequence[float] | np.ndarray,
-    colour: Colour,
-    shift: tuple[float, float] = (0.0, 0.0),
-    glow: Colour | None = None,
-) -> SceneDict:
+    side: str, distance: float, half: Sequence[float], colour: Colour, shift: Sequence[float] = (0.0, 0.0), glow: Colour | None = None
+) -> SceneDict:  # fmt: skip
     """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
 
     shift: of its middle in its own plane (along, up);  glow: the radiance it emits, None for a wall that only reflects
@@ -173,11 +132,10 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     radiance = read_photo(path, "linear").radiance.astype(float)
     rows, columns = radiance.shape[:2]
     if columns != 2 * rows:
-        fault, cure = f"{columns} × {rows} pixels is no lat-long map", "its width must be twice its height"
-        raise InputError(fault, file=path, cure=cure)
+        fault = f"{columns} × {rows} pixels is no lat-long map"
+        raise InputError(fault, file=path, cure="its width must be twice its height")
     if rows % height:
-        fault, cure = f"{rows} rows do not divide into {height}", f"resize it to a multiple of {height} rows"
-        raise InputError(fault, file=path, cure=cure)
-    finer = max(1, rows // height)
-    radiance = radiance.reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
+        fault = f"{rows} rows do not divide into {height}"
+        raise InputError(fault, file=path, cure=f"resize it to a multiple of {height} rows")
+    radiance = radiance.reshape(height, rows // height, 2 * height, rows // height, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

@@ -11,14 +11,14 @@ Material Reflectances of 1: the model is linear in them, and its colour channels
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.conventions import FRONT, alpha_of_roughness
+from factorlib.conventions import FRONT
+from factorlib.geometry.raster import unit
 from factorlib.tracing.scene import SAMPLER, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 
@@ -26,8 +26,6 @@ MAP_ROWS, MAP_COLUMNS = 2048, 8
 SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
 LEAST_FACING = 0.01  # n·o of a pixel
 ALPHA, SHARPNESS = (0.008, 1.0), (0.05, 1e4)  # log-uniform
-
-Progress = Callable[[int, int], None]
 
 
 class Spheres(msgspec.Struct, frozen=True):
@@ -48,30 +46,22 @@ class Pixels(msgspec.Struct, frozen=True):
 
 def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
     """Axes uniform on the sphere, α and λ log-uniform."""
-    axis = _unit(rng.standard_normal((count, 3)))
+    axis = unit(rng.standard_normal((count, 3)))
     alpha, sharpness = (np.exp(rng.uniform(*np.log(limits), count)) for limits in (ALPHA, SHARPNESS))
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 
-def rendered(
-    spheres: Spheres, pixels: int, rng: np.random.Generator, progress: Progress = lambda done, total: None
-) -> Pixels:
+def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
     """`pixels` random pixels of each sphere, by Mitsuba; equal generators give equal bytes on one machine."""
     rows = []
-    for k, (axis, sharpness, roughness) in enumerate(
-        zip(spheres.axis, spheres.sharpness, spheres.roughness, strict=True)
+    lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
+    for k, (axis, sharpness, alpha) in enumerate(
+        zip(spheres.axis, spheres.sharpness, spheres.roughness**2, strict=True)
     ):
-        normal = _normals(axis, sharpness, alpha_of_roughness(roughness), pixels, rng)
+        normal = _normals(axis, sharpness, alpha, pixels, rng)
         light, sensor = _envmap(axis, sharpness), _sensor(normal)
-        lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
-        glossy = {
-            "type": "roughconductor",
-            "material": "none",
-            "distribution": "ggx",
-            "alpha": float(alpha_of_roughness(roughness)),
-        }
+        glossy = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha)}
         rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (lambertian, glossy))))
-        progress(k + 1, len(spheres.axis))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -85,14 +75,10 @@ def _normals(
     """
     angle, radius = rng.uniform(0, 2 * np.pi, 4 * count), np.sqrt(rng.uniform(0, 1, 4 * count))
     even = np.stack([radius * np.cos(angle), radius * np.sin(angle), -np.sqrt(1 - radius**2)], axis=-1)
-    highlight = _unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
-    even, highlight = (n[n @ FRONT > LEAST_FACING] for n in (even, _unit(highlight)))
+    highlight = unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
+    even, highlight = (n[n @ FRONT > LEAST_FACING] for n in (even, unit(highlight)))
     half = min(count // 2, len(highlight))  # none is seen of a light right behind the sphere
     return np.concatenate([even[: count - half], highlight[:half]])
-
-
-def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _envmap(axis: Float[np.ndarray, "3"], sharpness: float) -> Any:
@@ -100,7 +86,7 @@ def _envmap(axis: Float[np.ndarray, "3"], sharpness: float) -> Any:
     theta = np.arange(MAP_ROWS) / (MAP_ROWS - 1) * np.pi  # Mitsuba's rows
     radiance = np.exp(-2 * sharpness * np.sin(theta / 2) ** 2).astype(np.float32)
     bitmap = mitsuba().Bitmap(np.tile(radiance[:, None, None], (1, MAP_COLUMNS, 3)))
-    across = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
+    across = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
     turn = np.stack([across, axis, np.cross(across, axis)], axis=-1)
     return mitsuba().load_dict({"type": "envmap", "bitmap": bitmap, "to_world": transform(rigid(turn, np.zeros(3)))})
 
@@ -110,16 +96,14 @@ def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
     film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
     rays = {f"ray{k:05d}": ray | {"origin": (point + FRONT).tolist()} for k, point in enumerate(normal)}
-    return mitsuba().load_dict(
-        {"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}, parallel=False
-    )
+    sensor = {"type": "batch", "film": film | {"width": len(rays)}, "sampler": {"type": SAMPLER}, **rays}
+    return mitsuba().load_dict(sensor, parallel=False)
 
 
 def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, " m"]:
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
     ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})
-    scene = mi.load_dict(
-        {"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}, parallel=False
-    )
+    scene = {"type": "scene", "integrator": integrator, "ball": ball, "light": light, "sensor": sensor}
+    scene = mi.load_dict(scene, parallel=False)
     return np.array(mi.render(scene, seed=seed, spp=SPP), dtype=np.float64)[0, :, 0]

@@ -7,6 +7,7 @@ that one routine makes triangles and smooth normals of them all.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from factorlib.meshes.mesh import Mesh, area_vectors
 
 ROWS, COLUMNS = 60, 96
 
+# profiles (radius, y) of a foot, belly, neck and lip, and of a body, shoulder and neck
 VASE = ((0.0, 0.78), (0.22, 0.77), (0.33, 0.72), (0.31, 0.62), (0.29, 0.52), (0.38, 0.32), (0.55, 0.08), (0.60, -0.14),
         (0.55, -0.38), (0.42, -0.62), (0.36, -0.74), (0.28, -0.78), (0.0, -0.79))  # fmt: skip
 BOTTLE = ((0.0, 0.86), (0.12, 0.85), (0.16, 0.80), (0.155, 0.70), (0.16, 0.52), (0.24, 0.36), (0.38, 0.20), (0.43, 0.02),
@@ -33,7 +35,6 @@ def blob() -> Mesh:
     """A smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """Distance of the surface from the centre."""
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)
@@ -43,23 +44,9 @@ def blob() -> Mesh:
     return star(radius)
 
 
-def vase() -> Mesh:
-    """A solid of revolution: foot, belly, neck and lip."""
-    return revolved(np.array(VASE))
-
-
-def bottle() -> Mesh:
-    """A solid of revolution: body, shoulder and neck."""
-    return revolved(np.array(BOTTLE))
-
-
-SHAPES = {"sphere": sphere, "vase": vase, "bottle": bottle, "blob": blob}
-
-
 def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     """The surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
-    theta = np.arange(1, ROWS) / ROWS * np.pi
-    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    theta, phi = np.arange(1, ROWS) / ROWS * np.pi, np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     sin = np.sin(theta)[:, None]
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
     poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
@@ -76,9 +63,7 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
 
 
-def closed_grid(
-    points: Float[np.ndarray, "r c 3"], top: Float[np.ndarray, "3"], bottom: Float[np.ndarray, "3"]
-) -> Mesh:
+def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.ndarray) -> Mesh:
     """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -99,3 +84,8 @@ def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndar
         np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
+
+
+SHAPES = {
+    "sphere": sphere, "vase": partial(revolved, np.array(VASE)), "bottle": partial(revolved, np.array(BOTTLE)), "blob": blob,
+}  # fmt: skip

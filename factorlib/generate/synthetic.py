@@ -18,13 +18,13 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
-from factorlib.generate.lights import random_light, random_materials
+from factorlib.generate.lights import Rng, Rotation, captured, daylight, random_materials, room
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
-from factorlib.tracing.scene import Material, bsdf, envmap, look, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
@@ -85,9 +85,8 @@ SHOTS = (
 class Scene(msgspec.Struct, frozen=True):
     """What one photo shows: objects in one light.
 
-    light      lat-long map in the camera's y-up frame, radiance in the light's own unit
-    materials  by name, in the order of their labels;  meshes: by shape
-    poses      cam_from_object by the object's name, in the order of `shot.placed`
+    light: lat-long map in the camera's y-up frame, radiance in its own unit;  materials: by name, in the order of their labels
+    meshes: by shape;  poses: cam_from_object by the object's name, in the order of `shot.placed`
     """
 
     shot: Shot
@@ -110,7 +109,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = random_light(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
+        light = light_of(number, world_from_camera, lat_longs, rng, parameters)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = placements(shot, world_from_camera, rng, spread)
         photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
@@ -121,9 +120,26 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     progress(2 * len(SHOTS), 2 * len(SHOTS), "done")
 
 
-def placements(
-    shot: Shot, world_from_camera: Float[np.ndarray, "3 3"], rng: np.random.Generator, spread: float
-) -> dict[str, Pose]:
+def light_of(
+    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, parameters: Parameters
+) -> Float[np.ndarray, "h w 3"]:
+    """The light of photo `number`, in the camera's y-up frame: one of `lat_longs`, or daylight for photo 0, the sun behind the camera
+    to its left or right, and for the others rooms with as many lamps as their number.
+    """
+    rows = parameters.light_rows
+    if lat_longs:
+        return captured(lat_longs[number % len(lat_longs)], rows)
+    seed = int(rng.integers(1 << 24))
+    if number:
+        scene = room(rng, windows=2, lamps=number)
+    else:
+        forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
+        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
+        scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
+    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, parameters.light_spp, seed)
+
+
+def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
     """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
     poses = {}
     for placed in shot.placed:
@@ -153,10 +169,10 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         exposure = float(0.25 / brightest.mean())
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
-    objects = []
-    for placed in shot.placed:
-        pose = {"pose": folder.pose_entry(scene.poses[placed.name])} if placed.posed else {}
-        objects.append({"name": placed.name, "mesh": placed.name, **pose})
+    entries = [
+        ({"name": p.name, "mesh": p.name}, {"pose": folder.pose_entry(scene.poses[p.name])}) for p in shot.placed
+    ]
+    objects = [own | pose if p.posed else own for p, (own, pose) in zip(shot.placed, entries, strict=True)]
     return {
         "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
         "camera": {"focal_px": parameters.focal_px}, "objects": objects,

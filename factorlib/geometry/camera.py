@@ -55,10 +55,6 @@ class Pose(msgspec.Struct, frozen=True):
         """Points of the object frame in camera coordinates."""
         return points @ self.rotation.T + self.translation
 
-    def colmap(self) -> pycolmap.Rigid3d:
-        """The same transform as pycolmap's."""
-        return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), self.translation)
-
 
 def rotation_of_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Turn about `vector` by its length in radians."""
@@ -80,7 +76,6 @@ def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "
     >>> is_pose(np.diag([1.0, 1.0, -1.0]), np.ones(3))
     False
     """
-    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
-    return bool(
-        finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0
-    )
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return False
+    return bool(np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)

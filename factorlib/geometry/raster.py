@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 
+Vectors = Float[np.ndarray, "*n 3"]
 MIN_COSINE = 0.01
 NO_FACE = o3d.t.geometry.RaycastingScene.INVALID_ID
 
@@ -59,9 +60,9 @@ class Caster:
 
     def __init__(self, mesh: Mesh):
         self.mesh, self.centre, self.radius = mesh, mesh.centre, mesh.radius
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         vertices = ((mesh.vertices - self.centre) / self.radius).astype(np.float32)
-        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        self.scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
     def cast(self, camera: Camera, pose: Pose) -> Hits:
         """What the rays through the pixel centres of `camera` meet first."""
@@ -72,13 +73,10 @@ class Caster:
         rays = np.empty((*directions.shape[:-1], 6), np.float32)
         rays[..., :3] = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
         rays[..., 3:] = directions @ (pose.rotation / self.radius)
-        found = self._scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
+        found = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
         face = found["primitive_ids"].numpy()
-        return Hits(
-            depth=found["t_hit"].numpy().astype(float),
-            face=np.where(face == NO_FACE, -1, face.astype(np.int64)),
-            uv=found["primitive_uvs"].numpy().astype(float),
-        )
+        depth, uv = (found[name].numpy().astype(float) for name in ("t_hit", "primitive_uvs"))
+        return Hits(depth, np.where(face == NO_FACE, -1, face.astype(np.int64)), uv)
 
     def labels(self, hits: Hits) -> Int[np.ndarray, "*n"]:
         """Material label of each hit, 0 for none."""
@@ -101,37 +99,18 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
         wins = (hits.face >= 0) & (hits.depth < nearest)
         nearest[wins] = hits.depth[wins]
         maps.depth[wins], maps.view[wins], maps.object[wins] = hits.depth[wins], view[wins], number
-        _fill(maps, wins, hits, caster.mesh, pose)
+        mesh, face, seen_along = caster.mesh, hits.face[wins], view[wins]
+        smooth, own = smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T, face_normals(mesh, face)
+        facing = np.sum((own @ pose.rotation.T) * seen_along, axis=1)
+        side = np.where(facing < 0, -1.0, 1.0)
+        maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], seen_along)
+        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], side < 0, np.abs(facing)
+        cosine = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own)).min(1)
+        maps.facet[wins] = np.arccos(np.minimum(cosine, 1.0))
     return maps
 
 
-def _fill(maps: Maps, wins: Bool[np.ndarray, "h w"], hits: Hits, mesh: Mesh, pose: Pose) -> None:
-    """What the surface of `mesh` adds to `maps` where it `wins`: normals, labels, sides; views are there already."""
-    corners = mesh.faces[hits.face[wins]]  # [n, 3]
-    smooth = smooth_normals(mesh, hits.face[wins], hits.uv[wins]) @ pose.rotation.T
-    own, view = face_normals(mesh, hits.face[wins]), maps.view[wins]
-    flat = own @ pose.rotation.T
-    facing = np.sum(flat * view, axis=1)
-    side = np.where(facing < 0, -1.0, 1.0)
-    maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], view)
-    maps.label[wins] = mesh.face_label[hits.face[wins]]
-    maps.back[wins], maps.edge[wins] = side < 0, np.abs(facing)
-    maps.facet[wins] = facets(mesh.normals[corners], own)
-
-
-def facets(corner: Float[np.ndarray, "n 3 3"], face: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """The largest angle, in radians, between unit normals of a face's three corners and its own, whichever way each points.
-
-    >>> facets(np.array([[[0, 0, 1.0], [0, 0, -1], [0, 1, 0]]]), np.array([[0, 0, 1.0]])).round(3).tolist()
-    [1.571]
-    """
-    cosine = np.abs(np.einsum("nkd,nd->nk", corner, face)).min(1)
-    return np.arccos(np.minimum(cosine, 1.0))
-
-
-def toward_viewer(
-    normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+def toward_viewer(normal: Vectors, view: Vectors) -> tuple[Vectors, Bool[np.ndarray, " n"]]:
     """Normals bent, where n·v < MIN_COSINE, to n·v = MIN_COSINE in the plane of normal and view; and where that was."""
     cosine = np.sum(normal * view, axis=1)
     bent = cosine < MIN_COSINE
@@ -152,6 +131,6 @@ def face_normals(mesh: Mesh, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "
     return unit(np.cross(b - a, c - a))
 
 
-def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def unit(vectors: Vectors) -> Vectors:
     """Vectors of length 1; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+Vectors = Float[np.ndarray, "*n 3"]
+
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
     """`count` nearly uniform unit directions.
@@ -31,14 +33,12 @@ def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
-def mirror_directions(normal: Float[np.ndarray, "*n 3"], view: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def mirror_directions(normal: Vectors, view: Vectors) -> Vectors:
     """2(n·o)n − o: where a mirror at the point would show the light from; all unit, in one frame."""
     return 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
 
 
-def mirror_cells(
-    normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], size: float
-) -> Int[np.ndarray, " n"]:
+def mirror_cells(normal: Vectors, view: Vectors, size: float) -> Int[np.ndarray, " n"]:
     """Number of the cell in which each observation's mirror direction lies; cells are cubes with sides of length `size`."""
     return np.floor((mirror_directions(normal, view) + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
 

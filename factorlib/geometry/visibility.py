@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.raster import Caster, unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import Mesh, area_vectors
 
@@ -30,6 +31,7 @@ LIFT = 1e-3  # of the object's radius: how far off the surface rays start
 GRAZING = 0.02  # sine of the least angle between a ray and its face
 BELOW = -0.1  # n·d of directions that are still cast: normals that are averaged later may lean that far
 ROWS = 4096  # points whose rays are held at once
+Vectors = Float[np.ndarray, "n 3"]
 NORMAL_WEIGHT = 10.0  # spacings of cast points that a difference of 1 between normals counts for
 
 
@@ -52,25 +54,18 @@ class Sight(msgspec.Struct, frozen=True):
     met: UInt16[np.ndarray, "n k"]
 
 
-class Occluders:
-    """The posed objects of one photo as one scene."""
+class Occluders(Caster):
+    """The posed objects of one photo as one mesh, in the camera's frame."""
 
     def __init__(self, meshes: Sequence[Mesh], poses: Sequence[Pose]):
         """poses: cam_from_object; raises ValueError for no mesh at all."""
         vertices = [pose.apply(mesh.vertices) for mesh, pose in zip(meshes, poses, strict=True)]
         first = np.cumsum([0, *map(len, vertices)])
         faces = np.vstack([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
-        vertices = np.vstack(vertices)
-        self.normal = area_vectors(vertices, faces)
-        self.normal /= np.maximum(np.linalg.norm(self.normal, axis=1, keepdims=True), 1e-300)
-        self.material = np.concatenate([mesh.face_label for mesh in meshes]).astype(np.int64) - 1
+        normals, labels = np.vstack([mesh.normals for mesh in meshes]), [mesh.face_label for mesh in meshes]
+        super().__init__(Mesh(np.vstack(vertices), faces, normals, np.concatenate(labels)))
+        self.normal = unit(area_vectors(self.mesh.vertices, faces))  # of faces
         self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
-        used = vertices[np.unique(faces)]
-        self.centre = (used.min(0) + used.max(0)) / 2
-        self.radius = float(np.linalg.norm(used - self.centre, axis=1).max())
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        scaled = ((vertices - self.centre) / self.radius).astype(np.float32)
-        self.scene.add_triangles(o3d.core.Tensor(scaled), o3d.core.Tensor(faces.astype(np.uint32)))
 
     def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
         """What the rays through the centres of pixels (x, y) meet first."""
@@ -80,9 +75,7 @@ class Occluders:
         depth = np.where(found, distance * self.radius, 0.0)
         return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
 
-    def seen_from(
-        self, points: Points, shading_normal: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "k 3"]
-    ) -> Sight:
+    def seen_from(self, points: Points, shading_normal: Vectors, directions: Float[np.ndarray, "k 3"]) -> Sight:
         """What the points see along `directions` (camera frame, unit)."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)
@@ -93,15 +86,12 @@ class Occluders:
             along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
             hidden = self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy()
             seen[rows][row, k] = np.where(hidden, 0, 255)
-            met[rows][row[hidden], k[hidden]] = self._codes(place[hidden], along[hidden])
+            distance, face, normal = self._first(place[hidden], along[hidden])
+            material = np.where(np.isfinite(distance), self.mesh.face_label[face].astype(np.int64) - 1, -1)
+            met[rows][row[hidden], k[hidden]] = met_codes(material, normal)
         return Sight(seen, met)
 
-    def _codes(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
-        """Of what rays meet first."""
-        distance, face, normal = self._first(start, along)
-        return met_codes(np.where(np.isfinite(distance), self.material[face], -1), normal)
-
-    def _first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
+    def _first(self, start: Vectors, along: Vectors) -> tuple[np.ndarray, ...]:
         """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and the face's normal
         [n, 3], turned against the ray."""
         hits = self.scene.cast_rays(self._rays(start, along), nthreads=1)
@@ -116,13 +106,8 @@ class Occluders:
 
 
 def sight(
-    occluders: Occluders,
-    camera: Camera,
-    pixels: Int[np.ndarray, "n 2"],
-    shading_normal: Float[np.ndarray, "n 3"],
-    directions: int,
-    most_points: int,
-) -> Sight | None:
+    occluders: Occluders, camera: Camera, pixels: Int[np.ndarray, "n 2"], shading_normal: Vectors, directions: int, most_points: int
+) -> Sight | None:  # fmt: skip
     """What the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all."""
     x, y = pixels.T
     points = occluders.points_under(camera, x, y)
@@ -133,7 +118,10 @@ def sight(
         return None
     if len(cast) == len(x):
         return seen
-    near = nearest(points.place[cast], shading_normal[cast], points.place, shading_normal)
+    # of the cast points the nearest one, in place (in units of their spacing) and in normal
+    spacing = max(float(np.median(cKDTree(some.place).query(some.place, k=2)[0][:, 1])), 1e-12)
+    places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
+    near = cKDTree(places[cast]).query(places)[1]
     return Sight(seen.visibility[near], seen.met[near])
 
 
@@ -146,15 +134,3 @@ def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int)
     """
     size = int(np.ceil(np.sqrt(len(x) / most)))
     return np.sort(np.unique(np.column_stack([y // size, x // size]), axis=0, return_index=True)[1])
-
-
-def nearest(
-    place: Float[np.ndarray, "m 3"],
-    normal: Float[np.ndarray, "m 3"],
-    place_asked: Float[np.ndarray, "n 3"],
-    normal_asked: Float[np.ndarray, "n 3"],
-) -> Int[np.ndarray, " n"]:
-    """Of the m surface points the one nearest to each of n, in place (in units of their spacing) and in normal."""
-    spacing = max(float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])), 1e-12)
-    tree = cKDTree(np.column_stack([place / spacing, NORMAL_WEIGHT * normal]))
-    return tree.query(np.column_stack([place_asked / spacing, NORMAL_WEIGHT * normal_asked]))[1]

@@ -112,12 +112,12 @@ def _step(
     lit:   the fitted pixels in their light, whose whitened residual is `residual`
     """
     seen = rendered(moving.caster, moving.target, moving.camera, state)
-    contours, free = normal_equations(seen, moving.target, moving.prior), moving.prior.free
+    (by_contours, pull), free = normal_equations(seen, moving.target, moving.prior), moving.prior.free
     jacobian = photometric_jacobian(moving, state, every, rows, lit.light, free)
     information, gradient = projected_equations(jacobian, residual, lit)
-    hessian = contours.information[:free, :free] + information + np.diag(DAMPING[:free])
+    hessian = by_contours[:free, :free] + information + np.diag(DAMPING[:free])
     step = np.zeros(7)
-    step[:free] = -np.linalg.solve(hessian, contours.gradient[:free] + gradient)
+    step[:free] = -np.linalg.solve(hessian, pull[:free] + gradient)
     return np.clip(step, -LARGEST_STEP, LARGEST_STEP)
 
 

@@ -49,7 +49,7 @@ def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype:
     elif name == "network":
         from factorlib.reflection.network import Network as Kind
 
-        options |= {"weights": weights} if weights is not None else {}
+        options["weights"] = weights
     else:
         from factorlib.reflection.paper_network import PaperNetwork as Kind
     return Kind(**options)

@@ -38,21 +38,13 @@ REMAINDER = torch.tensor(
 )
 
 
-def normal_mean_cosine(sharpness: Tensor, nz: Tensor) -> Tensor:
-    """Equation (1)."""
-    return _normal(*lobe_moments(sharpness), nz.clamp(-1, 1))
-
-
-def _normal(mean: Tensor, along: Tensor, across: Tensor, c: Tensor) -> Tensor:
-    m = mean * c
-    deviation = torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
+def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> Tensor:
+    """`diffuse`, from λ' and the lobe's moments."""
+    c = nz.clamp(-1, 1)
+    m, deviation = mean * c, torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
     u = m / deviation
     inside = 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5))
-    return inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
-
-
-def _remainder(mean: Tensor, c: Tensor) -> Tensor:
-    """(1 − t̄)² Σ a_ij T_i(2t̄ − 1) c^2j."""
+    normal = inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)  # (1)
     x, square = 2 * mean - 1, c * c
     chebyshev = [1.0, x]
     for _ in range(len(REMAINDER) - 2):
@@ -60,13 +52,7 @@ def _remainder(mean: Tensor, c: Tensor) -> Tensor:
     value = 0.0
     for column in reversed(REMAINDER.T.tolist()):
         value = value * square + sum(t * a for a, t in zip(column, chebyshev, strict=True))
-    return (1 - mean) * (1 - mean) * value
-
-
-def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> Tensor:
-    """`diffuse`, from λ' and the lobe's moments."""
-    c = nz.clamp(-1, 1)
-    return 2 / lam * (_normal(mean, along, across, c) + _remainder(mean, c)).clamp_min(0)
+    return 2 / lam * (normal + (1 - mean) * (1 - mean) * value).clamp_min(0)
 
 
 def diffuse(sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:

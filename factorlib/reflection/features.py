@@ -33,11 +33,6 @@ class Layers(msgspec.Struct, frozen=True):
         weights, biases = ([t.to(dtype) for t in tensors] for tensors in (self.weights, self.biases))
         return Layers(self.mean.to(dtype), self.scale.to(dtype), weights, biases)
 
-    def copy(self) -> Layers:
-        """The same weights, apart from the network's own and off torch's graph."""
-        weights, biases = ([t.detach().clone() for t in tensors] for tensors in (self.weights, self.biases))
-        return Layers(self.mean, self.scale, weights, biases)
-
 
 def fading(sharpness: Tensor) -> Tensor:
     """What is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
@@ -51,32 +46,13 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
     u = form.ni / form.deviation
     height = nz * torch.sqrt(form.sharpness)  # of the axis above the horizon, in widths of the lobe
     mirror = form.sharpness * (1 + oz - 2 * no * nz).clamp_min(0)  # λ'(1 − z·m), m the mirror direction
-    return (
-        torch.log(alpha),
-        log_width,
-        form.ratio,
-        no,
-        torch.log(no.clamp_min(1e-4) + 0.02),
-        nz,
-        oz,
-        form.px,
-        form.py * form.py,
-        form.misfit / (1 + form.misfit),
-        torch.log(form.density + 1e-5),
-        torch.log1p(form.spread),
-        torch.log1p(torch.log1p(form.distance)),
-        form.ni,
-        torch.log(form.deviation + 1e-3),
-        u * torch.rsqrt(4 + u * u),
-        u * torch.rsqrt(0.2 + u * u),
-        form.cosine / (form.cosine + alpha),
-        form.lit,
-        no / (no + alpha),
-        height * torch.rsqrt(1 + height * height),
-        height * torch.rsqrt(16 + height * height),
-        mirror / (1 + mirror),
-        mirror / (16 + mirror),
-    )
+    of_inputs = torch.log(alpha), log_width, form.ratio, no, torch.log(no.clamp_min(1e-4) + 0.02), nz, oz
+    of_place = form.px, form.py * form.py, form.misfit / (1 + form.misfit)
+    of_density = torch.log(form.density + 1e-5), torch.log1p(form.spread), torch.log1p(torch.log1p(form.distance))
+    of_light = form.ni, torch.log(form.deviation + 1e-3), u * torch.rsqrt(4 + u * u), u * torch.rsqrt(0.2 + u * u)
+    of_horizon = form.cosine / (form.cosine + alpha), form.lit, no / (no + alpha)
+    of_horizon += height * torch.rsqrt(1 + height * height), height * torch.rsqrt(16 + height * height)
+    return *of_inputs, *of_place, *of_density, *of_light, *of_horizon, mirror / (1 + mirror), mirror / (16 + mirror)
 
 
 def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:

@@ -20,6 +20,8 @@ part of the light above the horizon.
 
 from __future__ import annotations
 
+from collections import namedtuple
+
 import msgspec
 import torch
 from torch import Tensor
@@ -45,7 +47,10 @@ LEAST_HN, LARGEST_P = 1e-3, 0.998  # (n·h)² and |p|² where h is perpendicular
 SHARE = 2.0  # curvature of −log D at its peak over k, as the blend takes it
 WIDE = 0.03  # a lobe's V is no wider than 1/WIDE: p ends at the unit circle
 RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
-PEAK = 3.0  # −∂²/∂p² of log D is 2·PEAK·k/(1 + kp²)·(2/3) near its peak: between 4k there and 2k as a whole
+# PEAK k / (1 + kp²): curvature of −log D as the step to the mode takes it, between its 4k at the peak and 2k as a whole
+PEAK = 3.0
+# where o and z point, in the frame with n = (0, 0, 1) and o = (so, 0, no), z = (zx, zy, nz): so, no, zx, zy, nz
+Directions = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Filtered(msgspec.Struct):
@@ -66,63 +71,35 @@ class Filtered(msgspec.Struct):
     cosine: Tensor  # mean n·i of that
 
 
-class Width(msgspec.Struct):
-    """How wide a lobe is: λ, λ' of (2), and its variance along its axis."""
-
-    sharpness: Tensor
-    plane: Tensor
-    along: Tensor
-
-
-class Directions(msgspec.Struct):
-    """Where o and z point, in the frame with n = (0, 0, 1) and o = (so, 0, no): z = (zx, zy, nz)."""
-
-    so: Tensor
-    no: Tensor
-    zx: Tensor
-    zy: Tensor
-    nz: Tensor
-
-
-class Expansion(msgspec.Struct):
-    """The lobe about p*: JᵀJ with its determinant, c of (2), i*·z, n·i* and the derivatives of n·i by p."""
-
-    xx: Tensor
-    yy: Tensor
-    xy: Tensor
-    det: Tensor
-    cx: Tensor
-    cy: Tensor
-    along: Tensor
-    ni: Tensor
-    nix: Tensor
-    niy: Tensor
+# the lobe about p*: JᵀJ with its determinant, c of (2), i*·z, n·i* and the derivatives of n·i by p
+Expansion = namedtuple("Expansion", ("xx", "yy", "xy", "det", "cx", "cy", "along", "ni", "nix", "niy"))
 
 
 def filtered_specular(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
     """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over n·i > 0, from tensors of one shape."""
-    return filtered(alpha, Width(sharpness, gaussian_sharpness(sharpness), lobe_moments(sharpness)[1]), no, nz, oz)
+    return filtered(alpha, sharpness, gaussian_sharpness(sharpness), lobe_moments(sharpness)[1], no, nz, oz)
 
 
-def filtered(alpha: Tensor, width: Width, no: Tensor, nz: Tensor, oz: Tensor) -> Filtered:
-    """`filtered_specular`, of a lobe whose moments are known."""
-    sharpness, lam = width.sharpness, width.plane
+def filtered(
+    alpha: Tensor, sharpness: Tensor, lam: Tensor, variance: Tensor, no: Tensor, nz: Tensor, oz: Tensor
+) -> Filtered:
+    """`filtered_specular`, of a lobe whose λ' of (2) and variance along its axis are known."""
     alpha, no = alpha.clamp(LEAST_ALPHA, 1), no.clamp(LEAST_COSINE, 1)
     so = torch.sqrt((1 - no * no).clamp_min(1e-8))
     zx = (oz - no * nz) / so
     zy = torch.sqrt((1 - nz * nz - zx * zx).clamp_min(1e-8))
     k = (1 - alpha * alpha) / (alpha * alpha)
-    directions = Directions(so, no, zx, zy, nz)
+    directions = so, no, zx, zy, nz
     px, py = _blend(k, lam, oz, directions)
     px, py = _mode(k, lam, px, py, directions)
     at = _expansion(lam, px, py, directions)
     misfit = 0.5 * sharpness * (1 - at.along) ** 2
     density, spread = _student(k, lam, at, sharpness / lam, misfit)
-    r = _curvature(k, px, py) / lam
+    r = PEAK * k / (1 + k * (px * px + py * py)) / lam
     mx, my, total = _product(r, at)
     ni = at.ni + at.nix * (mx - px) + at.niy * (my - py)
-    variance = (at.nix * at.nix * (at.yy + r) + at.niy * at.niy * (at.xx + r) - 2 * at.nix * at.niy * at.xy) / total
-    deviation = torch.sqrt(variance / lam + width.along * ni * ni + 1e-8)
+    spread_of_ni = (at.nix * at.nix * (at.yy + r) + at.niy * at.niy * (at.xx + r) - 2 * at.nix * at.niy * at.xy) / total
+    deviation = torch.sqrt(spread_of_ni / lam + variance * ni * ni + 1e-8)
     u = LOGISTIC * (ni / deviation).clamp_min(-20)
     lit = torch.sigmoid(u)
     cosine = deviation * softplus(u) / (LOGISTIC * lit)
@@ -134,7 +111,8 @@ def filtered(alpha: Tensor, width: Width, no: Tensor, nz: Tensor, oz: Tensor) ->
 
 def _blend(k: Tensor, lam: Tensor, oz: Tensor, directions: Directions) -> tuple[Tensor, Tensor]:
     """p between n and the half vector of o and z, by the widths and weights of light and D there (isotropic)."""
-    x, y, z = directions.so + directions.zx, directions.zy, directions.no + directions.nz
+    so, no, zx, zy, nz = directions
+    x, y, z = so + zx, zy, no + nz
     length = torch.sqrt(x * x + y * y + z * z + 1e-6)
     x, y, z = x / length, y / length, z / length
     variance = 1 / (lam * (2 + 2 * oz).clamp_min(LEAST_HALF))
@@ -151,7 +129,7 @@ def _blend(k: Tensor, lam: Tensor, oz: Tensor, directions: Directions) -> tuple[
 def _mode(k: Tensor, lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> tuple[Tensor, Tensor]:
     """One Gauss–Newton step from p to the mode of light times D: (JᵀJ + r)⁻¹ JᵀJ c, kept inside the disc."""
     at = _expansion(lam, px, py, directions)
-    x, y, _ = _product(_curvature(k, px, py) / lam, at)
+    x, y, _ = _product(PEAK * k / (1 + k * (px * px + py * py)) / lam, at)
     outside = torch.sqrt((x * x + y * y) / LARGEST_P + 1e-12).clamp_min(1.0)
     return x / outside, y / outside
 
@@ -164,14 +142,9 @@ def _product(r: Tensor, at: Expansion) -> tuple[Tensor, Tensor, Tensor]:
     return x, at.cy - shrink * ((at.xx + r) * at.cy - at.xy * at.cx), total
 
 
-def _curvature(k: Tensor, px: Tensor, py: Tensor) -> Tensor:
-    """Curvature of −log D at p, as the step to the mode takes it; PEAK says why."""
-    return PEAK * k / (1 + k * (px * px + py * py))
-
-
 def _expansion(lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> Expansion:
     """The lobe of width `lam` = λ' about p."""
-    so, no, zx, zy, nz = directions.so, directions.no, directions.zx, directions.zy, directions.nz
+    so, no, zx, zy, nz = directions
     hn = torch.sqrt((1 - px * px - py * py).clamp_min(LEAST_HN))
     oh = so * px + no * hn
     tx, ty = px / hn, py / hn
@@ -185,8 +158,7 @@ def _expansion(lam: Tensor, px: Tensor, py: Tensor, directions: Directions) -> E
     xy = 4 * (xx1 * yy1 + xx2 * yy2 + xx3 * yy3)
     bx = 2 * (xx1 * zx + xx2 * zy + xx3 * nz)
     by = 2 * (yy1 * zx + yy2 * zy + yy3 * nz)
-    det = xx * yy - xy * xy
-    det = det.clamp_min(1e-7)
+    det = (xx * yy - xy * xy).clamp_min(1e-7)
     along = 2 * oh * (px * zx + py * zy + hn * nz) - (so * zx + no * nz)
     cx, cy = px + (yy * bx - xy * by) / det, py + (xx * by - xy * bx) / det
     return Expansion(xx, yy, xy, det, cx, cy, along, 2 * oh * hn - no, 2 * xx3, 2 * yy3)

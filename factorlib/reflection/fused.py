@@ -29,7 +29,7 @@ from torch import Tensor
 from factorlib.errors import InputError
 from factorlib.reflection.closed_form import diffuse_of_moments
 from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fading, specular_columns
-from factorlib.reflection.filtering import Width, filtered
+from factorlib.reflection.filtering import filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST
 from factorlib.reflection.tape import Tape, Value
@@ -60,23 +60,20 @@ class Fused:
         """A copy in another process compiles, or finds in the user's cache, its own."""
         return Fused, self.made_of
 
-    def __call__(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> list[Tensor]:
-        """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""
-        out = self._filled(6, roughness, sharpness, no, nz, oz)
-        out[1] *= 2 * roughness
-        return out
-
     def value(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
         """The value alone, in about a third of the time."""
-        return self._filled(1, roughness, sharpness, no, nz, oz)[0]
+        return self(roughness, sharpness, no, nz, oz, results=1)[0]
 
-    def _filled(self, count: int, roughness: float, sharpness: Tensor, *cosines: Tensor) -> list[Tensor]:
+    def __call__(self, roughness: float, sharpness: Tensor, *cosines: Tensor, results: int = 6) -> list[Tensor]:
+        """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""
         no, nz, oz = (t.detach().float().contiguous() for t in cosines)
-        out = [torch.empty_like(nz) for _ in range(count)]
+        out = [torch.empty_like(nz) for _ in range(results)]
         pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # the rest are null
         lobes = _lobe_table_of(sharpness.detach().double().numpy().tobytes())
         arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
         self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
+        for by_alpha in out[1:2]:
+            by_alpha *= 2 * roughness
         return out
 
 
@@ -91,24 +88,20 @@ def _lobe_table_of(sharpness: bytes) -> Tensor:
     return torch.stack([*(t.detach() for t in moments), *slopes]).float().contiguous()
 
 
-def specular_on(tape: Tape) -> tuple[Value, tuple]:
-    """The formula and the features, of inputs named as in PLACES."""
-    names = ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")
-    alpha, sharpness, lam, along, no, nz, oz = (tape.input(name) for name in names)
-    form = filtered(alpha, Width(sharpness, lam, along), no, nz, oz)
-    return form.value, specular_columns(alpha, no, nz, oz, form)
-
-
-def diffuse_on(tape: Tape) -> tuple[Value, tuple]:
-    """The formula and the features of the diffuse part, of inputs named as in PLACES."""
-    inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
-    return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
+def recorded(part: str, tape: Tape) -> tuple[Value, tuple]:
+    """The formula and the features of `part`, of inputs named as in PLACES."""
+    if part == "diffuse":
+        inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
+        return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
+    inputs = [tape.input(name) for name in ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")]
+    form = filtered(*inputs)
+    return form.value, specular_columns(inputs[0], *inputs[4:], form)
 
 
 def source(part: str, features: int, width: int, depth: int) -> str:
     """kernel.c with the formulas of `part` written in."""
     tape = Tape()
-    formula, columns = {"specular": specular_on, "diffuse": diffuse_on}[part](tape)
+    formula, columns = recorded(part, tape)
     fade = fading(tape.input("sharpness"))
     forward = tape.c_code({f"feature[{k}][l]": c for k, c in enumerate(columns)} | {"formula[l]": formula}, PLACES)
     t = torch.tanh(tape.input("net") / LARGEST)
@@ -116,29 +109,23 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     result = formula * grown
     inside = tape.apply("above", MOST, result)  # beyond, the result is MOST and its derivatives are nil
     by_net = inside * result * fade * (1 - t * t)
-    seeds = [
-        (formula, inside * grown),
-        (fade, inside * result * LARGEST * t),
-        *((c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)),
-    ]
-    by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(
-        seeds, [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)]
-    )
+    seeds = [(formula, inside * grown), (fade, inside * result * LARGEST * t)]
+    seeds += [(c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)]
+    inputs = [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)]
+    by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, inputs)
     by_log_sharpness = sum(slope * tape.input(f"d{name}") for name, slope in zip(MOMENTS, by_moments, strict=True))
     results = (result.clamp_max(MOST), by_alpha, by_log_sharpness, by_no, by_nz, by_oz)
     places = PLACES | {"formula": "formula[l]"} | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
     backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
     value = tape.c_code({"result[0][l]": (tape.input("formula") * grown).clamp_max(MOST)}, places)
     text = (Path(__file__).parent / "kernel.c").read_text()
-    before, after = text.split("      FORWARD\n")
-    middle, after = after.split("        BACKWARD\n")
-    between, end = after.split("        VALUE\n")
+    for place, lines in (("      FORWARD\n", forward), ("        BACKWARD\n", backward), ("        VALUE\n", value)):
+        code = "".join(line + "\n" for line in lines)
+        for name in ("expf", "logf", "log1pf", "erfcf"):  # kernel.c has its own
+            code = code.replace(f"{name}(", f"{name[:-1]}_(")
+        text = text.replace(place, code)
     sizes = {"FEATURES": features, "WIDTH": width, "DEPTH": depth, "MOMENTS": len(MOMENTS)}
-    sizes = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
-    forward, backward, value = ("\n".join(lines) + "\n" for lines in (forward, backward, value))
-    for name in ("expf", "logf", "log1pf", "erfcf"):  # kernel.c has its own
-        forward, backward, value = (t.replace(f"{name}(", f"{name[:-1]}_(") for t in (forward, backward, value))
-    return sizes + before + forward + middle + backward + between + value + end
+    return "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + text
 
 
 @lru_cache(maxsize=8)
@@ -185,8 +172,7 @@ def fused(part: str, layers: Layers) -> Fused | None:
     except (OSError, subprocess.SubprocessError) as error:
         # not torch instead: which form runs is in the keys of steps, and nothing there knows that this one failed
         said = " ".join((getattr(error, "stderr", None) or str(error)).split())
+        cure = "mend the compiler, name another (CC=gcc), or take torch, about ten times slower: FACTORLIB_FUSED=0"
         raise InputError(
-            f"the C code of the reflection network did not compile ({said})",
-            key="CC",
-            cure="mend the compiler, name another (CC=gcc), or take torch, about ten times slower: FACTORLIB_FUSED=0",
+            f"the C code of the reflection network did not compile ({said})", key="CC", cure=cure
         ) from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, get_args
 
 import msgspec
 import torch
@@ -16,7 +16,6 @@ PerLobe, PerPoint, PerPair = Float[Tensor, "*p"], Float[Tensor, "*n"], Float[Ten
 CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
 
 
-@runtime_checkable
 class LobesLike(Protocol):
     """Lobes weight · exp(λ(ω·axis − 1)), as tensors or arrays: axis [p, 3] unit, sharpness λ [p], weight [p, 3]."""
 
@@ -25,7 +24,6 @@ class LobesLike(Protocol):
     weight: Any
 
 
-@runtime_checkable
 class MaterialLike(Protocol):
     """A reflectance: diffuse k_d [3], specular k_s [3], roughness [] with α = roughness²."""
 
@@ -69,12 +67,8 @@ class Operator:
     def response(self, roughness: Tensor, sharpness: PerLobe, no: PerPoint, nz: PerPair, oz: PerPair) -> Response:
         """Values and derivatives together; nothing is left on torch's graph."""
         rows = max(1, CHUNK // max(nz.shape[1], 1))
-        parts = [
-            self._response(roughness, sharpness, no[i : i + rows], nz[i : i + rows], oz[i : i + rows])
-            for i in range(0, len(nz), rows)
-        ]
-        if len(parts) == 1:
-            return parts[0]
+        chunks = zip(no.split(rows), nz.split(rows), oz.split(rows), strict=True)
+        parts = [self._response(roughness, sharpness, *chunk) for chunk in chunks]
         return Response(*(torch.cat([getattr(part, field) for part in parts]) for field in Response.__struct_fields__))
 
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:

@@ -20,7 +20,7 @@ Activation    SiLU, so that derivatives are continuous; at the end s tanh(x/s), 
 Range         sharpness and roughness are clamped to what was rendered, `SHARPNESS` and `ROUGHNESS`.
 Pixels        50 of each of 4000 spheres, lobes uniform in direction, seen from afar, so that every view is (0, 0, −1):
               `factorlib.generate.lobe_spheres`; Mitsuba renders them in place of Blender.
-Training      `paper_training`: relative error, Adam.
+Training      `training.trained_plainly`: relative error, Adam.
 Frame         normals and lobes of every azimuth about the camera's axis, as in photographs.  An operator is asked for
               scalars only, so the networks are asked in the frame where the view is (0, 0, −1) and the normal in the
               plane y = 0, or, for the diffuse part, where the normal is (0, 0, −1).  To have seen that azimuth alone
@@ -87,16 +87,10 @@ def soft_root(square: Tensor) -> Tensor:
 
 def diffuse_inputs(normal: Vector, axis: Vector, sharpness: Tensor) -> Float[Tensor, "*b 7"]:
     """Inputs of the diffuse network: normal, axis (three components each, camera frame), log σ."""
-    return torch.stack([*normal, *axis, log_precision(sharpness)], -1)
+    return torch.stack([*normal, *axis, torch.log(sharpness.clamp(*SHARPNESS) / 2)], -1)
 
 
-def specular_inputs(
-    normal: Vector, half: Vector, axis: Vector, sharpness: Tensor, roughness: Tensor
-) -> Float[Tensor, "*b 11"]:
-    """Inputs of the specular network: normal, half vector, axis (three components each, camera frame), log σ, roughness."""
-    return torch.stack([*normal, *half, *axis, log_precision(sharpness), roughness.clamp(*ROUGHNESS)], -1)
-
-
-def log_precision(sharpness: Tensor) -> Tensor:
-    """log σ."""
-    return torch.log(sharpness.clamp(*SHARPNESS) / 2)
+def specular_inputs(normal: Vector, half: Vector, axis: Vector, sharpness: Tensor, roughness: Tensor) -> Tensor:
+    """Inputs [*b, 11] of the specular network: normal, half vector, axis (three components each, camera frame), log σ, roughness."""
+    precision = torch.log(sharpness.clamp(*SHARPNESS) / 2)
+    return torch.stack([*normal, *half, *axis, precision, roughness.clamp(*ROUGHNESS)], -1)

@@ -64,7 +64,7 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
             if not len(todo):
                 break
             previous = value[todo]
-            value[todo] = finer = in_chunks(nodes, *(t[todo] for t in scalars))
+            value[todo] = finer = specular_quadrature(nodes, *(t[todo] for t in scalars))
             level[todo] = k
             agrees = (finer - previous).abs() <= tolerance * (finer + floor[todo])
             todo = todo[~agrees] if k > first else todo
@@ -73,33 +73,30 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
     for k, nodes in enumerate(LEVELS):
         where = torch.nonzero(level == k)[:, 0]
         if len(where):
-            value = value.index_put((where,), in_chunks(nodes, *(t[where] for t in scalars)))
+            value = value.index_put((where,), specular_quadrature(nodes, *(t[where] for t in scalars)))
     return value
 
 
-def in_chunks(nodes: int, *scalars: Tensor) -> Float[Tensor, " b"]:
-    """`specular_quadrature`, of so many elements at a time that memory stays small; scalars [b]."""
+def specular_quadrature(nodes: int, *scalars: Tensor) -> Float[Tensor, " b"]:
+    """∫ SG D G / (4 n·o) di with `nodes` nodes in each direction of each piece, about the sharper factor.
+
+    scalars: α, λ, n·o, n·z, o·z, [b] each, taken so many at a time that memory stays small
+    """
+    values = []
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
-    firsts = range(0, len(scalars[0]), rows)
-    return torch.cat([specular_quadrature(nodes, *(t[i : i + rows] for t in scalars)) for i in firsts])
-
-
-def specular_quadrature(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-    """∫ SG D G / (4 n·o) di with `nodes` nodes in each direction of each piece, about the sharper factor."""
-    no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
-    about_normal = sharper_is_the_normal(alpha, sharpness, no, nz, oz)
-    value = torch.zeros_like(alpha)
-    for rule, chosen in ((about_half_vector, about_normal), (about_lobe, ~about_normal)):
-        where = torch.nonzero(chosen)[:, 0]
-        if len(where):
-            value = value.index_put((where,), rule(nodes, *(t[where] for t in (alpha, sharpness, no, nz, oz))))
-    return value * smith(alpha, no) / (4 * no)
-
-
-def sharper_is_the_normal(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-    """D is narrower than the lobe, whose axis is not so far from the mirror direction that it does not see D's peak."""
-    deviation = 1 / torch.sqrt(sharpness)
-    return (2 * alpha * torch.sqrt(no) < deviation) & (mirror_angle(no, nz, oz) < reach_of(sharpness) + 0.5 * deviation)
+    for alpha, sharpness, no, nz, oz in zip(*(t.split(rows) for t in scalars), strict=True):
+        no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
+        # D is narrower than the lobe, whose axis is not so far from the mirror direction that it does not see D's peak
+        deviation = 1 / torch.sqrt(sharpness)
+        about_normal = 2 * alpha * torch.sqrt(no) < deviation
+        about_normal &= mirror_angle(no, nz, oz) < reach_of(sharpness) + 0.5 * deviation
+        value = torch.zeros_like(alpha)
+        for rule, chosen in ((about_half_vector, about_normal), (about_lobe, ~about_normal)):
+            where = torch.nonzero(chosen)[:, 0]
+            if len(where):
+                value = value.index_put((where,), rule(nodes, *(t[where] for t in (alpha, sharpness, no, nz, oz))))
+        values.append(value * smith(alpha, no) / (4 * no))
+    return torch.cat(values)
 
 
 def reach_of(sharpness: Tensor) -> Tensor:
@@ -126,19 +123,17 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
 
     def integrand(theta: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
-        """Lobe, GGX and shadowing at directions in the lobe's frame, times sin θ."""
         cos, sin = torch.cos(theta), torch.sin(theta)
         ni, oi = nz * cos + sz * sin * cos_phi, oz * cos + sin * (ox * cos_phi + oy * sin_phi)
         nh = (no + ni) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
         lobe = torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2)
         return lobe * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
 
-    def cos_arc(theta: Tensor) -> Tensor:
-        """Cosine of the azimuth beyond which light comes from below the surface."""
-        return -nz * torch.cos(theta) / (sz * torch.sin(theta))
-
     circles = over_circles(nodes, *full, integrand)  # before the arcs' limits: derivatives are summed in this order
-    return circles + over_arcs(nodes, a.minimum(reach), b.minimum(reach), integrand, cos_arc)
+    limits = a.minimum(reach), b.minimum(reach)
+    return circles + over_arcs(
+        nodes, *limits, integrand, lambda theta: -nz * torch.cos(theta) / (sz * torch.sin(theta))
+    )
 
 
 def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
@@ -155,19 +150,15 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     y_least, y_a, y_b = (torch.asinh(t / alpha) for t in (least, (math.pi / 2 - tilt) / 2, (math.pi / 2 + tilt) / 2))
 
     def integrand(y: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
-        """Lobe, GGX and shadowing at half vectors θ = α sinh y, times the Jacobian of y."""
         theta = alpha * torch.sinh(y)
         cos, sin = torch.cos(theta), torch.sin(theta)
         oh, zh = no * cos + so * sin * cos_phi, nz * cos + sin * (zx * cos_phi + zy * sin_phi)
         lobe = torch.exp(-sharpness * (1 + oz - 2 * oh * zh))
         return lobe * ggx(alpha, cos) * smith(alpha, 2 * oh * cos - no) * 4 * oh * sin * alpha * torch.cosh(y)
 
-    def cos_arc(y: Tensor) -> Tensor:
-        """Cosine of the azimuth beyond which light comes from below the surface."""
-        return -no / (so * torch.tan(2 * alpha * torch.sinh(y)))
-
     circles = over_circles(nodes, y_least.minimum(y_a), y_a, integrand)  # first, as above
-    return circles + over_arcs(nodes, y_least.clamp(y_a, y_b), y_b, integrand, cos_arc)
+    limits = y_least.clamp(y_a, y_b), y_b
+    return circles + over_arcs(nodes, *limits, integrand, lambda y: -no / (so * torch.tan(2 * alpha * torch.sinh(y))))
 
 
 def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor]) -> Float[Tensor, " b"]:
@@ -179,10 +170,9 @@ def over_circles(nodes: int, low: Tensor, high: Tensor, integrand: Callable[...,
     return (inner * w * (high - low)[:, :, 0]).sum(1)
 
 
-def over_arcs(
-    nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable[[Tensor], Tensor]
-) -> Float[Tensor, " b"]:
-    """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], whose length goes like a root at both ends."""
+def over_arcs(nodes: int, low: Tensor, high: Tensor, integrand: Callable[..., Tensor], cos_arc: Callable) -> Tensor:
+    """∫ over arcs |φ| < arccos(cos_arc) at radii [low, high], beyond which light comes from below the surface; their length goes
+    like a root at both ends."""
     x, w = gauss(nodes, low.dtype)
     radius = low + (high - low) * (torch.sin(math.pi / 2 * x) ** 2)[None, :, None]
     stretch = (high - low)[:, :, 0] * math.pi / 2 * torch.sin(math.pi * x)

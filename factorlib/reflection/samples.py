@@ -1,4 +1,5 @@
-"""Samples of the reflection operator's inputs, for training and for measuring, spread evenly over what occurs in a solve.
+"""Samples of the reflection operator's inputs, for training and for measuring, spread evenly over what occurs in a solve, and
+tables of an operator's errors |R − S| / (S + E/100) there.
 
 α log-uniform in [.01, 1], sharpness log-uniform in [.3, 5000], n·o uniform in [.02, 1]; the lobe's axis about the mirror
 direction with a spread of 2√(α²/2 + 1/λ) for two thirds, uniform on the sphere for one third.
@@ -21,32 +22,11 @@ from factorlib.reflection.reference import converged, diffuse_quadrature
 
 Range = tuple[float, float]  # least and greatest
 GRAZING = 0.3  # n·o below which most of the hard cases lie
-
-
-class Samples(msgspec.Struct, frozen=True):
-    """The five scalars of the specular part and its value, float64."""
-
-    alpha: Float[Tensor, " n"]
-    sharpness: Float[Tensor, " n"]
-    no: Float[Tensor, " n"]
-    nz: Float[Tensor, " n"]
-    oz: Float[Tensor, " n"]
-    value: Float[Tensor, " n"]
-
-    def inputs(self) -> tuple[Tensor, ...]:
-        """α, λ, n·o, n·z, o·z: the arguments of the specular formula."""
-        return self.alpha, self.sharpness, self.no, self.nz, self.oz
-
-    def scale(self) -> Float[Tensor, " n"]:
-        """S + E/100, E the lobe's integral: what errors are measured in."""
-        return self.value + lobe_integral(self.sharpness) / 100
-
-    def __len__(self) -> int:
-        return len(self.alpha)
-
-    def joined(self, other: Samples) -> Samples:
-        """These samples, then the others."""
-        return Samples(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in self.__struct_fields__))
+QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "worst": 1.0}
+ROUGHNESS = (0.1, 0.18, 0.32, 0.56, 1.0)  # edges of the bins of tables
+SHARPNESS = (0.3, 3.0, 30.0, 300.0, 5000.0)
+COSINE = (0.0, 0.1, 0.3, 0.6, 1.0)
+DEGREES = (0.0, 10.0, 30.0, 90.0, 180.0)
 
 
 class DiffuseSamples(msgspec.Struct, frozen=True):
@@ -57,11 +37,24 @@ class DiffuseSamples(msgspec.Struct, frozen=True):
     value: Float[Tensor, " n"]
 
     def scale(self) -> Float[Tensor, " n"]:
-        """S + E/100, as for the specular part."""
+        """S + E/100, E the lobe's integral: what errors are measured in."""
         return self.value + lobe_integral(self.sharpness) / 100
 
-    def __len__(self) -> int:
-        return len(self.sharpness)
+
+class Samples(DiffuseSamples, frozen=True):
+    """The five scalars of the specular part and its value, float64."""
+
+    alpha: Float[Tensor, " n"]
+    no: Float[Tensor, " n"]
+    oz: Float[Tensor, " n"]
+
+    def inputs(self) -> tuple[Tensor, ...]:
+        """α, λ, n·o, n·z, o·z: the arguments of the specular formula."""
+        return self.alpha, self.sharpness, self.no, self.nz, self.oz
+
+    def joined(self, other: Samples) -> Samples:
+        """These samples, then the others."""
+        return Samples(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in self.__struct_fields__))
 
 
 def diffuse_samples(count: int, seed: int, *, sharpness: Range = (0.3, 5000.0)) -> DiffuseSamples:
@@ -97,8 +90,8 @@ def specular_inputs(
 
 def specular_samples(count: int, seed: int, *, tolerance: float, **ranges: Any) -> Samples:
     """Samples with their reference values, converged to `tolerance`; ranges: as of `specular_inputs`."""
-    inputs = specular_inputs(count, seed, **ranges)
-    return Samples(*inputs, converged(*inputs, tolerance=tolerance))
+    alpha, sharpness, no, nz, oz = inputs = specular_inputs(count, seed, **ranges)
+    return Samples(sharpness, nz, converged(*inputs, tolerance=tolerance), alpha, no, oz)
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Float[np.ndarray, "count d"]:
@@ -107,10 +100,44 @@ def _sobol(dimensions: int, count: int, seed: int) -> Float[np.ndarray, "count d
     return sequence.random_base2(max(1, math.ceil(math.log2(count))))[:count]
 
 
-def _turned(
-    axis: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"], azimuth: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 3"]:
+def _turned(axis: np.ndarray, angle: np.ndarray, azimuth: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """`axis` (in the plane y = 0) turned away from itself by `angle` in the direction `azimuth`."""
     across = np.stack([axis[:, 2], 0 * angle, -axis[:, 0]], 1)
     sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]
     return cos * axis + sin * (np.cos(azimuth)[:, None] * across + np.sin(azimuth)[:, None] * np.array([0.0, 1.0, 0.0]))
+
+
+def quantiles(error: Float[Tensor, " n"]) -> dict[str, float | int]:
+    """Quantiles of |error| and the number of samples; 4 digits, since more say nothing."""
+    size = error.abs().double()
+    return {name: float(f"{float(size.quantile(q)):.4g}") for name, q in QUANTILES.items()} | {"samples": len(size)}
+
+
+def binned(error: Float[Tensor, " n"], value: Float[Tensor, " n"], edges: tuple[float, ...]) -> dict[str, dict]:
+    """`quantiles` of each bin that has samples, by its edges."""
+    table = {}
+    for k, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):
+        inside = (value >= low) & ((value < high) | (k == len(edges) - 2))
+        if inside.any():
+            table[f"{low:g} to {high:g}"] = quantiles(error[inside])
+    return table
+
+
+def specular_table(error: Tensor, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> dict:
+    """Errors over all samples, and by roughness, sharpness, cosine of the view and the lobe's angle from the mirror direction."""
+    angle = torch.rad2deg(torch.arccos((2 * no * nz - oz).clamp(-1, 1)))
+    return quantiles(error) | {
+        "roughness": binned(error, alpha.sqrt(), ROUGHNESS),
+        "sharpness": binned(error, sharpness, SHARPNESS),
+        "cosine of the view": binned(error, no, COSINE),
+        "degrees from the mirror direction": binned(error, angle, DEGREES),
+    }
+
+
+def diffuse_table(error: Tensor, sharpness: Tensor, nz: Tensor) -> dict:
+    """Errors over all samples, and by sharpness and the lobe's angle from the normal."""
+    angle = torch.rad2deg(torch.arccos(nz.clamp(-1, 1)))
+    return quantiles(error) | {
+        "sharpness": binned(error, sharpness, SHARPNESS),
+        "degrees from the normal": binned(error, angle, DEGREES),
+    }

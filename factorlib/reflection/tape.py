@@ -23,6 +23,7 @@ C = {
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "sqrt": "sqrtf({0})", "exp": "expf({0})", "log": "logf({0})",
     "log1p": "log1pf({0})", "max": "max_({0}, {1})", "min": "min_({0}, {1})", "above": "({0} > {1} ? 1.0f : 0.0f)", "erfc": "erfcf({0})",
 }  # fmt: skip
+ARITHMETIC = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
 
 
 class Tape:
@@ -39,9 +40,16 @@ class Tape:
     def apply(self, name: str, *arguments: Value | float) -> Value | float:
         """Record operation `name` of C on values or numbers; a number where all arguments are."""
         arguments = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
-        plain = _simplified(name, arguments)
-        if plain is not None:
-            return plain if isinstance(plain, float) else Value(self, plain[0])
+        a, b = (*arguments, None)[:2]
+        numbers = [v if isinstance(v, float) else None for v in (a, b)]  # an index is not a number
+        if None not in numbers and name in ARITHMETIC:
+            return ARITHMETIC[name](a, b)
+        if name == "mul" and 0.0 in numbers:
+            return 0.0
+        if numbers[1] is not None and numbers[1] == {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(name):
+            return Value(self, a)
+        if numbers[0] is not None and numbers[0] == {"add": 0.0, "mul": 1.0}.get(name):
+            return Value(self, b)
         return self._record(name, arguments)
 
     def _record(self, name: str, arguments: tuple) -> Value:
@@ -95,21 +103,6 @@ def _c(argument: int | float) -> str:
     return f"v{argument}" if isinstance(argument, int) else f"{argument!r}f"
 
 
-def _simplified(name: str, arguments: tuple) -> float | tuple[int] | None:
-    """A number, or (index,) of an operation that is there already, or None."""
-    a, b = (*arguments, None)[:2]
-    numbers = [v if isinstance(v, float) else None for v in (a, b)]  # an index is not a number
-    if None not in numbers and name in ("add", "sub", "mul", "div"):
-        return {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}[name](a, b)
-    if name == "mul" and 0.0 in numbers:
-        return 0.0
-    if numbers[1] == {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}.get(name):
-        return (a,) if numbers[1] is not None else None
-    if numbers[0] is not None and numbers[0] == {"add": 0.0, "mul": 1.0}.get(name):
-        return (b,)
-    return None
-
-
 class Value:
     """A number on a tape; understands the arithmetic and the torch functions that the formulas use."""
 
@@ -133,17 +126,11 @@ class Value:
         """As torch's."""
         return self.clamp_min(low).clamp_max(high)
 
-    def sqrt(self) -> Value:
-        """As torch's."""
-        return self.tape.apply("sqrt", self)
-
     @classmethod
-    def __torch_function__(
-        cls, function: Callable, types: Any, arguments: tuple = (), keywords: dict | None = None
-    ) -> Any:
+    def __torch_function__(cls, function: Callable, types: Any, arguments: tuple, keywords: dict | None = None) -> Any:
         x = arguments[0]
         compound = {
-            torch.rsqrt: lambda: 1.0 / x.sqrt(), torch.sigmoid: lambda: 1.0 / (1.0 + x.tape.apply("exp", -x)),
+            torch.rsqrt: lambda: 1.0 / x.tape.apply("sqrt", x), torch.sigmoid: lambda: 1.0 / (1.0 + x.tape.apply("exp", -x)),
             torch.nn.functional.softplus: lambda: x.clamp_min(0.0) + x.tape.apply("log1p", x.tape.apply("exp", -x.tape.apply("max", x, -x))),
             torch.tanh: lambda: 1.0 - 2.0 / (x.tape.apply("exp", 2.0 * x) + 1.0),
         }  # fmt: skip

@@ -4,6 +4,8 @@ The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at it
 falls to zero by a cosine.  Samples of large error are drawn more often, because the worst case matters as much as the mean.  The
 weights of the least held-out error are kept, and training stops when that error has not fallen for PATIENCE points of the curve.
 Seeds and threads are fixed, so that the same parameters give the same bytes, also after a kill and a restart.
+
+The paper's networks are trained plainly on rendered pixels (`trained_plainly`): what improves the project's own stays out of it.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from torch import Tensor
 from factorlib.checkpoint import Checkpoint
 from factorlib.reflection.closed_form import diffuse
 from factorlib.reflection.filtering import filtered_specular
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
 from factorlib.reflection.samples import DiffuseSamples, Samples
 
@@ -47,13 +50,13 @@ class Problem(msgspec.Struct, frozen=True):
     exact: Float[Tensor, " n"]
     unit: Float[Tensor, " n"]
 
-    def rows(self, index: Tensor) -> Problem:
-        """The problem of some samples, by index [k]."""
-        return Problem(*(getattr(self, name)[index] for name in self.__struct_fields__))
+    def each(self, change: Callable[[Tensor], Tensor]) -> Problem:
+        """The problem with `change` made to every field."""
+        return Problem(*(change(getattr(self, name)) for name in self.__struct_fields__))
 
     def float(self) -> Problem:
         """The same in float32, in which networks are trained."""
-        return Problem(*(getattr(self, name).float() for name in self.__struct_fields__))
+        return self.each(Tensor.float)
 
     def errors(self, layers: Layers) -> Float[Tensor, " n"]:
         """(R − S) / unit of every sample: the network's value R against the exact value S."""
@@ -88,100 +91,69 @@ class Step(msgspec.Struct, frozen=True):
 
 
 def train(
-    problem: Problem,
-    held_out: Problem,
-    schedule: Schedule,
-    report: Callable[[Step], None],
-    checkpoint: Checkpoint | None = None,
-) -> tuple[Layers, list[Step]]:
-    """The network of least held-out error, and the curve; goes on from `checkpoint`, to the same bytes."""
-    run = Run(problem.float(), held_out.float(), schedule)
-    checkpoint = checkpoint or Checkpoint(None)
+    problem: Problem, held_out: Problem, schedule: Schedule, report: Callable[[Step], None], checkpoint: Checkpoint | None = None
+) -> tuple[Layers, list[Step]]:  # fmt: skip
+    """The network of least held-out error, and the curve; goes on from `checkpoint`, to the same bytes.
+
+    It ends where all steps are done, or the held-out error has not fallen for a quarter of them.
+    """
+    problem, held_out, checkpoint = problem.float(), held_out.float(), checkpoint or Checkpoint(None)
+    generator = torch.Generator().manual_seed(schedule.seed)
+    layers = initial_layers(problem.features, schedule, generator)
+    parameters = [*layers.weights, *layers.biases]
+    optimiser = torch.optim.Adam(parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+    order, best, curve = torch.empty(0, dtype=torch.long), parameters, []
     if (state := checkpoint.load()) is not None:
-        run.load_state(state)
-    while not run.finished():
-        report(run.advance())
-        checkpoint.save(run.state())
-    return run.best, run.curve
-
-
-class Run:
-    """A training run that can be stopped between any two points of its curve."""
-
-    def __init__(self, problem: Problem, held_out: Problem, schedule: Schedule):
-        self.problem, self.held_out, self.schedule = problem, held_out, schedule
-        self.generator = torch.Generator().manual_seed(schedule.seed)
-        self.layers = initial_layers(problem.features, schedule, self.generator)
-        self.parameters = [*self.layers.weights, *self.layers.biases]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-        self.order = torch.empty(0, dtype=torch.long)
-        self.best, self.curve = self.layers, []
-        self.stretch = max(1, schedule.steps // POINTS)  # steps between two points of the curve
-
-    def finished(self) -> bool:
-        """All steps are done, or the held-out error has not fallen for a quarter of them."""
-        scores = [point.score() for point in self.curve]
-        return len(scores) >= POINTS or (len(scores) > PATIENCE and min(scores) < min(scores[-PATIENCE:]))
-
-    def advance(self) -> Step:
-        """Train to the next point of the curve."""
-        total, first = 0.0, len(self.curve) * self.stretch
-        for step in range(first, first + self.stretch):
-            for group in self.optimiser.param_groups:
-                group["lr"] = self.schedule.rate * share_of_rate(step, self.schedule.steps)
-            error = self._batch().errors(self.layers)
+        with torch.no_grad():
+            for parameter, value in zip(parameters, state["parameters"], strict=True):
+                parameter.copy_(value)
+        optimiser.load_state_dict(state["optimiser"])
+        generator.set_state(state["generator"])
+        order, best, curve = state["order"], state["best"], [Step(**point) for point in state["curve"]]
+    stretch = max(1, schedule.steps // POINTS)  # steps between two points of the curve
+    while len(curve) < POINTS and not is_stuck([point.score() for point in curve]):
+        total, first = 0.0, len(curve) * stretch
+        for step in range(first, first + stretch):
+            if len(order) < schedule.batch:
+                order = hard_ones_often(problem, layers if curve else None, generator)
+            rows, order = order[: schedule.batch], order[schedule.batch :]
+            error = problem.each(lambda field, rows=rows: field[rows]).errors(layers)
             # about |e|, smooth at 0, plus 2e², so that single large errors count more
             loss = (torch.sqrt(error * error + 1e-6) + 2 * error * error).mean()
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimiser.step()
-            total += float(loss.detach())
+            total += descended(optimiser, loss, step, schedule)
         with torch.no_grad():
-            error = self.held_out.errors(self.layers).abs()
+            error = held_out.errors(layers).abs()
         quantiles = (float(error.quantile(q)) for q in (0.5, 0.95, 0.999))
-        point = Step(first + self.stretch, total / self.stretch, *quantiles)
-        if all(point.score() < earlier.score() for earlier in self.curve):
-            self.best = self.layers.copy()
-        self.curve.append(point)
-        return point
+        point = Step(first + stretch, total / stretch, *quantiles)
+        if all(point.score() < earlier.score() for earlier in curve):
+            best = [t.detach().clone() for t in parameters]
+        curve.append(point)
+        report(point)
+        state = {"parameters": [t.detach() for t in parameters], "best": best, "optimiser": optimiser.state_dict()}
+        points = [msgspec.structs.asdict(point) for point in curve]
+        checkpoint.save(state | {"generator": generator.get_state(), "order": order, "curve": points})
+    count = len(layers.weights)
+    return Layers(layers.mean, layers.scale, best[:count], best[count:]), curve
 
-    def _batch(self) -> Problem:
-        if len(self.order) < self.schedule.batch:
-            self.order = self._reshuffled()
-        rows, self.order = self.order[: self.schedule.batch], self.order[self.schedule.batch :]
-        return self.problem.rows(rows)
 
-    def _reshuffled(self) -> Tensor:
-        """Every sample once, and those of large error up to REPEATED times more, in random order."""
+def is_stuck(scores: list[float]) -> bool:
+    """The least score is not among the last PATIENCE.
+
+    >>> is_stuck([1.0] * PATIENCE), is_stuck([0.5] + [1.0] * PATIENCE)
+    (False, True)
+    """
+    return len(scores) > PATIENCE and min(scores) < min(scores[-PATIENCE:])
+
+
+def hard_ones_often(problem: Problem, layers: Layers | None, generator: torch.Generator) -> Tensor:
+    """Every sample once, and those on which `layers` are far off up to REPEATED times more, in random order."""
+    times = torch.ones_like(problem.exact)
+    if layers is not None:
         with torch.no_grad():
-            error = self.problem.errors(self.layers).abs()
-        times = (1 + error / HARD).clamp(max=REPEATED) if self.curve else torch.ones_like(error)
-        times = torch.floor(times + torch.rand(len(error), generator=self.generator)).long()
-        rows = torch.repeat_interleave(torch.arange(len(error)), times)
-        return rows[torch.randperm(len(rows), generator=self.generator)]
-
-    def state(self) -> dict:
-        """All that `load_state` needs to go on to the same bytes."""
-        return {
-            "parameters": [p.detach() for p in self.parameters],
-            "best": [*self.best.weights, *self.best.biases],
-            "optimiser": self.optimiser.state_dict(),
-            "generator": self.generator.get_state(),
-            "order": self.order,
-            "curve": [msgspec.structs.asdict(point) for point in self.curve],
-        }
-
-    def load_state(self, state: dict) -> None:
-        """Go on from a `state` of a run with the same problem and schedule."""
-        with torch.no_grad():
-            for parameter, value in zip(self.parameters, state["parameters"], strict=True):
-                parameter.copy_(value)
-        count = len(self.layers.weights)
-        self.best = Layers(self.layers.mean, self.layers.scale, state["best"][:count], state["best"][count:])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"])
-        self.order = state["order"]
-        self.curve = [Step(**point) for point in state["curve"]]
+            times = (1 + problem.errors(layers).abs() / HARD).clamp(max=REPEATED)
+    times = torch.floor(times + torch.rand(len(times), generator=generator)).long()
+    rows = torch.repeat_interleave(torch.arange(len(times)), times)
+    return rows[torch.randperm(len(rows), generator=generator)]
 
 
 def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator: torch.Generator) -> Layers:
@@ -196,7 +168,40 @@ def initial_layers(features: Float[Tensor, "n f"], schedule: Schedule, generator
     return Layers(features.mean(0), 1 / (features.std(0) + 1e-3), weights, biases)
 
 
-def share_of_rate(step: int, steps: int) -> float:
-    """Of the greatest step: it warms up and falls to zero by a cosine."""
-    warm = min(1.0, (step + 1) / max(1, steps // 30))
-    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
+def descended(optimiser: torch.optim.Optimizer, loss: Tensor, step: int, schedule: Schedule) -> float:
+    """The loss before step `step` down its gradient, whose rate warms up and falls to zero by a cosine."""
+    warm = min(1.0, (step + 1) / max(1, schedule.steps // 30))
+    share = warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / schedule.steps)))
+    for group in optimiser.param_groups:
+        group["lr"] = schedule.rate * share
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    optimiser.step()
+    return float(loss.detach())
+
+
+def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Float[Tensor, " n"]) -> Problem:
+    """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
+    energy, radiance = lobe_integral(sharpness.float()), radiance.float()
+    return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
+
+
+def trained_plainly(problem: Problem, schedule: Schedule, report: Callable[[int, float], None]) -> Layers:
+    """The network of the last step; Adam sees every sample equally often, in random order.
+
+    report: takes the step and the mean error since the last report
+    """
+    generator = torch.Generator().manual_seed(schedule.seed)
+    layers = initial_layers(problem.features, schedule, generator)
+    optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+    every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
+    for step in range(schedule.steps):
+        if len(order) < schedule.batch:
+            order = torch.randperm(len(problem.exact), generator=generator)
+        rows, order = order[: schedule.batch], order[schedule.batch :]
+        error = problem.each(lambda field, rows=rows: field[rows]).errors(layers)
+        total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
+        if (step + 1) % every == 0:
+            report(step + 1, total / every)
+            total = 0.0
+    return layers

@@ -28,6 +28,7 @@ from factorlib.tracing.variant import mitsuba
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
+Entry, Matrix, Image = dict[str, Any], Float[np.ndarray, "4 4"], Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
@@ -55,9 +56,8 @@ def bsdf(material: Material) -> dict[str, Any]:
 
 
 def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
-    return {
-        "type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2, "specular_reflectance": rgb(reflectance),
-    }  # fmt: skip
+    ggx = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
+    return ggx | {"specular_reflectance": rgb(reflectance)}
 
 
 def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:
@@ -65,26 +65,19 @@ def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, An
     return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(value, 3)]}
 
 
-def transform(matrix: Float[np.ndarray, "4 4"]) -> Any:
+def transform(matrix: Matrix) -> Any:
     """Mitsuba's transform of a 4 × 4 matrix."""
     return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
 
 
-def rigid(
-    rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]) -> Matrix:
     """The 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix
 
 
-def shape(
-    mesh: Mesh,
-    material: dict[str, Any],
-    world_from_object: Float[np.ndarray, "4 4"] = np.eye(4),
-    emitter: dict[str, Any] | None = None,
-) -> Any:
+def shape(mesh: Mesh, material: Entry, world_from_object: Matrix = np.eye(4), emitter: Entry | None = None) -> Any:
     """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
@@ -94,11 +87,7 @@ def shape(
 
 
 def sensor(
-    camera: Camera,
-    world_from_camera: Float[np.ndarray, "4 4"],
-    columns: slice = slice(None),
-    near: float = 1e-3,
-    alpha: bool = False,
+    camera: Camera, world_from_camera: Matrix, columns: slice = slice(None), near: float = 1e-3, alpha: bool = False
 ) -> dict[str, Any]:
     """The pinhole camera, of whose image some columns are taken.
 
@@ -122,21 +111,12 @@ def sensor(
     }
 
 
-def traced(
-    entries: dict[str, Any],
-    camera: Camera,
-    world_from_camera: Float[np.ndarray, "4 4"],
-    spp: int,
-    seed: int,
-    max_depth: int,
-) -> Float[np.ndarray, "h w 3"]:
+def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, seed: int, max_depth: int) -> Image:
     """Radiance of a scene, by a camera at world_from_camera; as `rendered`."""
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
-def rendered(
-    entries: dict[str, Any], view: dict[str, Any], spp: int, seed: int, max_depth: int, hide_emitters: bool = False
-) -> Float[np.ndarray, "h w c"]:
+def rendered(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False) -> Image:
     """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
 
     hide_emitters: the light itself is not seen (where the sensor has alpha, it is 0 there)
@@ -174,13 +154,8 @@ def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
 
 
 def light_seen(
-    entries: dict[str, Any],
-    world_from_light: Float[np.ndarray, "4 4"],
-    height: int,
-    spp: int,
-    seed: int,
-    max_depth: int = -1,
-) -> Float[np.ndarray, "h w 3"]:
+    entries: Entry, world_from_light: Matrix, height: int, spp: int, seed: int, max_depth: int = -1
+) -> Image:
     """The radiance that arrives at the origin of the light frame (y-up), a lat-long map of [height, 2·height].
 
     Six square views of 90° along the light frame's axes, then means over 8 × 8 directions a texel.
@@ -191,7 +166,13 @@ def light_seen(
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
         world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
         faces[name] = traced(entries, camera, world_from_camera, spp, 6 * seed + number, max_depth)
-    return _texel_means(faces, height)
+    fine = 8 * height, 16 * height
+    directions, weight = lat_long_directions(*fine), lat_long_solid_angles(*fine)[:, None, None]
+    sums = (
+        array.reshape(height, 8, 2 * height, 8, -1).sum(axis=(1, 3))
+        for array in (looked_up(faces, directions) * weight, np.broadcast_to(weight, (*fine, 1)))
+    )
+    return np.divide(*sums)
 
 
 def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
@@ -200,18 +181,6 @@ def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
     forward = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)])
     right = np.array([-np.cos(yaw), 0.0, np.sin(yaw)])
     return np.stack([right, np.cross(forward, right), forward], axis=-1)
-
-
-def _texel_means(faces: dict[str, np.ndarray], height: int, finer: int = 8) -> Float[np.ndarray, "h w 3"]:
-    size = finer * height, finer * 2 * height
-    directions, weight = lat_long_directions(*size), lat_long_solid_angles(*size)[:, None, None]
-    weight = np.broadcast_to(weight, (*size, 1))
-    values = looked_up(faces, directions) * weight
-
-    def cells(array: np.ndarray) -> np.ndarray:
-        return array.reshape(height, finer, 2 * height, finer, -1).sum(axis=(1, 3))
-
-    return cells(values) / cells(weight)
 
 
 def looked_up(faces: dict[str, np.ndarray], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

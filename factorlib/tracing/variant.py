@@ -41,19 +41,15 @@ def mitsuba(variant: str | None = None) -> ModuleType:
 
 
 def _fastest() -> str:
-    for library in [os.environ.get(LIBRARY), *llvm_libraries()]:
+    found = {path.resolve() for folder in FOLDERS for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")}
+    newest_first = [str(path) for path in sorted(found, key=_version, reverse=True) if _version(path) >= 16]
+    for library in [os.environ.get(LIBRARY), *newest_first]:
         if library and _runs(library):
             os.environ[LIBRARY] = library
             return "llvm_ad_rgb"
     needed = "no LLVM that Mitsuba runs with (16 or later; Debian: libllvm19)"
     log.warning("%s: rendering with scalar_rgb, about 3 times slower", needed)
     return "scalar_rgb"
-
-
-def llvm_libraries() -> list[str]:
-    """LLVM's shared libraries on this machine, newest first."""
-    found = {path.resolve() for folder in FOLDERS for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")}
-    return [str(path) for path in sorted(found, key=_version, reverse=True) if _version(path) >= 16]
 
 
 def _version(library: Path) -> int:
@@ -63,9 +59,8 @@ def _version(library: Path) -> int:
 
 
 def _runs(library: str) -> bool:
+    command, variables = [sys.executable, "-c", PROBE], {**os.environ, LIBRARY: library}
     try:
-        command, variables = [sys.executable, "-c", PROBE], {**os.environ, LIBRARY: library}
-        done = subprocess.run(command, env=variables, capture_output=True, timeout=PROBE_SECONDS)
+        return subprocess.run(command, env=variables, capture_output=True, timeout=PROBE_SECONDS).returncode == 0
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0

@@ -45,30 +45,17 @@ def observations_of_photo(
     """
     seen = observed_pixels(photo, geometry, least_confidence)
     y, x = np.nonzero(seen)
+    none, sure = np.zeros(len(x), "i4"), geometry["confidence"][seen]
 
     def gather(channels: Channels, names: Iterable[str]) -> np.ndarray:
         """The named channels at the observed pixels."""
         return np.stack([channels[n][seen] for n in names], axis=-1)
 
-    def directions(name: str) -> Float[np.ndarray, "n 3"]:
-        """A vector of the geometry, at length 1."""
-        vectors = gather(geometry, [f"{name}.{axis}" for axis in "xyz"])
-        return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
+    normal, view = (gather(geometry, [f"{name}.{axis}" for axis in "xyz"]) for name in ("normal", "view"))
+    normal, view = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in (normal, view))
     return Observations(
-        normal=directions("normal"),
-        view=directions("view"),
-        radiance=np.maximum(gather(photo, "RGB"), 0.0),
-        clipped=gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
-        material=np.rint(photo["label"][seen]).astype("i2") - 1,
-        photo=np.zeros(len(x), "i4"),
-        illumination=np.zeros(len(x), "i4"),
-        x=x.astype("i4"),
-        y=y.astype("i4"),
-        weight=geometry["confidence"][seen],
-        confidence=geometry["confidence"][seen],
-        materials=tuple(materials),
-        photos=(taken.photo,),
-        illuminations=(taken.illumination,),
-        exposures=(taken.exposure,),
-    )
+        normal, view, np.maximum(gather(photo, "RGB"), 0.0), gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
+        material=np.rint(photo["label"][seen]).astype("i2") - 1, photo=none, illumination=none, x=x.astype("i4"), y=y.astype("i4"),
+        weight=sure, confidence=sure, materials=tuple(materials),
+        photos=(taken.photo,), illuminations=(taken.illumination,), exposures=(taken.exposure,),
+    )  # fmt: skip

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int
 from scipy.sparse import csr_array
 
 from factorlib.geometry.sphere import direction_cells, fibonacci_sphere, mirror_directions
-from factorlib.urm.cells import groups
 from factorlib.urm.observations import Observations
 
 HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
@@ -35,40 +34,43 @@ def merge(observations: Observations, degrees: float) -> Observations:
     cell, mirror = np.radians(degrees), mirror_directions(seen.normal, seen.view)
     flags = seen.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(seen.normal, cell), direction_cells(mirror, 2 * cell)]
-    if seen.visibility is not None:
-        cells.append(_hidden_cells(seen.visibility))
+    if (visibility := seen.visibility) is not None:  # where the hidden directions lie
+        directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
+        chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
+        hidden = [(255 - chunk).astype("f4") / 255 @ directions for chunk in chunks]
+        cells.append(np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64))
     first, group = groups(np.column_stack([seen.photo, seen.material, flags, *cells]))
     weight = np.maximum(seen.weight.astype(float), 1e-12)
     total = np.bincount(group, weight)
 
-    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
-        """Weighted mean of each group."""
-        return np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
-
-    def unit(vectors: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
-        """The vectors at length 1, float32."""
-        return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype("f4")
-
-    changed = {"normal": unit(mean(seen.normal)), "view": unit(mean(seen.view))}
-    changed |= {"radiance": mean(seen.radiance).astype("f4"), "weight": total.astype("f4")}
-    if seen.visibility is not None:
-        changed["visibility"] = _mean_visibility(seen.visibility, weight / total[group], group)
+    changed = {"weight": total.astype("f4")}
+    for name in ("normal", "view", "radiance"):
+        mean = np.column_stack([np.bincount(group, weight * v) / total for v in getattr(seen, name).T])
+        length = 1 if name == "radiance" else np.linalg.norm(mean, axis=-1, keepdims=True)
+        changed[name] = (mean / length).astype("f4")
+    if visibility is not None:
+        averaging = csr_array(((weight / total[group]).astype("f4"), (group, np.arange(len(group)))))
+        columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
+        changed["visibility"] = np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
     if seen.confidence is not None:
         changed["confidence"] = (np.bincount(group, weight * seen.confidence) / total).astype("f4")
     return msgspec.structs.replace(seen.take(first), **changed)
 
 
-def _hidden_cells(visibility: UInt8[np.ndarray, "n k"]) -> Int[np.ndarray, "n 3"]:
-    """Cells of where the hidden directions lie."""
-    mean = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
-    hidden = [(255 - visibility[i : i + ROWS]).astype("f4") / 255 @ mean for i in range(0, len(visibility), ROWS)]
-    return np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64)
+def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " g"], Int[np.ndarray, " n"]]:
+    """The first row of each group of equal rows, groups in lexicographic order, and each row's group.
 
-
-def _mean_visibility(
-    visibility: UInt8[np.ndarray, "n k"], share: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]
-) -> UInt8[np.ndarray, "g k"]:
-    """Means with weights that sum to 1 in each group."""
-    averaging = csr_array((share.astype("f4"), (group, np.arange(len(group)))))
-    columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
-    return np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
+    As np.unique of rows, on one number a row.
+    """
+    code, size = np.zeros(len(keys), np.int64), 1
+    for column in keys.T - keys.min(0)[:, None]:
+        span = int(column.max()) + 1
+        if size * span >= 1 << 62:
+            code = np.unique(code, return_inverse=True)[1]
+            size = int(code.max()) + 1
+        code, size = code * span + column, size * span
+    order = np.argsort(code)
+    starts = np.flatnonzero(np.diff(code[order], prepend=-1))
+    group = np.empty(len(keys), np.int64)
+    group[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
+    return np.minimum.reduceat(order, starts), group

@@ -27,7 +27,6 @@ from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
 
-VECTORS = ("normal", "view", "radiance", "clipped")
 WHAT, CURE = "a reflectance map", "run the stage `urm` again"
 VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
@@ -60,9 +59,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = (
-        None  # codes of what hides directions (geometry.met); not without `visibility`
-    )
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides them (geometry.met); not without `visibility`
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
 
@@ -81,34 +78,34 @@ class Observations(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, **taken)
 
 
-COLUMNS = ("normal", "view", "radiance", "clipped", "material", "photo", "illumination", "x", "y", "weight")
+COLUMNS = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
+           "x": "i4", "y": "i4", "weight": "f4"}  # and their types  # fmt: skip
+VECTORS = ("normal", "view", "radiance", "clipped")
+OPTIONAL = {"confidence": "f4"}  # columns that need not be there
 NAMES = {
     "materials": "material",
     "photos": "photo",
     "illuminations": "illumination",
 }  # and the columns that number them
-OPTIONAL = ("confidence",)  # columns that need not be there
-WIDE = {"visibility": np.dtype("u1"), "met": np.dtype("<u2")}  # K values a row, where there are any
-NOTHING = {"visibility": 255, "met": UNMET}  # of observations that see everything
-DTYPES = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
-          "x": "i4", "y": "i4", "weight": "f4", "confidence": "f4"}  # fmt: skip
+# K values a row, where there are any: type, value where everything is seen, meaning
+WIDE = {"visibility": (np.dtype("u1"), 255, VISIBILITY), "met": (np.dtype("<u2"), UNMET, MET)}
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
     """Write the fixed Parquet columns, and `confidence`, `visibility` and `met`, where there is one."""
-    columns = {}
-    given = [name for name in OPTIONAL if getattr(observations, name) is not None]
-    for name in ("normal", "half", "view", "radiance", "clipped", *COLUMNS[4:], *given):
-        values = np.ascontiguousarray(getattr(observations, name), dtype=DTYPES.get(name, "f4"))
-        flat = pa.array(values.reshape(-1))
-        columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
+    columns, types = {}, {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}
+    for name, dtype in types.items():
+        if (values := getattr(observations, name)) is not None:
+            values = np.ascontiguousarray(values, dtype=dtype)
+            flat = pa.array(values.reshape(-1))
+            columns[name] = pa.FixedSizeListArray.from_arrays(flat, 3) if values.ndim == 2 else flat
     about = {**UNITS, **{kind: getattr(observations, kind) for kind in NAMES}}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
-    for name, meaning in (("visibility", VISIBILITY), ("met", MET)):
+    for name, (dtype, _, meaning) in WIDE.items():
         if (values := getattr(observations, name)) is not None:
-            data = pa.py_buffer(np.ascontiguousarray(values, dtype=WIDE[name]))
-            type_ = pa.binary(values.shape[1] * WIDE[name].itemsize)  # a row's values as one binary of fixed size
+            data = pa.py_buffer(np.ascontiguousarray(values, dtype=dtype))
+            type_ = pa.binary(values.shape[1] * dtype.itemsize)  # a row's values as one binary of fixed size
             columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
             about[name] = meaning
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
@@ -120,9 +117,9 @@ def read_observations(path: str | Path) -> Observations:
     """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
     parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
-        narrow = [name for name in (*COLUMNS, *OPTIONAL) if name in parts]
-        columns = {name: _array(parts[name], DTYPES[name], name in VECTORS) for name in narrow}
-        columns |= {name: _of_bytes(parts[name], dtype) for name, dtype in WIDE.items() if name in parts}
+        narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
+        columns = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
+        columns |= {name: _of_bytes(parts[name], dtype) for name, (dtype, *_) in WIDE.items() if name in parts}
         named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**columns, **named, exposures=exposures)
@@ -162,20 +159,46 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
         columns[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    for name, dtype in WIDE.items():  # those without see everything
+    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()} | {"confidence": (np.dtype("f4"), 1)}
+    for name, (dtype, fill) in fills.items():  # parts without see everything, and are sure
         given = [getattr(part, name) for part in parts]
-        counts = {values.shape[1] for values in given if values is not None}
-        if len(counts) > 1:
-            raise InputError(f"reflectance maps whose {name} has {sorted(counts)} directions", cure=cure)
-        for k in counts:
-            everything = (np.full((len(part), k), NOTHING[name], dtype) for part in parts)
-            filled = [full if own is None else own for full, own in zip(everything, given, strict=True)]
+        shapes = {values.shape[1:] for values in given if values is not None}
+        if len(shapes) > 1:
+            counts = sorted(count for (count,) in shapes)
+            raise InputError(f"reflectance maps whose {name} has {counts} directions", cure=cure)
+        for shape in shapes:
+            filled = [
+                np.full((len(part), *shape), fill, dtype) if own is None else own for part, own in zip(parts, given)
+            ]
             columns[name] = np.concatenate(filled)
-    if any(part.confidence is not None for part in parts):
-        sure = [np.ones(len(part), "f4") if part.confidence is None else part.confidence for part in parts]
-        columns["confidence"] = np.concatenate(sure)
     of_photos = tuple(exposures.get(photo) for photo in names["photos"])
     return Observations(**columns, materials=materials, **names, exposures=of_photos)
+
+
+def relative_exposures(observations: Observations) -> dict[str, float]:
+    """Of each photo that has observations, over the first one (by name) in its light; 1 unless all photos of the light say theirs.
+
+    Two photos of one light differ by a factor, which the solve finds.  From a factor of 8 it may not find back; what the cameras
+    wrote, t·S/N², is right within rounding and what a camera's own rendering does.  So radiance is brought to the exposure of
+    the light's first photo by EXIF, and what is solved for is what EXIF leaves.
+    """
+    known = dict(zip(observations.photos, observations.exposures))
+    relative = {}
+    for light in np.unique(observations.illumination):
+        of_light = np.unique(observations.photo[observations.illumination == light])
+        photos = sorted(observations.photos[k] for k in of_light)
+        exposures = [known.get(photo) for photo in photos]
+        first = exposures[0] if None not in exposures else None
+        relative |= {photo: exposure / first if first else 1.0 for photo, exposure in zip(photos, exposures)}
+    return relative
+
+
+def at_one_exposure(observations: Observations, relative: dict[str, float]) -> Observations:
+    """With the radiance of each photo over its relative exposure; unchanged where all are 1."""
+    factors = np.array([relative.get(photo, 1.0) for photo in observations.photos])
+    if (factors == 1).all():
+        return observations
+    return msgspec.structs.replace(observations, radiance=observations.radiance / factors[observations.photo][:, None])
 
 
 def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:

@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Int
 
 from factorlib.geometry.sphere import direction_cells
-from factorlib.urm.cells import groups
+from factorlib.urm.merge import groups
 from factorlib.urm.observations import Observations
 
 CELL = np.radians(3.0)  # of normals: about as well as poses and meshes are known
-CLIPPED_BITS = np.array([1, 2, 4])
 
 
 def sample(observations: Observations, most: int) -> Observations:
@@ -35,7 +34,7 @@ def sample(observations: Observations, most: int) -> Observations:
 
 def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
     """The stratum of each observation, from 0; cells grow until there are no more strata than `most`."""
-    kind, cell = np.column_stack([observations.material, observations.clipped @ CLIPPED_BITS]), CELL
+    kind, cell = np.column_stack([observations.material, observations.clipped @ np.array([1, 2, 4])]), CELL
     while True:
         of_normal = direction_cells(observations.normal, cell) if cell < np.pi else np.zeros((len(kind), 0), np.int64)
         first, group = groups(np.column_stack([kind, of_normal]))

@@ -19,11 +19,20 @@ from torch import Tensor
 
 from factorlib.errors import InputError
 from factorlib.reflection import Operator, reflection_operator
-from factorlib.reflection.accuracy import QUANTILES, diffuse_table, quantiles, specular_table
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.operator import NAMES
 from factorlib.reflection.reference import Reference
-from factorlib.reflection.samples import DiffuseSamples, Samples, diffuse_samples, specular_inputs, specular_samples
+from factorlib.reflection.samples import (
+    QUANTILES,
+    DiffuseSamples,
+    Samples,
+    diffuse_samples,
+    diffuse_table,
+    quantiles,
+    specular_inputs,
+    specular_samples,
+    specular_table,
+)
 from studies.measured.tools import Tables, exact
 from studies.scenes import operators as laws
 

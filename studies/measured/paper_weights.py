@@ -15,9 +15,8 @@ from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED, write_layers
 from factorlib.reflection.paper_network import diffuse_inputs, specular_inputs
-from factorlib.reflection.paper_training import Examples, trained
 from factorlib.reflection.samples import diffuse_samples, specular_samples
-from factorlib.reflection.training import Schedule
+from factorlib.reflection.training import Schedule, pixels_problem, trained_plainly
 from studies.measured.operator import diffuse_errors, specular_errors
 
 SPHERES, PIXELS = 4000, 50
@@ -44,8 +43,8 @@ def main() -> None:
         "specular": specular_inputs(normal, half, axis, sharpness, roughness),
     }
     for part, of in inputs.items():
-        examples = Examples(of, sharpness, _flat(getattr(pixels, part)))
-        layers = trained(examples, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
+        problem = pixels_problem(of, sharpness, _flat(getattr(pixels, part)))
+        layers = trained_plainly(problem, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
         file, note = SHIPPED / f"paper_{part}.safetensors", "see factorlib.reflection.paper_network"
         write_layers(file, layers, torch.float16, inputs=note)
     operator = reflection_operator("paper_network")

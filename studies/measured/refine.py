@@ -72,7 +72,7 @@ def measured(shape: str, axis: int, off: float, rough: bool) -> list[str]:
     start = time.perf_counter()
     verdict = proportions(sightings)
     seconds, wanted = time.perf_counter() - start, 1 / factors / (1 / factors).prod() ** (1 / 3)
-    meshes = (given, [one.state for one in sightings]), (scaled(given, verdict.fitted.factors), verdict.fitted.states)
+    meshes = (given, [one.state for one in sightings]), (scaled(given, verdict.factors), verdict.states)
     before, after = (
         [
             normal_error_deg(truth, rasterise(mesh, state.camera(one.camera), state.pose(mesh)))
@@ -80,7 +80,7 @@ def measured(shape: str, axis: int, off: float, rough: bool) -> list[str]:
         ]
         for mesh, states in meshes
     )
-    error = float(100 * np.abs(verdict.fitted.factors / wanted - 1).max())
+    error = float(100 * np.abs(verdict.factors / wanted - 1).max())
     errors = [exacts((np.median(of), max(of))) for of in (before, after)]
     return [shape, f"{off:g}", "yes" if verdict.used else "no", f"{error:.2g}", *errors, f"{seconds:.2g}"]
 

@@ -32,9 +32,9 @@ def ball(radius=1.0, subdivisions=3):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
 
 
-def blob():
+def blob(subdivisions=3):
     """Smooth, without symmetry."""
-    part = ball()
+    part = ball(subdivisions=subdivisions)
     x, y, z = part.vertices.T
     radius = 1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3
     part.vertices = part.vertices * radius[:, None]

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from factorlib.align import silhouette as masks
 from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import FACET, TURN, confidence, turns
-from factorlib.align.overlay import overlay
-from factorlib.align.silhouette import (
-    UNKNOWN,
-    Silhouette,
-    label_agreement,
-    labelled_iou,
-    silhouette_iou,
-    silhouette_of_object,
-    silhouette_of_photo,
-)
+from factorlib.align.confidence import FACET, TURN, confidence, overlay, turns
+from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import rasterise
 from tests.align.scenes import at, ball, chair, dumbbell, mesh_of, photo_of, true_silhouette
@@ -25,26 +17,19 @@ from tests.align.scenes import at, ball, chair, dumbbell, mesh_of, photo_of, tru
 
 def label_of(number, labels, own_mask, label, owner=None, left_out=None):
     """What the masks say of an object, or of the whole photo (number 0), in one row of pixels."""
-    row = {
-        name: np.array([x if x else [0] * len(label)], float) for name, x in (("object", owner), ("left_out", left_out))
-    }
-    row["label"] = np.array([label], float)
-    silhouette = silhouette_of_object(row, number, labels, own_mask) if number else silhouette_of_photo(row)
-    return silhouette.label[0].tolist()
+    none = [0] * len(label)
+    row = {"label": label, "object": owner or none, "left_out": left_out or none}
+    row = {name: np.array([values], float) for name, values in row.items()}
+    of = masks.silhouette_of_object(row, number, labels, own_mask) if number else masks.silhouette_of_photo(row)
+    return of.label[0].tolist()
 
 
-@pytest.mark.parametrize(
-    "of, expected",
-    [
-        ((0, (), False, [0, 1, 0], None, [0, 0, 1]), [0, 1, UNKNOWN]),  # what is left out
-        ((1, (1, 3), False, [0, 1, 2, 3]), [0, 1, UNKNOWN, 3]),  # foreign materials may hide an object
-        (
-            (1, (1,), True, [0, 1, 1, 1], [0, 1, 2, 0]),
-            [0, 1, UNKNOWN, UNKNOWN],
-        ),  # own masks part objects of one material
-        ((2, (1,), False, [0, 1, 1, 1], [0, 1, 2, 0]), [0, UNKNOWN, 1, 1]),
-    ],
-)
+@pytest.mark.parametrize("of, expected", [
+    ((0, (), False, [0, 1, 0], None, [0, 0, 1]), [0, 1, UNKNOWN]),  # what is left out
+    ((1, (1, 3), False, [0, 1, 2, 3]), [0, 1, UNKNOWN, 3]),  # foreign materials may hide an object
+    ((1, (1,), True, [0, 1, 1, 1], [0, 1, 2, 0]), [0, 1, UNKNOWN, UNKNOWN]),  # own masks part objects of one material
+    ((2, (1,), False, [0, 1, 1, 1], [0, 1, 2, 0]), [0, UNKNOWN, 1, 1]),
+])  # fmt: skip
 def test_what_masks_say_of_an_object(of, expected):
     assert label_of(*of) == expected
 
@@ -54,10 +39,10 @@ def test_agreement_is_one_for_the_truth_and_ignores_the_unknown():
     silhouette, mesh_label = true_silhouette(caster, camera, pose), rasterise(caster, camera, pose).label
     label = silhouette.label.copy()
     label[:, 150:] = UNKNOWN
+    measures = masks.silhouette_iou, masks.label_agreement, masks.labelled_iou
     for known in (silhouette, Silhouette(label)):
-        assert [of(known, mesh_label) for of in (silhouette_iou, label_agreement, labelled_iou)] == [1, 1, 1]
-    swapped = np.where(mesh_label > 0, 3 - mesh_label, 0)
-    assert [of(silhouette, swapped) for of in (silhouette_iou, label_agreement, labelled_iou)] == [1, 0, 0]
+        assert [of(known, mesh_label) for of in measures] == [1, 1, 1]
+    assert [of(silhouette, np.where(mesh_label > 0, 3 - mesh_label, 0)) for of in measures] == [1, 0, 0]
 
 
 def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
@@ -131,12 +116,6 @@ def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(heig
     assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
     believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
     assert sure[middle] == pytest.approx(believed, rel=0.02)
-
-
-def test_a_small_smooth_object_keeps_its_slanted_normals():
-    maps, sure = seen(mesh_of([ball()]), 6, width=80, height=60)
-    slanted = (maps.edge > 0.35) & (maps.edge < 0.7)
-    assert slanted.sum() > 50 and (sure[slanted] > 0).mean() > 0.95
 
 
 def test_overlay_draws_both_contours():

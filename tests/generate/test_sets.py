@@ -1,16 +1,19 @@
-"""The generated sets: the same seed is the same bytes, and what is written is what the format asks for."""
+"""The generated sets: the same seed is the same bytes, what is written is what the format asks for, and what is taken away of the
+chair set (exact geometry, distant light, direct light) is taken away by itself."""
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.generate import eames, folder, lights, synthetic
-from factorlib.generate.chair import chair, rough_chair, shell
+from factorlib.generate.__main__ import app
+from factorlib.generate.chair import chair, labelled, rough_chair, shell
 from factorlib.generate.shapes import SHAPES
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
@@ -20,44 +23,58 @@ from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.read import read_mesh
 
 pytest.importorskip("mitsuba")
-TINY = synthetic.Parameters(width=96, height=64, focal_px=125.0, light_rows=16, spp=64, light_spp=2)
-TINY_PHOTO = eames.Parameters(width=96, height=72, light_rows=16, spp=8, light_spp=2)
 
 
-def quiet(done: int, total: int, text: str) -> None:
-    pass
+def made(out: Path, seed: int, spp: int = 64) -> Path:
+    """A small synthetic set."""
+    parameters = synthetic.Parameters(width=96, height=64, focal_px=125.0, light_rows=16, spp=spp, light_spp=2)
+    synthetic.generate(out, seed, [], parameters, lambda done, total, text: None)
+    return out
+
+
+def made_chairs(out: Path, lights=(), names=("kitchen",), spp=8, **easier: bool) -> Path:
+    """A small chair set of seed 3."""
+    parameters = eames.Parameters(width=96, height=72, light_rows=16, spp=spp, light_spp=2, **easier)
+    shots = [shot for shot in eames.SET.shots if shot.name in names]
+    eames.generate(out, 3, lights, parameters, lambda done, total, text: None, shots)
+    return out
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("sets") / "small"
-    synthetic.generate(out, 0, [], TINY, quiet)
-    return out
+    return made(tmp_path_factory.mktemp("sets") / "small", seed=0)
 
 
 @pytest.fixture(scope="module")
 def chairs(tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("sets") / "chairs"
-    eames.generate(out, 3, [], TINY_PHOTO, quiet, eames.SET.shots[:2])
-    return out
+    return made_chairs(tmp_path_factory.mktemp("sets") / "chairs", names=("terrace", "kitchen"))
 
 
-def hashes(out: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(out.rglob("*"))
-        if path.is_file()
-    }
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    return made_chairs(tmp_path_factory.mktemp("sets") / "plain")
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory) -> Path:
+    return made_chairs(tmp_path_factory.mktemp("sets") / "exact", exact=True)
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def photo_and_light(out: Path):
+    """The photo of the kitchen, and the true light as a map in the camera's frame turned y-up; in the photo's unit."""
+    return read_photo(out / "photos/kitchen.jpg"), read_rgb_exr(out / "truth/kitchen_light.exr")
 
 
 def test_the_same_seed_is_the_same_bytes(small, tmp_path):
-    synthetic.generate(tmp_path / "again", 0, [], TINY, quiet)
-    assert hashes(tmp_path / "again") == hashes(small)
+    assert files(made(tmp_path / "again", seed=0)) == files(small)
 
 
 def test_another_seed_is_another_set(small, tmp_path):
-    synthetic.generate(tmp_path / "other", 1, [], TINY, quiet)
-    first, other = read_dataset(small).truth, read_dataset(tmp_path / "other").truth
+    first, other = read_dataset(small).truth, read_dataset(made(tmp_path / "other", seed=1, spp=1)).truth
     assert all(first.materials[name] != other.materials[name] for name in first.materials)
     assert all(max(m.diffuse) + max(m.specular) < 1 for m in other.materials.values())
 
@@ -153,3 +170,71 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
     with pytest.raises(InputError, match="no lat-long"):
         lights.captured(tmp_path / "square.exr", 8)
+
+
+def test_exact_geometry_changes_no_photo(plain, exact):
+    before, after = files(plain), files(exact)
+    assert before.keys() == after.keys()
+    assert {name for name in before if before[name] != after[name]} == {"dataset.yaml", "meshes/chair.obj"}
+
+
+def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
+    dataset = read_dataset(exact)
+    (photo,) = dataset.spec.photos
+    (thing,) = photo.objects
+    assert np.allclose(thing.pose.rotation, dataset.truth.poses["kitchen"][thing.name].rotation, atol=1e-6)
+    assert np.allclose(thing.pose.translation, dataset.truth.poses["kitchen"][thing.name].translation, atol=1e-6)
+    assert photo.camera.focal_px == pytest.approx(folder.focal_px_of_35mm(45, 96, 72), abs=0.01)
+    mesh = read_mesh(exact / "meshes/chair.obj", ["red", "wood"], {"shell": "red", "legs": "wood"})
+    traced = labelled(chair(), {"shell": 1, "legs": 2})
+    assert len(mesh.faces) == len(traced.faces)
+    apart, nearest = cKDTree(traced.vertices).query(mesh.vertices)
+    assert apart.max() < 1e-6 and len(set(nearest)) == len(traced.vertices)
+    alike = np.linalg.norm(mesh.normals - traced.normals[nearest], axis=1) < 1e-6
+    assert alike.mean() > 0.97, (
+        "of flat ends of legs, which stand on the floor or in the seat, the reader takes its own"
+    )
+
+
+def test_behind_the_chairs_a_distant_light_is_its_map(tmp_path):
+    """Light, camera and exposure belong together: each pixel beside the chairs is the map in the pixel's direction."""
+    photo, light = photo_and_light(made_chairs(tmp_path / "set", distant=True, direct=True))
+    focal = folder.focal_px_of_35mm(45, 96, 72)
+    column, row = np.meshgrid(np.arange(96) + 0.5 - 48, np.arange(72) + 0.5 - 36)
+    ray = np.stack([column, row, np.full(row.shape, focal)], axis=-1)
+    expected = sampled(light, ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ YUP_FROM_CAMERA)
+    beside = (read_png(tmp_path / "set/masks/kitchen.png")[..., 0] == 0) & ~photo.clipped.any(axis=-1)
+    off = photo.radiance[beside] - expected[beside]
+    assert beside.mean() > 0.3 and np.abs(off).mean() < 0.03 * expected[beside].mean()
+
+
+def test_without_bounces_chairs_are_darker(tmp_path):
+    """In one light, against that light's unit, in which exposure is gone."""
+    brightness = []
+    for direct in (True, False):
+        out = made_chairs(tmp_path / str(direct), spp=32, distant=True, direct=direct)
+        photo, light = photo_and_light(out)
+        on_chair = np.isin(read_png(out / "masks/kitchen.png")[..., 0], [1, 2, 3, 4, 5])
+        brightness.append(np.minimum(photo.radiance[on_chair], 0.9).mean() / light.mean())
+    assert brightness[0] < 0.97 * brightness[1]
+
+
+def test_the_light_of_a_direct_set_is_what_shines_by_itself(tmp_path, plain):
+    _, all_of_it = photo_and_light(plain)
+    _, direct = photo_and_light(made_chairs(tmp_path / "set", direct=True))
+    assert (all_of_it > 0).all() and (direct == 0).all(axis=-1).mean() > 0.8 and direct.max() > 1
+
+
+def test_a_users_distant_light_has_no_ground(tmp_path):
+    write_rgb_exr(tmp_path / "constant.exr", np.ones((16, 32, 3)))
+    maps = [tmp_path / "constant.exr"]
+    _, light = photo_and_light(made_chairs(tmp_path / "distant", lights=maps, distant=True))
+    np.testing.assert_allclose(light, light[0, 0, 0], rtol=1e-3)
+    _, light = photo_and_light(made_chairs(tmp_path / "near", lights=maps))
+    assert light.min() < 0.5 * light.max()
+
+
+def test_an_easier_set_does_not_replace_the_one_the_project_carries(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["eames", "--direct"])
+    assert done.exit_code == 2 and "--out" in done.output and not list(tmp_path.iterdir())

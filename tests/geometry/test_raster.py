@@ -1,15 +1,17 @@
-"""What a pixel sees, against a sphere known in closed form and against the laws of frames."""
+"""Cameras, poses and directions agree with COLMAP's and the laws of frames; what a pixel sees, with a sphere known in closed form."""
 
 from __future__ import annotations
 
 import msgspec
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.raster import MIN_COSINE, Caster, rasterise, toward_viewer
-from tests.align.scenes import at, ball, blob, chair, mesh_of, photo_of
+from factorlib.geometry.raster import MIN_COSINE, rasterise
+from factorlib.geometry.sphere import fibonacci_directions, fibonacci_sphere, mirror_directions
+from tests.align.scenes import ball, blob, chair, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))
 STILL = Pose(np.eye(3), np.array([0.1, -0.2, 4.0]))
@@ -36,24 +38,12 @@ def test_what_is_seen_faces_the_viewer_and_is_of_unit_length():
     assert np.sum(maps.normal * maps.view, axis=-1)[seen].min() >= MIN_COSINE - 1e-9
 
 
-def test_bending_a_normal_keeps_its_plane():
-    view = np.array([[0.0, 0, -1]] * 2)
-    normal = np.array([[0.6, 0, -0.8], [0.8, 0, 0.6]])
-    bent, was = toward_viewer(normal, view)
-    assert was.tolist() == [False, True] and np.allclose(bent[0], normal[0])
-    assert np.allclose(bent[1], [np.sqrt(1 - MIN_COSINE**2), 0, -MIN_COSINE])
-
-
 def test_turning_object_and_pose_together_changes_nothing():
     caster, camera, pose = photo_of(chair(), seed=2)
     turn = Rotation.random(rng=np.random.default_rng(3)).as_matrix()
-    turned = msgspec.structs.replace(
-        caster.mesh, vertices=caster.mesh.vertices @ turn.T, normals=caster.mesh.normals @ turn.T
-    )
-    first, second = (
-        rasterise(caster, camera, pose),
-        rasterise(turned, camera, Pose(pose.rotation @ turn.T, pose.translation)),
-    )
+    vectors = {name: getattr(caster.mesh, name) @ turn.T for name in ("vertices", "normals")}
+    turned, there = msgspec.structs.replace(caster.mesh, **vectors), Pose(pose.rotation @ turn.T, pose.translation)
+    first, second = rasterise(caster, camera, pose), rasterise(turned, camera, there)
     assert np.mean(first.label != second.label) < 1e-4
     assert np.quantile(np.abs(first.normal - second.normal), 0.999) < 1e-4
 
@@ -87,7 +77,40 @@ def test_nearest_of_several_objects_wins():
     assert np.array_equal(other.label, maps.label) and np.array_equal(other.normal, maps.normal)
 
 
-def test_a_caster_and_its_mesh_see_the_same():
-    mesh = mesh_of([at(ball(), 3, 0, 0)])
-    pose = Pose(np.eye(3), np.array([-3.0, 0, 4]))
-    assert np.array_equal(rasterise(mesh, CAMERA, pose).normal, rasterise(Caster(mesh), CAMERA, pose).normal)
+def test_projection_is_colmaps():
+    _, camera, pose = photo_of(blob(), seed=0)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    in_camera = pose.apply(points)
+    there = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+    assert np.allclose(in_camera, np.array([there * p for p in points]))
+    assert np.allclose(camera.project(in_camera), camera.colmap().img_from_cam(in_camera))
+
+
+def test_rays_go_through_pixel_centres():
+    camera = Camera(7, 5, 9.0, (3.0, 2.0))
+    x, y = np.meshgrid(np.arange(7) + 0.5, np.arange(5) + 0.5)
+    assert np.allclose(camera.project(camera.rays() * 3.7), np.stack([x, y], axis=-1))
+
+
+def test_window_sees_the_same_directions():
+    camera = Camera(64, 48, 80.0, (30.0, 25.0))
+    window = camera.window(left=8, top=4, pixel=2, width=10, height=6)
+    assert np.allclose(window.rays()[0, 0], [(8 + 1 - 30) / 80, (4 + 1 - 25) / 80, 1])
+
+
+@pytest.mark.parametrize("lattice", [fibonacci_directions, fibonacci_sphere])
+def test_directions_cover_the_sphere(lattice):
+    directions = lattice(300)
+    cosine = directions @ directions.T - 2 * np.eye(300)
+    nearest = np.rad2deg(np.arccos(cosine.max(axis=1)))
+    assert nearest.min() > 7 and nearest.max() < 14
+
+
+def test_a_mirror_shows_what_lies_as_far_beyond_the_normal():
+    rng = np.random.default_rng(0)
+    normal, view = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 20, 3)))
+    mirror = mirror_directions(normal, view)
+    assert np.allclose(np.linalg.norm(mirror, axis=1), 1) and np.allclose(
+        np.sum(mirror * normal, 1), np.sum(view * normal, 1)
+    )
+    assert np.allclose(mirror_directions(normal, mirror), view)

@@ -6,16 +6,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.met import BINS, UNMET
 from factorlib.geometry.raster import rasterise
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.geometry.visibility import Occluders, Points, sight
-from factorlib.urm.merge import merge
-from factorlib.urm.observations import concatenate, read_observations, write_observations
 from tests.align.scenes import at, ball, mesh_of
-from tests.urm.test_urm import observations
 
 CAMERA = Camera(64, 64, 100.0, (32.0, 32.0))
 AWAY = Pose(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(), np.array([0.1, -0.1, 5.0]))
@@ -104,42 +100,6 @@ def test_distance_and_units_change_nothing():
     assert np.mean(one != seen_by([other], [moved])[0]) < 1e-3
 
 
-def with_visibility(name="kitchen", seed=0, count=64):
-    seen = observations(name, name)
-    random = np.random.default_rng(seed).integers(0, 2, (len(seen), count)) * 255
-    return msgspec.structs.replace(seen, visibility=random.astype(np.uint8))
-
-
-def test_visibility_is_kept_in_parquet_and_absent_where_everything_is_seen(tmp_path):
-    seen = with_visibility()
-    write_observations(tmp_path / "a.parquet", seen)
-    again = read_observations(tmp_path / "a.parquet")
-    np.testing.assert_array_equal(again.visibility, seen.visibility)
-    write_observations(tmp_path / "b.parquet", again)
-    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
-    write_observations(tmp_path / "c.parquet", observations())
-    assert read_observations(tmp_path / "c.parquet").visibility is None
-
-
-def test_merged_visibility_is_the_weighted_mean():
-    seen = with_visibility()
-    merged = merge(seen, 8.0)
-    total = (seen.weight[:, None] * seen.visibility).sum(0)
-    np.testing.assert_allclose((merged.weight[:, None] * merged.visibility).sum(0), total, rtol=2e-3)
-
-
-def test_photos_without_hidden_directions_see_all_beside_others():
-    part = with_visibility("a")
-    both = concatenate([part, observations("b", "b")])
-    np.testing.assert_array_equal(both.visibility[both.photo == 0], part.visibility)
-    assert (both.visibility[both.photo == 1] == 255).all()
-
-
-def test_sets_of_different_directions_are_not_mixed():
-    with pytest.raises(InputError, match="64, 128"):
-        concatenate([with_visibility("a"), with_visibility("b", count=128)])
-
-
 def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     """A floor of material 1 under a ball of material 3: straight up the floor meets the ball's underside."""
     floor = mesh_of([trimesh.creation.box(extents=(8, 8, 0.1))])
@@ -154,42 +114,5 @@ def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     material, faces = np.divmod(past.met[hidden].astype(int), BINS)
     assert (material == 2).all()
     row, k = np.nonzero(hidden)
-    assert (
-        np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1) < 0.2
-    ).all()  # toward the floor, to the width of a bin
-
-
-def with_met():
-    seen = with_visibility()
-    codes = np.random.default_rng(1).integers(0, BINS * len(seen.materials), seen.visibility.shape)
-    return msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, codes, UNMET).astype(np.uint16))
-
-
-def test_codes_are_kept_in_parquet_taken_and_merged(tmp_path):
-    seen = with_met()
-    write_observations(tmp_path / "a.parquet", seen)
-    again = read_observations(tmp_path / "a.parquet")
-    assert again.met.dtype == np.uint16
-    np.testing.assert_array_equal(again.met, seen.met)
-    write_observations(tmp_path / "b.parquet", again)
-    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
-    write_observations(tmp_path / "c.parquet", with_visibility())
-    assert read_observations(tmp_path / "c.parquet").met is None
-    np.testing.assert_array_equal(seen.take(np.array([2, 0])).met, seen.met[[2, 0]])
-    merged = merge(seen, 8.0)
-    first = [int(np.flatnonzero((seen.x == x) & (seen.y == y))[0]) for x, y in zip(merged.x, merged.y, strict=True)]
-    np.testing.assert_array_equal(merged.met, seen.met[first])
-    both = concatenate([seen, observations("other", "other")])
-    assert (both.met[both.photo == both.photos.index("other")] == UNMET).all()
-
-
-def test_codes_that_name_no_material_are_refused(tmp_path):
-    seen = with_met()
-    write_observations(
-        tmp_path / "a.parquet", msgspec.structs.replace(seen, met=seen.met * 0 + BINS * len(seen.materials))
-    )
-    with pytest.raises(InputError, match="met"):
-        read_observations(tmp_path / "a.parquet")
-    write_observations(tmp_path / "b.parquet", msgspec.structs.replace(seen, met=seen.met[:, :32]))
-    with pytest.raises(InputError, match="met"):
-        read_observations(tmp_path / "b.parquet")
+    toward_floor = np.sum(fibonacci_sphere(BINS)[faces] * directions[k], 1)
+    assert (toward_floor < 0.2).all(), "to the width of a bin"

@@ -14,12 +14,9 @@ from studies.measured.operator import made
 from studies.scenes import operators as laws
 from studies.scenes.operators import ALL, CASES, answers, case, gradient_error, reference_values, value_error
 
-COMPILED, TORCH = (
-    reflection_operator("network"),
-    made("network", "float32", compiled=False) or reflection_operator("network"),
-)
 FAST = {
-    "closed_form": reflection_operator("closed_form"), "network": COMPILED, "network in torch": TORCH,
+    "closed_form": reflection_operator("closed_form"), "network": reflection_operator("network"),
+    "network in torch": made("network", "float32", compiled=False),
     "closed_form float64": reflection_operator("closed_form", dtype="float64"),
     "network float64": reflection_operator("network", dtype="float64"),
 }  # fmt: skip
@@ -90,18 +87,13 @@ def leaves_of(light, material, normals, views, dtype) -> dict[str, torch.Tensor]
 
 
 def called(operator, leaves):
-    light, material = (
-        SimpleNamespace(**{k: leaves[k] for k in keys})
-        for keys in (("axis", "sharpness", "weight"), ("diffuse", "specular", "roughness"))
-    )
-    return operator(light, material, leaves["normals"], leaves["views"])
+    return operator(SimpleNamespace(**leaves), SimpleNamespace(**leaves), leaves["normals"], leaves["views"])
 
 
 def gradients(operator, leaves) -> dict[str, torch.Tensor]:
     radiance = called(operator, leaves)
-    return {"radiance": radiance.detach()} | dict(
-        zip(leaves, torch.autograd.grad(radiance.sum(), list(leaves.values())), strict=True)
-    )
+    slopes = torch.autograd.grad(radiance.sum(), list(leaves.values()))
+    return {"radiance": radiance.detach(), **dict(zip(leaves, slopes, strict=True))}
 
 
 @fast
@@ -120,12 +112,9 @@ def test_radiance_and_every_gradient_are_finite(
         across = torch.nn.functional.normalize(torch.linalg.cross(n, o) + 1e-12, dim=0)
         o = cosine * n + math.sqrt(1 - cosine**2) * across
     z = {"n": n, "−n": -n, "mirror": 2 * (n @ o) * n - o, "o": o, "−o": -o, "anywhere": z}[place]
-    light = SimpleNamespace(
-        axis=z[None], sharpness=torch.tensor([math.exp(log_sharpness)]), weight=torch.full((1, 3), weight)
-    )
-    material = SimpleNamespace(
-        diffuse=torch.full((3,), 0.5), specular=torch.full((3,), 0.5), roughness=torch.tensor(roughness)
-    )
+    sharpness, half = torch.tensor([math.exp(log_sharpness)]), torch.full((3,), 0.5)
+    light = SimpleNamespace(axis=z[None], sharpness=sharpness, weight=torch.full((1, 3), weight))
+    material = SimpleNamespace(diffuse=half, specular=half, roughness=torch.tensor(roughness))
     slopes = gradients(operator, leaves_of(light, material, n[None], o[None], operator.dtype))
     assert all(t.isfinite().all() for t in slopes.values()), {k: t for k, t in slopes.items() if not t.isfinite().all()}
     assert (slopes["radiance"] >= 0).all()
@@ -159,21 +148,11 @@ TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no
 @pytest.mark.parametrize("bad", INPUTS)
 def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
     operator = FAST[name]
-    point = dict(
-        zip(
-            INPUTS,
-            (torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2),
-            strict=True,
-        )
-    )
-    point = {key: t.to(operator.dtype).clone() for key, t in point.items()}
+    values = torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2
+    point = {key: t.to(operator.dtype).clone() for key, t in zip(INPUTS, values, strict=True)}
     point[bad].view(-1)[0] = math.nan
-    expected = torch.zeros(2, 2, dtype=torch.bool)
-    expected[
-        {"roughness": (slice(None), slice(None)), "sharpness": (slice(None), 0), "no": (0, slice(None))}.get(
-            bad, (0, 0)
-        )
-    ] = True
+    expected, all_ = torch.zeros(2, 2, dtype=torch.bool), slice(None)
+    expected[{"roughness": (all_, all_), "sharpness": (all_, 0), "no": (0, all_)}.get(bad, (0, 0))] = True
     response = operator.response(**point)
     with torch.no_grad():
         values = {"diffuse": operator.diffuse(point["sharpness"], point["nz"]), "specular": operator.specular(**point)}

@@ -23,18 +23,14 @@ def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
     light = np.zeros((16, 32, 3))
     light[texel] = 100.0
     toward = lat_long_directions(16, 32)[texel] @ YUP_FROM_CAMERA  # camera frame
-    ball = tracing.shape(
-        sphere(1.0),
-        {"type": "diffuse", "reflectance": tracing.rgb(0.8)},
-        tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0]),
-    )
+    matte, place = {"type": "diffuse", "reflectance": tracing.rgb(0.8)}, YUP_FROM_CAMERA @ [0, 0, 4.0]
+    ball = tracing.shape(sphere(1.0), matte, tracing.rigid(YUP_FROM_CAMERA, place))
     image = tracing.traced({"ball": ball, "light": tracing.envmap(light)}, CAMERA, AT_ORIGIN, 64, 1, 2)[..., 0]
     normal = ball_normal(CAMERA, 4.0)
     inside = np.nan_to_num(np.sum(normal * -CAMERA.rays(), axis=-1)) > 0.5
     cosine = np.nan_to_num(normal @ toward)
-    irradiance = np.sum(
-        sampled(light, lat_long_directions(128, 256))[..., 0] * lat_long_solid_angles(128, 256)[:, None]
-    )
+    fine = sampled(light, lat_long_directions(128, 256))[..., 0]
+    irradiance = np.sum(fine * lat_long_solid_angles(128, 256)[:, None])
     expected = 0.8 / np.pi * irradiance * cosine
     lit, unlit = inside & (cosine > 0.25), inside & (cosine < -0.2)
     assert lit.sum() > 8
@@ -47,7 +43,10 @@ def test_a_one_texel_light_lights_a_ball_from_its_side(texel):
 def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
     """One pixel's worth: a ball's radiance in a smooth light against a sum over directions of the written formula."""
     light = smooth_light(32)
-    image = pixel_of_ball(material, light)
+    pose = tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ BALL)
+    ball = {"type": "sphere", "to_world": tracing.transform(pose), "bsdf": tracing.bsdf(material)}
+    scene = {"ball": ball, "light": tracing.envmap(light)}
+    image = tracing.traced(scene, PIXEL, AT_ORIGIN, 200_000, 2, 2)[0, 0]
     depth = 4.0 - np.sqrt(1 - 0.6**2 - 0.3**2)  # of the ball where the camera's axis meets it
     normal, view = np.array([0, 0, depth]) - BALL, np.array([0, 0, -1.0])
     incoming = lat_long_directions(512, 1024) @ YUP_FROM_CAMERA
@@ -64,18 +63,9 @@ def reflectance(material, normal, incoming, view):
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     ni, no, nh = np.maximum(incoming @ normal, 1e-9), view @ normal, half @ normal
     d = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
-    g = smith(alpha, ni) * smith(alpha, no)
+    shadowing = [2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2)) for c in (ni, no)]
+    g = shadowing[0] * shadowing[1]
     return np.array(material.diffuse) / np.pi + np.array(material.specular) * (d * g / (4 * ni * no))[..., None]
-
-
-def smith(alpha, c):
-    return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2))
-
-
-def pixel_of_ball(material, light):
-    pose = tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ BALL)
-    ball = {"type": "sphere", "to_world": tracing.transform(pose), "bsdf": tracing.bsdf(material)}
-    return tracing.traced({"ball": ball, "light": tracing.envmap(light)}, PIXEL, AT_ORIGIN, 200_000, 2, 2)[0, 0]
 
 
 def smooth_light(height):

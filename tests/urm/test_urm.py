@@ -1,4 +1,4 @@
-"""Observations of photos: which pixels, in files, one after another, merged, and brought to one exposure."""
+"""Observations of photos: which pixels, in files, one after another, merged, sampled, and brought to one exposure."""
 
 import msgspec
 import numpy as np
@@ -6,11 +6,20 @@ import pytest
 
 from factorlib.conventions import FRONT
 from factorlib.errors import InputError
-from factorlib.urm.cells import groups
-from factorlib.urm.exposure import at_one_exposure, relative_exposures
+from factorlib.geometry.met import BINS, UNMET
 from factorlib.urm.extract import Taken, observations_of_photo
-from factorlib.urm.merge import merge
-from factorlib.urm.observations import COLUMNS, OPTIONAL, concatenate, read_observations, write_observations
+from factorlib.urm.merge import groups, merge
+from factorlib.urm.observations import (
+    COLUMNS,
+    OPTIONAL,
+    Observations,
+    at_one_exposure,
+    concatenate,
+    read_observations,
+    relative_exposures,
+    write_observations,
+)
+from factorlib.urm.sample import sample, strata
 
 
 def photo_and_geometry(size=64):
@@ -19,12 +28,13 @@ def photo_and_geometry(size=64):
     inside = x**2 + y**2 < 0.98
     z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     one = inside.astype("f4")
-    geometry = {
-        "normal.x": x * one, "normal.y": y * one, "normal.z": z * one, "view.x": 0 * one, "view.y": 0 * one,
-        "view.z": -one,
-    }  # fmt: skip
-    geometry |= {"label": np.where(x < 0, 1, 2) * one, "confidence": one}
-    photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": np.where(x < 0, 1, 2) * one, "valid": one}
+    label, vectors = (
+        np.where(x < 0, 1, 2) * one,
+        {"normal": (x * one, y * one, z * one), "view": (0 * one, 0 * one, -one)},
+    )
+    geometry = {f"{name}.{axis}": v for name, vector in vectors.items() for axis, v in zip("xyz", vector)}
+    geometry |= {"label": label, "confidence": one}
+    photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": label, "valid": one}
     photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}
     return photo, geometry
 
@@ -55,16 +65,28 @@ def test_half_of_a_normal_facing_the_viewer_is_the_front():
     np.testing.assert_allclose(seen.half[middle], FRONT, atol=0.05)
 
 
-def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path):
-    seen = observations()
-    seen = msgspec.structs.replace(seen, confidence=np.linspace(0, 1, len(seen)).astype("f4"))
+def with_columns(name="kitchen", count=64):
+    """Observations with every column that need not be there; what hides directions is of material 0 or 1."""
+    seen, random = observations(name, name), np.random.default_rng(0)
+    visibility = (random.integers(0, 2, (len(seen), count)) * 255).astype(np.uint8)
+    met = np.where(visibility == 0, random.integers(0, 2 * BINS, visibility.shape), UNMET).astype(np.uint16)
+    sure = np.linspace(0, 1, len(seen)).astype("f4")
+    return msgspec.structs.replace(seen, visibility=visibility, met=met, confidence=sure, exposures=(2.0,))
+
+
+@pytest.mark.parametrize("make", [with_columns, observations])
+def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path, make):
+    seen = make()
     write_observations(tmp_path / "a.parquet", seen)
     write_observations(tmp_path / "b.parquet", read_observations(tmp_path / "a.parquet"))
     again = read_observations(tmp_path / "b.parquet")
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     for name in (*COLUMNS, *OPTIONAL):
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name).astype(getattr(again, name).dtype))
-    assert (again.materials, again.photos) == (("red", "white"), ("kitchen",))
+    for name in ("visibility", "met"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
+    known = tuple(exposure for exposure in seen.exposures if exposure)
+    assert (again.materials, again.photos, again.exposures) == (("red", "white"), ("kitchen",), known)
 
 
 def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
@@ -73,21 +95,27 @@ def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
         read_observations(tmp_path / "x.parquet")
 
 
-def test_a_map_need_not_say_how_sure_normals_are(tmp_path):
-    seen = observations()
-    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, confidence=None))
-    assert read_observations(tmp_path / "a.parquet").confidence is None
-    half = msgspec.structs.replace(observations("hall", "hall"), confidence=np.full(len(seen), 0.5, "f4"))
-    both = concatenate([half, read_observations(tmp_path / "a.parquet")])
-    assert {float(both.confidence[both.photo == k].mean()) for k in range(2)} == {0.5, 1.0}
-
-
-@pytest.mark.parametrize("confidence", [1.5, -0.1, np.nan])
-def test_a_confidence_that_is_none_is_refused(tmp_path, confidence):
-    seen = observations()
-    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, confidence=np.full(len(seen), confidence)))
-    with pytest.raises(InputError, match="'confidence' is not between 0 and 1"):
+@pytest.mark.parametrize("key, change", [
+    ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence + 0.5}),
+    ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence * np.nan}),
+    ("met", lambda seen: {"met": seen.met * 0 + 2 * BINS}), ("met", lambda seen: {"met": seen.met[:, :32]}),
+])  # fmt: skip
+def test_values_that_mean_nothing_are_refused(tmp_path, key, change):
+    seen = with_columns()
+    write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, **change(seen)))
+    with pytest.raises(InputError, match=key):
         read_observations(tmp_path / "a.parquet")
+
+
+def test_photos_that_do_not_say_see_all_and_are_sure():
+    part, plain = with_columns("a"), msgspec.structs.replace(observations("b", "b"), confidence=None)
+    both = concatenate([part, plain])
+    np.testing.assert_array_equal(both.visibility[both.photo == 0], part.visibility)
+    of_plain = both.photo == 1
+    assert (both.visibility[of_plain] == 255).all() and (both.met[of_plain] == UNMET).all()
+    assert (both.confidence[of_plain] == 1).all() and both.exposures == (2.0, None)
+    with pytest.raises(InputError, match="64, 128"):
+        concatenate([part, with_columns("b", count=128)])
 
 
 def test_the_order_of_photos_changes_nothing():
@@ -114,12 +142,16 @@ def test_merging_keeps_weight_and_mean_and_moves_normals_by_less_than_a_cell(deg
     np.testing.assert_allclose(np.linalg.norm(merged.normal, axis=1), 1, atol=1e-5)
 
 
-def test_merging_takes_the_weighted_mean_of_confidence():
-    seen = observations()
-    sure = np.random.default_rng(0).uniform(0.1, 1, len(seen)).astype("f4")
-    merged = merge(msgspec.structs.replace(seen, weight=sure, confidence=sure), 10.0)
-    np.testing.assert_allclose((merged.weight * merged.confidence).sum(), np.square(sure).sum(), rtol=1e-5)
-    assert 0.1 <= merged.confidence.min() and merged.confidence.max() <= 1
+def test_merging_takes_weighted_means_and_the_codes_of_the_first():
+    seen = with_columns()
+    seen = msgspec.structs.replace(seen, weight=np.random.default_rng(0).uniform(0.1, 1, len(seen)).astype("f4"))
+    merged = merge(seen, 8.0)
+    for name, tolerance in (("visibility", 2e-3), ("confidence", 1e-5)):
+        sums = (np.dot(each.weight.astype(float), getattr(each, name)) for each in (merged, seen))
+        np.testing.assert_allclose(*sums, rtol=tolerance)
+    first = [int(np.flatnonzero((seen.x == x) & (seen.y == y))[0]) for x, y in zip(merged.x, merged.y, strict=True)]
+    np.testing.assert_array_equal(merged.met, seen.met[first])
+    assert 0 <= merged.confidence.min() and merged.confidence.max() <= 1 and merged.exposures == seen.exposures
 
 
 def test_merging_never_mixes_clipped_with_unclipped():
@@ -166,13 +198,96 @@ def test_one_photo_that_does_not_say_leaves_the_light_as_it_is():
     assert at_one_exposure(seen, relative) is seen
 
 
-def test_exposures_pass_through_files_and_merging(tmp_path):
-    seen = exposed("a", "room", 2.0)
-    write_observations(tmp_path / "a.parquet", seen)
-    assert read_observations(tmp_path / "a.parquet").exposures == (2.0,) == merge(seen, 5.0).exposures
-    unknown, silent = exposed("a", "room", None), observations("a", "room")
-    for name, part in (("b", unknown), ("c", msgspec.structs.replace(silent, exposures=()))):
-        write_observations(tmp_path / f"{name}.parquet", part)
-    assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "c.parquet").read_bytes(), (
-        "what is unknown leaves no trace"
-    )
+def test_an_exposure_that_is_unknown_leaves_no_trace_in_a_file(tmp_path):
+    for name, exposures in (("a", (None,)), ("b", ())):
+        write_observations(tmp_path / name, msgspec.structs.replace(observations("a", "room"), exposures=exposures))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def many(n: int = 20_000, seed: int = 0) -> Observations:
+    """A flat seat that most pixels show, and a ball that few do; a fifth of the ball's are clipped."""
+    random = np.random.default_rng(seed)
+    normal = np.tile([0.0, -0.6, -0.8], (n, 1))
+    ball = random.normal(size=(n // 20, 3)) * (1, 1, 0.5) - (0, 0, 2)
+    normal[: n // 20] = ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    clipped = np.zeros((n, 3), bool)
+    clipped[: n // 100] = True
+    y, x = np.divmod(np.arange(n), 200)
+    order = random.permutation(n)
+    return Observations(
+        normal=normal[order].astype("f4"), view=np.tile([0.0, 0.0, -1.0], (n, 1)).astype("f4"),
+        radiance=random.uniform(0.5, 1.5, (n, 3)),
+        clipped=clipped[order], material=(np.arange(n) % 2)[order].astype("i2"), photo=np.zeros(n, "i4"),
+        illumination=np.zeros(n, "i4"),
+        x=x.astype("i4"), y=y.astype("i4"), weight=random.uniform(0.1, 1, n).astype("f4"),
+        materials=("red", "white"), photos=("a",), illuminations=("a",), exposures=(0.5,),
+    )  # fmt: skip
+
+
+def test_no_more_than_that_many_are_no_sample():
+    seen = many(2000)
+    assert sample(seen, 2000) is seen and sample(seen, 10**9) is seen
+
+
+@pytest.mark.parametrize("most", [5000, 1500, 100])
+def test_there_are_as_many_as_asked_for(most):
+    assert len(sample(many(), most)) == most
+
+
+def test_weights_keep_their_sum_in_every_stratum_and_in_all():
+    seen = many()
+    kept = sample(seen, 3000)
+    assert kept.weight.sum(dtype=float) == pytest.approx(seen.weight.sum(dtype=float), rel=1e-5)
+    for material in (0, 1):
+        for clipped in (False, True):
+            total = [
+                s.weight[(s.material == material) & (s.clipped[:, 0] == clipped)].sum(dtype=float) for s in (seen, kept)
+            ]
+            assert total[1] == pytest.approx(total[0], rel=1e-5)
+
+
+def test_rare_normals_are_all_kept_and_the_flat_seat_is_thinned():
+    seen = many()
+    kept = sample(seen, 3000)
+    flat = [np.abs(s.normal - np.float32([0, -0.6, -0.8])).max(1) < 1e-6 for s in (seen, kept)]
+    assert (~flat[1]).sum() == (~flat[0]).sum() == 1000
+    assert flat[1].sum() <= 2000 and (kept.weight[~flat[1]] == seen.weight[~flat[0]]).all()
+
+
+def test_the_sample_is_spread_over_the_picture_and_the_same_each_time():
+    seen = many()
+    kept, again = sample(seen, 3000), sample(many(), 3000)
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(kept, name), getattr(again, name))
+    assert (np.diff(kept.y * 200 + kept.x) > 0).all(), "in row order"
+    share = np.histogram(kept.y, 10, (0, 100))[0] / len(kept)
+    assert share.min() > 0.08 and share.max() < 0.12
+
+
+def test_the_mean_of_a_stratum_is_kept_within_its_noise():
+    seen = many()
+    kept = sample(seen, 3000)
+    group, small = strata(seen, 3000), strata(kept, 3000)
+    most = np.bincount(group).argmax()
+    means = [
+        np.average(s.radiance[g == n], axis=0, weights=s.weight[g == n])
+        for s, g, n in ((seen, group, most), (kept, small, np.bincount(small).argmax()))
+    ]
+    np.testing.assert_allclose(*means, atol=0.04)
+
+
+def test_names_exposures_and_the_rest_stay():
+    visibility = np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8)
+    seen = msgspec.structs.replace(many(), visibility=visibility)
+    kept = sample(seen, 3000)
+    assert (kept.materials, kept.photos, kept.exposures) == (seen.materials, seen.photos, seen.exposures)
+    row = kept.y * 200 + kept.x
+    for name in ("visibility", "radiance"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(seen, name)[row])
+
+
+def test_a_sampled_ball_merges_to_what_the_whole_ball_merges_to():
+    seen = observations()
+    whole, part = merge(seen, 20.0), merge(sample(seen, len(seen) // 2), 20.0)
+    assert part.weight.sum(dtype=float) == pytest.approx(whole.weight.sum(dtype=float), rel=1e-5)
+    assert len(part) > 0.9 * len(whole)
