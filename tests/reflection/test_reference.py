@@ -7,7 +7,7 @@ import torch
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.brdf import ggx, specular
 from factorlib.reflection.lobe import lobe_integral
-from factorlib.reflection.reference import LEVELS, converged, specular_quadrature
+from factorlib.reflection.reference import LEVELS, about_half_vector, about_lobe, converged, specular_quadrature
 from factorlib.reflection.samples import specular_inputs, specular_samples
 
 R = reflection_operator("reference")
@@ -53,6 +53,12 @@ def test_levels_converge_to_one_part_in_a_hundred_thousand():
     finer = specular_quadrature(LEVELS[-3], *inputs)
     floor = 1e-3 * lobe_integral(inputs[1])
     assert ((value - finer).abs() <= 1e-5 * (finer + floor)).all()
+
+
+def test_both_quadratures_agree():
+    inputs = specular_inputs(64, 4, alpha=(0.15, 1.0), sharpness=(0.3, 60.0), least_no=0.1)
+    a, b = (rule(135, *inputs) for rule in (about_lobe, about_half_vector))
+    assert ((a - b).abs() <= 1e-5 * (a + 1e-3 * lobe_integral(inputs[1]))).all()
 
 
 def test_a_point_light_reflects_the_brdf():
