@@ -17,7 +17,7 @@ from factorlib.runner import verbs
 from factorlib.runner.executors import Pools
 from factorlib.runner.gc import collect
 from factorlib.runner.project import LIBRARY
-from tests.faults.test_many_photos import own_modules
+from tests.faults.battered import own_modules
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, reasons, state, write
 
