@@ -15,17 +15,9 @@ from factorlib.elementary import square_root
 
 ROOT = Path(__file__).resolve().parents[1]
 EMULATOR = shutil.which("qemu-x86_64")
-WIDEST = {
-    "OPENBLAS_CORETYPE": "",
-    "ATEN_CPU_CAPABILITY": "",
-    "MKL_CBWR": "",
-    "NPY_DISABLE_CPU_FEATURES": "",
-}  # what this processor has
 SOLVE = """
-import sys
-if sys.argv[1] == "fixed":
-    from factorlib.arithmetic import fix
-    fix()
+from factorlib.arithmetic import fix
+fix()
 import hashlib, msgspec, torch
 torch.set_num_threads(1)
 from factorlib.reflection import fused
@@ -44,39 +36,30 @@ print(hashlib.sha256(np.exp(x).tobytes() + (x @ x).tobytes()).hexdigest())
 """
 
 
-def process(*command: str, **environment: str) -> str:
-    """What a process prints that no test has set variables for."""
+def process(code: str, emulator: tuple[str, ...] = (), **environment: str) -> str:
+    """What Python prints in a process that no test has set variables for."""
     set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES and not k.startswith("PYTEST_")}
-    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=set_ | environment, capture_output=True, text=True)
+    set_ |= {"OMP_NUM_THREADS": "1"} | environment
+    command = [*emulator, sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env=set_, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def solved(how: str, *emulator: str, **environment: str) -> str:
-    """The hash of a brief solve in a process of its own."""
-    set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES} | {"OMP_NUM_THREADS": "1"}
-    set_ |= {name: value for name, value in environment.items() if value}
-    done = subprocess.run(
-        [*emulator, sys.executable, "-c", SOLVE, how], cwd=ROOT, env=set_, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
 def test_a_solve_is_the_same_bits_whatever_the_variables_were():
-    assert solved("fixed", **WIDEST) == solved("fixed", OPENBLAS_CORETYPE="Nehalem", ATEN_CPU_CAPABILITY="default")
+    assert process(SOLVE) == process(SOLVE, OPENBLAS_CORETYPE="Nehalem", ATEN_CPU_CAPABILITY="default")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(EMULATOR is None, reason="qemu-x86_64 is not installed (Debian: qemu-user)")
 @pytest.mark.parametrize("processor", ["EPYC-Rome", "Haswell-noTSX"])
 def test_a_solve_is_the_same_bits_on_an_emulated_processor(processor):
-    assert solved("fixed", EMULATOR, "-cpu", processor) == solved("fixed")
+    assert process(SOLVE, emulator=(EMULATOR, "-cpu", processor)) == process(SOLVE)
 
 
 def test_a_test_computes_the_bits_of_a_worker(capsys):
     exec(BITS, {})
-    assert capsys.readouterr().out == process("-c", BITS, **VARIABLES)
+    assert capsys.readouterr().out == process(BITS, **VARIABLES)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

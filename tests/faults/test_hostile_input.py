@@ -98,8 +98,8 @@ def with_values(**values):
 
 def many_rows(path):
     """A kilobyte that stands for gigabytes: 200 million rows of one number."""
-    schema = pa.schema({"illumination": pa.float64()}, metadata={"factorlib": "{}"})
-    table = pa.table({"illumination": pa.array(np.zeros(10_000_000))}, schema=schema)
+    schema = pa.schema({"illumination": pa.int8()}, metadata={"factorlib": "{}"})
+    table = pa.table({"illumination": pa.array(np.zeros(10_000_000, np.int8))}, schema=schema)
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for _ in range(20):
             writer.write_table(table)

@@ -51,6 +51,7 @@ COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 WHOM = ("all of its processes", "the run", "one that is at work")
 LONG = pytest.mark.long
+some_of = lambda every, *short: [pytest.param(one, marks=() if one in short else LONG) for one in every]  # noqa: E731
 few = lambda some, most: pytest.mark.parametrize(  # noqa: E731
     "seeds", [range(some), pytest.param(range(some, most), marks=LONG)], ids=str
 )
@@ -255,7 +256,7 @@ libc.signal(signal.SIGTERM, _c_stack)  # what pycolmap does where it is imported
 """
 
 
-@pytest.mark.parametrize("whom", [*WHOM[1:2], pytest.param(WHOM[0], marks=LONG)])
+@pytest.mark.parametrize("whom", some_of(WHOM[:2], "the run"))
 def test_sigterm_ends_a_run_as_an_interrupt_does_and_no_library_that_takes_it_prints_a_stack(fresh, whom):
     edit(fresh, "upper", "class Params", C_STACK + "class Params")
     process = start(fresh, "upper.sleep=30")
@@ -373,7 +374,10 @@ MEANWHILE = {  # what changes while a step runs -> that stage, the line before w
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", MEANWHILE)
+@pytest.mark.parametrize(
+    "what",
+    some_of(MEANWHILE, "a photo goes", "a result is spoilt", "the code is another", "a file of its package is another"),
+)
 def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made_once, capfd, what):
     """Nothing is kept under a key that says something else, and once it is as it was the run goes on."""
     stage, before, code, words = MEANWHILE[what]
@@ -404,7 +408,7 @@ def test_edited_code_runs_for_no_further_photo_and_a_remark_stops_nothing(fresh,
 CLOCK = "import time\n_now, _now_ns = time.time, time.time_ns\ntime.time = lambda: _now() - {0}\ntime.time_ns = lambda: _now_ns() - {0} * 10**9\n"
 
 
-@pytest.mark.parametrize("days", [1, *(pytest.param(days, marks=LONG) for days in (400, -1, -4000))])
+@pytest.mark.parametrize("days", some_of([1, 400, -1, -4000], 1))
 def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(made_once, project, days):
     """All files are from the future, and what is edited now is older than what is remembered."""
     seconds, before = days * 86400, len(done(project))
@@ -422,7 +426,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(made_once, proje
     no_loss("a clock that goes back", [wrong + lost_in(project, results(made_once))])
 
 
-@pytest.mark.parametrize("link", ["build", pytest.param("build/store", marks=LONG)])
+@pytest.mark.parametrize("link", some_of(["build", "build/store"], "build"))
 def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_nothing(fresh, made_once, tmp_path, link):
     """Killed here, moved, and finished there."""
     if not Path("/dev/shm").is_dir() or Path("/dev/shm").stat().st_dev == fresh.root.stat().st_dev:
@@ -440,12 +444,13 @@ def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_no
         shutil.rmtree(place)
 
 
-GONE = (".", "set", "store", *(f"store/{name}" for name in ("trees", "keys", "views", "logs", "locks", "cache", "tmp")))
+GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "logs", "locks", "cache", "tmp")), "store")
 
 
-def test_a_folder_of_results_that_is_deleted_is_made_again(project):
+@pytest.mark.parametrize("folders", [GONE[:4], pytest.param(GONE[4:], marks=LONG)], ids=["results", "the rest"])
+def test_a_folder_of_results_that_is_deleted_is_made_again(project, folders):
     wanted = results(project)
-    for gone in (gone for gone in GONE if (project.build / gone).exists()):
+    for gone in (gone for gone in folders if (project.build / gone).exists()):
         shutil.rmtree(project.build / gone)
         verbs.show_status(project, verbs.Wish("set"))
         again = make(project) == 0 and is_sound(project)
@@ -553,7 +558,7 @@ DAMAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("damage", some_of(DAMAGES, "other content", "one too many", "all gone"))
 def test_a_damaged_result_is_made_again_and_nothing_else_is_and_a_damaged_view_too(project, damage):
     before = results(project)
     DAMAGES[damage](tree_of(project, "total", "total.txt"))
@@ -665,12 +670,8 @@ def limited():
     resource.setrlimit(resource.RLIMIT_FSIZE, (SIZE // 2, SIZE // 2))
 
 
-SHORT = [("table", kind) for kind in NO_ROOM] + [("upper", "a disk that is full")]
-
-
-@pytest.mark.parametrize("stage, kind", [
-    pytest.param(stage, kind, marks=() if (stage, kind) in SHORT else LONG) for stage in STAGES for kind in NO_ROOM
-])  # fmt: skip
+@pytest.mark.parametrize("stage", some_of(STAGES, "table"))
+@pytest.mark.parametrize("kind", some_of(NO_ROOM, *list(NO_ROOM)[:3]))
 def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, again, request, stage, kind):
     """Without root's rights, which pass limits."""
     (words, raised), project = NO_ROOM[kind], again(fresh)
@@ -695,7 +696,7 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     no_loss(kind.partition(",")[0], [lost_in(project, results(usual))])
 
 
-@pytest.mark.parametrize("free", [0, *(pytest.param(free, marks=LONG) for free in range(40_000, 400_000, 40_000))])
+@pytest.mark.parametrize("free", some_of(range(0, 400_000, 40_000), 0))
 def test_wherever_the_disk_becomes_full_the_next_run_ends_in_the_same_bytes(fresh, made_once, again, disk, free):
     """In results, keys, logs, links and caches: of all that a run writes."""
     project = again(fresh)

@@ -247,7 +247,7 @@ def takers(project, slice_, photo, dataset):
 
 
 CHANGES = {  # kind -> who makes them, at random, and how many a short and a long test take
-    "a line of a module": (lines, 6, 600),
+    "a line of a module": (lines, 4, 600),
     "a module, all plans made anew": (whole_modules, 4, None),
     "comments, docstrings and layout": (remarks, 4, None),
     "a file of a package": (files_of_packages, 3, None),
