@@ -36,29 +36,30 @@ print(hashlib.sha256(np.exp(x).tobytes() + (x @ x).tobytes()).hexdigest())
 """
 
 
-def printed(code: str, *emulator: str, **environment: str) -> str:
-    """What a process prints that no test has set variables for."""
+def process(code: str, emulator: tuple[str, ...] = (), **environment: str) -> str:
+    """What Python prints in a process that no test has set variables for."""
     set_ = {k: v for k, v in os.environ.items() if k not in VARIABLES and not k.startswith("PYTEST_")}
-    set_ |= {"OMP_NUM_THREADS": "1", **environment}
-    done = subprocess.run([*emulator, sys.executable, "-c", code], cwd=ROOT, env=set_, capture_output=True, text=True)
+    set_ |= {"OMP_NUM_THREADS": "1"} | environment
+    command = [*emulator, sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env=set_, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def test_a_solve_is_the_same_bits_whatever_the_variables_were():
-    assert printed(SOLVE) == printed(SOLVE, OPENBLAS_CORETYPE="Nehalem", ATEN_CPU_CAPABILITY="default")
+    assert process(SOLVE) == process(SOLVE, OPENBLAS_CORETYPE="Nehalem", ATEN_CPU_CAPABILITY="default")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(EMULATOR is None, reason="qemu-x86_64 is not installed (Debian: qemu-user)")
 @pytest.mark.parametrize("processor", ["EPYC-Rome", "Haswell-noTSX"])
 def test_a_solve_is_the_same_bits_on_an_emulated_processor(processor):
-    assert printed(SOLVE, EMULATOR, "-cpu", processor) == printed(SOLVE)
+    assert process(SOLVE, emulator=(EMULATOR, "-cpu", processor)) == process(SOLVE)
 
 
 def test_a_test_computes_the_bits_of_a_worker(capsys):
     exec(BITS, {})
-    assert capsys.readouterr().out == printed(BITS, **VARIABLES)
+    assert capsys.readouterr().out == process(BITS, **VARIABLES)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -1,6 +1,9 @@
-"""`factorlib.load_result`: what was solved, in Python."""
+"""`factorlib.load_result`: what was solved, in Python; and the Python that README.md and docs/ show of it, on a small result."""
 
+import ast
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +17,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
+from factorlib.runner.project import LIBRARY
 from tests.export import made_export
 
 
@@ -205,3 +209,44 @@ def test_a_damaged_file_of_a_result_is_named(copy, file, break_, ask, words):
 def test_importing_the_package_imports_nothing_heavy():
     code = "import sys, factorlib; assert not {'numpy', 'torch', 'mitsuba'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# ── the pages: names of the small result stand in place of those of data/eames ───────────────────────────────────────
+
+SMALL = {
+    "build/eames": "build/set", "kitchen": "side", "garden": "front", "terrace": "front", "yellow_chair": "chair",
+    "kitchn": "sid", "width=320": "width=32",
+}  # fmt: skip
+
+
+def run(code, names):
+    """As a notebook does: the HTML of the last line's value, where it is an expression that has some."""
+    for name, small in SMALL.items():
+        code = code.replace(name, small)
+    tree = ast.parse(code)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, "cell", "exec"), names)
+    value = None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+    return value._repr_html_() if hasattr(value, "_repr_html_") else None
+
+
+def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(folder, monkeypatch, capsys):
+    (docs := folder.parent.parent / "docs").mkdir()
+    monkeypatch.chdir(docs)
+    cells, names = json.loads((LIBRARY / "docs" / "result.ipynb").read_text())["cells"], {}
+    shown = [run("".join(cell["source"]), names) for cell in cells if cell["cell_type"] == "code"]
+    shown = [html for html in shown if html]
+    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 5] and "0.350 ± 0.100" in shown[0]
+    said = capsys.readouterr().out
+    assert "roughness 0.350 ± 0.100" in said
+    assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))
+    assert sorted(path.name for path in docs.iterdir()) == ["chair.exr", "chair.png", "side.exr", "side.hdr"]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/recipes.md"])
+def test_the_examples_of_the_pages_run(folder, page, tmp_path, monkeypatch):
+    (tmp_path / "build").symlink_to(folder.parent)
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (LIBRARY / page).read_text(), re.DOTALL)
+    (code,) = [block for block in blocks if "load_result" in block]
+    run(code, {})

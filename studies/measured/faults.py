@@ -18,7 +18,7 @@ import msgspec
 from factorlib.errors import InputError
 from studies.measured.tools import ROOT, Tables
 
-TESTS = ("test_nothing_lost", "test_no_room", "test_real_kills", "test_reruns", "test_fuzz")
+TESTS = ("test_nothing_lost", "test_reruns", "test_fuzz")
 COLUMNS = {  # table in the log -> its title, and the head of the first column with those of the numbers, by field
     "faults": ("Faults", {"": "fault", "tries": "tries", "lost": "lost"}),
     "reruns": ("Reruns", {"": "change", "tries": "changes", "lost": "wrong reruns"}),

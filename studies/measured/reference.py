@@ -1,39 +1,50 @@
 """The numbers of data/synthetic that a run must reproduce: `python -m studies.measured.reference "why they changed"` writes them anew.
 
-It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again) and writes
-tests/regression/synthetic.json: of each number its value with the default seed, its range and deviation over seeds, the tolerance that
-follows, and the reasons of all refreshes with what each changed.  `make test` runs the default seed and compares.
+It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again), as it is and SMALL, and writes
+synthetic.json and small.json in tests/regression: of each number its value with the default seed, its range and deviation over seeds, the
+tolerance that follows, and the reasons of all refreshes with what each changed.  `make test` runs the default seed SMALL and compares,
+`make test-long` runs it as it is.  Of SMALL the files of each stage count too, so that a change is named where it begins.
 
 Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's of n − 1 degrees of freedom at 1 − DOUBT / 2: two runs that
              differ by nothing but their seeds lie further apart once in 1 / DOUBT times, a number.  On the processors of
              docs/reproducibility.md a run gives the same bits, so that any change at all is one of the sources; a change within
-             the tolerance is as small as another seed's.
+             the tolerance is as small as another seed's.  What knows no seed has ROUNDING of itself.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import pyarrow.parquet as pq
 from scipy.stats import t as student
 
 from factorlib.errors import InputError
 from factorlib.evaluate.table import SYNTHETIC, value_at
+from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
+from factorlib.runner import verbs
+from factorlib.runner.project import Project, photo_sets
 from studies.measured.tools import ROOT, Tables, evaluated
 
-DATASET, SEEDS, DOUBT = "synthetic", 5, 0.01
-STORED = ROOT / "tests" / "regression" / "synthetic.json"
+DATASET, SEEDS, DOUBT, ROUNDING = "synthetic", 5, 0.01, 1e-5
+FOLDER = ROOT / "tests" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
+SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
 NUMBERS = {  # dotted path in metrics.json -> meaning
     **{bound.path: bound.meaning for bound in SYNTHETIC},
     "materials.mean_roughness": "roughness, mean over materials",
     "materials.mean_diffuse": "diffuse, mean, relative",
     "materials.mean_specular": "specular, mean, relative",
 }
+FILES = {  # stage -> those of its files that are images and tables of numbers
+    "masks": "*.exr", "align": "*.exr", "urm": "*.parquet", "solve": "coverage/*.exr",
+    "export": "illumination/*.exr", "render": "resynthesis/*.exr",
+}  # fmt: skip
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,7 +66,7 @@ class Refresh(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file.  numbers: by their dotted path in metrics.json;  refreshes: the newest first."""
+    """The whole file.  numbers: by their dotted path in metrics.json, or stage and channel;  refreshes: the newest first."""
 
     dataset: str
     seeds: int
@@ -73,11 +84,46 @@ def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
     return float(student.ppf(1 - doubt / 2, len(values) - 1) * np.sqrt(2) * np.std(values, ddof=1))
 
 
-def differences(metrics: object, stored: Stored) -> dict[str, str]:
+def of_metrics(metrics: object) -> dict[str, float | None]:
+    """The NUMBERS in what a metrics.json holds; None for each that is missing."""
+    return {path: value_at(metrics, path) for path in NUMBERS}
+
+
+def of_stages(folder: Path) -> dict[str, float]:
+    """{"stage.channel": root mean square over all FILES of that stage} of the results of a run."""
+    values: dict[str, list[np.ndarray]] = {}
+    for stage, pattern in FILES.items():
+        for path in sorted((folder / stage).glob(pattern)):
+            for name, channel in (read_exr(path) if path.suffix == ".exr" else _columns(path)).items():
+                values.setdefault(f"{stage}.{name}", []).append(channel[np.isfinite(channel)].astype(float).ravel())
+    return {name: float(np.sqrt(np.mean(np.square(np.concatenate(of))))) for name, of in values.items()}
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a table, each as one array; of columns of bytes, the bytes."""
+    columns = {}
+    for name, rows in pq.read_table(path).to_pydict().items():
+        columns[name] = np.frombuffer(b"".join(rows), np.uint8) if isinstance(rows[0], bytes) else np.array(rows)
+    return columns
+
+
+def run_small(root: Path, seed: int = 0) -> dict[str, float | None]:
+    """The numbers of data/synthetic run SMALL, by a project of its own in the folder `root`."""
+    for name in ("pipeline.yaml", "stages", "factorlib", "data"):
+        if not (root / name).exists():
+            (root / name).symlink_to(ROOT / name)
+    project = Project(root, photo_sets())
+    if verbs.make(project, verbs.Wish(DATASET, settings=[*SMALL, f"solve.seed={seed}"])):
+        raise SystemExit(1)  # it has said why
+    build = project.build / DATASET
+    return of_metrics(read_json(build / "evaluate" / "metrics.json")) | of_stages(build)
+
+
+def differences(values: dict[str, float | None], stored: Stored) -> dict[str, str]:
     """Path -> a line for people, of each number that is missing or further from the stored one than its tolerance, for better or worse."""
     lines = {}
     for path, old in stored.numbers.items():
-        new = value_at(metrics, path)
+        new = values.get(path)
         if new is None or not abs(new - old.value) <= old.tolerance:
             change = "missing" if new is None else f"{new:.4g}, by {new - old.value:+.2g}"
             lines[path] = f"{old.meaning}: old {old.value:.4g}, new {change}, tolerance {old.tolerance:.2g} ({path})"
@@ -90,25 +136,29 @@ def complaint(lines: dict[str, str]) -> str:
     return f"{len(lines)} number(s) of data/{DATASET} are not those stored:\n{listed}\nif that is meant, store them: {COMMAND}"
 
 
-def read_stored() -> Stored:
-    """The stored numbers."""
-    return msgspec.convert(read_json(STORED), Stored)
+def read_stored(name: str = DATASET) -> Stored:
+    """The stored numbers of a run: `synthetic`, as it is, or `small`."""
+    return msgspec.convert(read_json(FOLDER / f"{name}.json"), Stored)
 
 
-def stored(runs: Sequence[object], reason: str, before: Stored | None) -> Stored:
+def stored(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
     """The numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
-    values = {path: [value_at(metrics, path) for metrics in runs] for path in NUMBERS}
+    values = {path: [run.get(path) for run in runs] for path in runs[0]}
     if missing := [path for path, of in values.items() if None in of]:
         raise InputError(
             "there is no such number", file=Path("metrics.json"), key=missing[0], cure="correct NUMBERS in studies/measured/reference.py"
         )  # fmt: skip
-    numbers = {
-        p: Number(NUMBERS[p], v[0], min(v), max(v), float(np.std(v, ddof=1)), tolerance(v)) for p, v in values.items()
-    }
+    numbers = {path: _number(path, of) for path, of in values.items()}
     old = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
     refreshes = [Refresh(reason, changed), *(before.refreshes if before else [])]
     return Stored(DATASET, len(runs), DOUBT, numbers, refreshes)
+
+
+def _number(path: str, values: list[float]) -> Number:
+    allowed = max(tolerance(values), ROUNDING * abs(values[0]))
+    meaning = NUMBERS.get(path, f"{path}, root mean square")
+    return Number(meaning, values[0], min(values), max(values), float(np.std(values, ddof=1)), allowed)
 
 
 def rows() -> Tables:
@@ -124,11 +174,17 @@ def main(reason: str) -> None:
     """Run all seeds, the default one last, so that build/ has it afterwards; write, and print what changed."""
     if not reason:
         raise InputError("no reason is given", key="reason", cure=COMMAND)
-    before = read_stored() if STORED.exists() else None
-    runs = [evaluated(DATASET, SET=f"solve.seed={seed}") for seed in reversed(range(SEEDS))][::-1]
-    write_json(STORED, new := stored(runs, reason, before))
-    changed = [f"{new.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in new.refreshes[0].changed.items()]
-    print("\n".join(changed) or "nothing changed")
+    with tempfile.TemporaryDirectory() as folder:
+        small = [run_small(Path(folder), seed) for seed in range(SEEDS)]
+    whole = [of_metrics(evaluated(DATASET, SET=f"solve.seed={seed}")) for seed in reversed(range(SEEDS))][::-1]
+    for name, runs in (("small", small), (DATASET, whole)):
+        write_json(FOLDER / f"{name}.json", new := stored(runs, reason, _before(name)))
+        changed = [f"{new.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in new.refreshes[0].changed.items()]
+        print("\n".join([f"{name}:", *changed]) if changed else f"{name}: nothing changed")
+
+
+def _before(name: str) -> Stored | None:
+    return read_stored(name) if (FOLDER / f"{name}.json").exists() else None
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What tests of faults share: a finished toy, small disks, and another user, without root's rights."""
+"""What tests of faults share: a finished toy, folders of an earlier run, and another user, without root's rights."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.battered import make
+from tests.faults.battered import make, real_project
 from tests.runner import toy
 
 NOBODY = 65534
@@ -26,6 +26,18 @@ def made_once(tmp_path_factory):
 def project(made_once, tmp_path):
     """The toy, everything current, in a checkout of its own."""
     return toy.copy(made_once, tmp_path / "checkout")
+
+
+@pytest.fixture
+def fresh(tmp_path):
+    """The toy, nothing made yet."""
+    return toy.make_project(tmp_path / "root")
+
+
+@pytest.fixture(scope="module")
+def linked(tmp_path_factory):
+    """This project with a build/ of its own."""
+    return real_project(tmp_path_factory.mktemp("project"))
 
 
 @pytest.fixture

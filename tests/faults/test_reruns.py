@@ -1,4 +1,4 @@
-"""Which steps get new keys by a single change: exactly those that the change can reach, and those below them.
+"""Which steps get new keys by a single change: exactly those that the change can reach, and those below them; `why` names it.
 
 Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of
 code another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml.  `make test` takes a sample
@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import cProfile
 import importlib.metadata
-import io
 import json
-import keyword
 import os
 import random
-import shutil
-import tokenize
 from functools import cache
 from importlib.metadata import packages_distributions
+from itertools import islice
 from pathlib import Path
 
 import grimp
@@ -27,27 +25,33 @@ import pytest
 import yaml
 
 from factorlib.errors import InputError
+from factorlib.runner import words
 from factorlib.runner.pipeline import read_pipeline
-from factorlib.runner.plan import Listing, difference, plan
-from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.plan import Listing, Spec, difference, plan
+from factorlib.runner.project import LIBRARY, photo_sets
 from factorlib.runner.survey import survey
 from factorlib.runner.worker import Code, load_stage
-from tests.faults.test_many_photos import Everything
-from tests.faults.tries import note
+from tests.faults.battered import make, note, real_project
+from tests.faults.good import edited as edited_data
+from tests.runner import toy
+from tests.runner.toy import reasons, state, write
 
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices)
 STAGES = list(PIPELINE.stages)
-LINES, MANY_LINES, MODULES = 20, 600, 8  # of the samples
+LONG = pytest.mark.long
+
+
+class Everything(dict):
+    """A store that holds a result of every key, another for each."""
+
+    def get(self, key, default=None):
+        return f"output of {key}"
 
 
 @pytest.fixture(scope="module")
-def project(tmp_path_factory):
+def real(tmp_path_factory):
     """This project, to be edited."""
-    root = tmp_path_factory.mktemp("project")
-    for name in ("stages", "factorlib", "data", "recipes"):
-        shutil.copytree(LIBRARY / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(LIBRARY / "pipeline.yaml", root)
-    return Project(root, photo_sets())
+    return real_project(tmp_path_factory.mktemp("project"), "pipeline.yaml", "stages", "factorlib", "data", "recipes")
 
 
 def planned(project, settings=(), dataset="synthetic"):
@@ -61,7 +65,7 @@ def keys(project, settings=(), dataset="synthetic"):
 
 
 @cache
-def usual(project, dataset):
+def usual(project, dataset="synthetic"):
     return keys(project, dataset=dataset)
 
 
@@ -76,7 +80,7 @@ def other_keys(project, settings=(), dataset="synthetic"):
 def edited(project, contents: dict[str, bytes | str]):
     """Within, files of the project hold something else."""
     before = {name: (project.root / name).read_bytes() for name in contents}
-    usual(project, "synthetic"), usual(project, "eames")
+    usual(project), usual(project, "eames")
     try:
         for name, content in contents.items():
             (project.root / name).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -90,24 +94,22 @@ def below(project, steps, dataset="synthetic"):
     """Those steps, and all that take their results, however far: read from pipeline.yaml, step by step."""
     found = set(steps)
     for name in PIPELINE.order():
-        for step in usual(project, dataset):
-            stage, _, photo = step.partition("/")
-            if stage == name and any(_takes(stage, photo, above) for above in found):
-                found.add(step)
+        of = (step for step in usual(project, dataset) if step.partition("/")[0] == name)
+        found |= {step for step in of if any(_takes(step, above) for above in found)}
     return found
 
 
-def _takes(stage, photo, above):
-    above_stage, _, above_photo = above.partition("/")
+def _takes(step, above):
+    (stage, _, photo), (above_stage, _, above_photo) = step.partition("/"), above.partition("/")
     alone = PIPELINE.stages[stage].over == "photo" and PIPELINE.stages[above_stage].over == "photo"
     return above_stage in PIPELINE.stages[stage].inputs and (photo == above_photo or not alone)
 
 
 def steps_of(project, stages):
-    return {step for step in usual(project, "synthetic") if step.partition("/")[0] in stages}
+    return {step for step in usual(project) if step.partition("/")[0] in stages}
 
 
-# ── code ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── code, files of packages, files of data sets ──────────────────────────────────────────────────────────────────────
 
 
 @cache
@@ -128,130 +130,215 @@ def reached_by(stage):
     return found
 
 
-def users(module):
-    return {stage for stage in STAGES if module in reached_by(stage)}
+def users(project, module):
+    """The steps that run a module, and those below."""
+    return below(project, steps_of(project, {stage for stage in STAGES if module in reached_by(stage)}))
+
+
+OTHER = (ast.Name, ast.BinOp, ast.Constant)
 
 
 @cache
 def modules():
     """{name: file within the project} of the modules that any stage runs."""
-    files = {}
-    for name in sorted({name for stage in STAGES for name in reached_by(stage)}):
-        path = Path(*name.split("."))
-        for file in (path.with_suffix(".py"), path / "__init__.py"):
-            if (LIBRARY / file).is_file():
-                files[name] = str(file)
-    return files
+    paths = {name: Path(*name.split(".")) for name in sorted(set().union(*map(reached_by, STAGES)))}
+    files = {name: (path.with_suffix(".py"), path / "__init__.py") for name, path in paths.items()}
+    return {name: str(file) for name, both in files.items() for file in both if (LIBRARY / file).is_file()}
 
 
 def text_of(module):
     return (LIBRARY / modules()[module]).read_text(encoding="utf-8")
 
 
-OTHER = dict(
-    zip(
-        ["+", "-", "*", "/", "<", ">", "<=", ">=", "==", "!=", "|", "&", "+=", "-=", "True", "False", "and", "or"],
-        ["-", "+", "/", "*", "<=", ">=", "<", ">", "!=", "==", "&", "|", "-=", "+=", "False", "True", "or", "and"],
-    )
-)
+def lines(project, chance):
+    """A name, a number, a text or an operator in a line of a module is another."""
+    while True:
+        module = chance.choice(sorted(modules()))
+        tree = ast.parse(text_of(module))
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        places = [node for node in ast.walk(tree) if isinstance(node, OTHER) and id(node) not in docstrings]
+        for node in places and [chance.choice(places)]:
+            if isinstance(node, ast.Name):
+                node.id += "_"
+            elif isinstance(node, ast.BinOp):
+                node.op = ast.Mod() if isinstance(node.op, ast.Sub) else ast.Sub()
+            else:
+                node.value = f"{node.value}x" if isinstance(node.value, str) else another(node.value or 0)
+            yield {modules()[module]: ast.unparse(tree)}, "synthetic", users(project, module)
 
 
-def mutations(text):
-    """{line: texts in which one token of it is another}, but for docstrings; some are no Python."""
-    bodies = [node.body for node in ast.walk(ast.parse(text)) if isinstance(getattr(node, "body", None), list)]
-    texts = [
-        item for body in bodies for item in body if isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)
+def whole_modules(project, chance):
+    for module in chance.sample(sorted(modules()), len(modules())):
+        yield {modules()[module]: text_of(module) + "\nNEW = 1\n"}, "synthetic", users(project, module)
+
+
+def remarks(project, chance):
+    """Comments, docstrings and layout: texts that say the same to Python and YAML, of twenty modules at once."""
+    for name in ("data/synthetic/dataset.yaml", "data/synthetic/truth/truth.yaml"):
+        spec = yaml.safe_load((project.root / name).read_text())
+        text = "# a remark\n" + yaml.safe_dump(spec, default_flow_style=True, sort_keys=False)
+        yield {name: text}, "synthetic", set()
+    mixed = chance.sample(sorted(modules()), len(modules()))
+    for some in (mixed[k : k + 20] for k in range(0, len(mixed), 20)):
+        anew, more = {}, {}
+        for module in some:
+            tree = ast.parse(text_of(module))
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+                    node.body[0].value.value = "Other words."
+            anew[modules()[module]] = ast.unparse(tree)
+            more[modules()[module]] = f"# a remark\n\n{text_of(module)}\n# another\n"
+        yield from ((contents, "synthetic", set()) for contents in (anew, more))
+
+
+def files_of_packages(project, chance):
+    """Weights, templates, kernels: whatever lies in the folder of a module that is run."""
+    root = project.root
+    files = [path for path in sorted((root / "factorlib").rglob("*")) if path.is_file() and path.suffix != ".py"]
+    for path in chance.sample(files, len(files)):
+        package = ".".join(next(f for f in path.parents if (f / "__init__.py").exists()).relative_to(root).parts)
+        in_it = lambda stage, package=package: package in {m.rpartition(".")[0] for m in reached_by(stage)}  # noqa: E731
+        stages = {stage for stage in STAGES if package in reached_by(stage) or in_it(stage)}
+        yield (
+            {str(path.relative_to(root)): path.read_bytes() + b"\n"},
+            "synthetic",
+            below(project, steps_of(project, stages)),
+        )
+
+
+def files_of_data_sets(project, chance):
+    folders = {dataset: LIBRARY / "data" / dataset for dataset in ("synthetic", "eames")}
+    files = [
+        (dataset, p)
+        for dataset, f in folders.items()
+        for p in sorted(f.rglob("*"))
+        if p.is_file() and p.suffix != ".yaml"
     ]
-    docstrings = {(item.lineno, item.col_offset) for item in texts}
-    lines, by_line = text.splitlines(keepends=True), {}
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        new = OTHER.get(token.string)
-        if new is None and token.type in (tokenize.NAME, tokenize.NUMBER) and not keyword.iskeyword(token.string):
-            new = token.string + ("7" if token.type == tokenize.NUMBER else "_")
-        elif token.type == tokenize.STRING and token.start not in docstrings and not token.string.endswith('"""'):
-            new = f"{token.string[:-1]}x{token.string[-1]}"
-        if new is not None and token.start[0] == token.end[0]:
-            line = lines[token.start[0] - 1]
-            changed = line[: token.start[1]] + new + line[token.end[1] :]
-            by_line.setdefault(token.start[0], []).append(
-                "".join([*lines[: token.start[0] - 1], changed, *lines[token.start[0] :]])
-            )
-    return by_line
+    for dataset, path in chance.sample(files, len(files)):
+        direct = readers(project, dataset, str(path.relative_to(folders[dataset])))
+        yield {str(path.relative_to(LIBRARY)): path.read_bytes() + b"\n"}, dataset, below(project, direct, dataset)
 
 
-def imported(text):
-    return [ast.dump(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+def readers(project, dataset, file):
+    """The steps that are handed a file of a data set, by what dataset.yaml says of it."""
+    folder, found = LIBRARY / "data" / dataset, set()
+    spec = yaml.safe_load((folder / "dataset.yaml").read_text())
+    for photo in spec["photos"]:
+        masks = photo["masks"] if isinstance(photo["masks"], dict) else {"": photo["masks"]}
+        own = {obj.get("mask") for obj in photo["objects"]}
+        meshes = {Path(spec["meshes"][obj["mesh"]]["file"]) for obj in photo["objects"]}
+        rows = [
+            (mesh, row) for mesh in meshes if mesh.suffix == ".obj" for row in (folder / mesh).read_text().splitlines()
+        ]
+        near = {str(mesh.parent / row.split()[1]) for mesh, row in rows if row.startswith("mtllib ")}
+        if file in {photo["image"], *masks.values(), *own}:
+            found |= takers(project, "dataset.photo", photo["name"], dataset)
+        if file in {*map(str, meshes), *near, *own}:
+            found |= takers(project, "dataset.objects", photo["name"], dataset)
+    truth = yaml.safe_load((folder / spec["truth"]).read_text()) if spec.get("truth") else {}
+    maps = {*truth.get("illumination", {}).values(), *truth.get("normals", {}).values()}
+    return found | (takers(project, "dataset.truth", None, dataset) if file in maps else set())
 
 
-def check_line(project, module, texts):
-    """Whether one of the texts imports the same: then what runs the module gets new keys, and what is below."""
-    for text in texts:
-        try:
-            if imported(text) != imported(text_of(module)) or ast.dump(ast.parse(text)) == ast.dump(
-                ast.parse(text_of(module))
-            ):
-                continue
-            with edited(project, {modules()[module]: text}):
-                assert other_keys(project) == below(project, steps_of(project, users(module))), module
-            return True
-        except (SyntaxError, InputError):
-            continue
-    return False
+def takers(project, slice_, photo, dataset):
+    steps = (step.partition("/") for step in usual(project, dataset))
+    taking = ((stage, mid, of) for stage, mid, of in steps if slice_ in PIPELINE.stages[stage].inputs)
+    return {stage + mid + of for stage, mid, of in taking if PIPELINE.stages[stage].over != "photo" or of == photo}
 
 
-@pytest.mark.parametrize("lines", [LINES, pytest.param(MANY_LINES, marks=pytest.mark.long)])
-def test_a_line_of_any_module_reruns_what_runs_it_and_what_is_below(project, lines):
-    chance = random.Random(17)
-    chosen = chance.sample(sorted(modules()), min(lines, len(modules())))
-    every = [(module, texts) for module in chosen for texts in mutations(text_of(module)).values()]
-    sample = chance.sample(every, lines)
-    changed = sum(check_line(project, module, texts) for module, texts in sample)
-    note("reruns", "a line of a module", changed)
-    assert changed > 0.7 * len(sample), "the others import, or hold nothing that can be another"
+CHANGES = {  # kind -> who makes them, at random, and how many a short and a long test take
+    "a line of a module": (lines, 4, 600),
+    "a module, all plans made anew": (whole_modules, 4, None),
+    "comments, docstrings and layout": (remarks, 4, None),
+    "a file of a package": (files_of_packages, 3, None),
+    "a file of a data set": (files_of_data_sets, 6, None),
+}
 
 
-@pytest.mark.parametrize("share", [MODULES, pytest.param(None, marks=pytest.mark.long)])
-def test_a_change_of_a_module_changes_the_keys_of_what_runs_it_alone(project, share):
-    """All modules of the project count that are imported, as grimp sees it."""
-    chosen = sorted(modules()) if share is None else random.Random(3).sample(sorted(modules()), share)
-    for module in chosen:
-        with edited(project, {modules()[module]: text_of(module) + "\nNEW = 1\n"}):
-            assert other_keys(project) == below(project, steps_of(project, users(module))), module
-    note("reruns", "a module, all plans made anew", len(chosen))
+@pytest.mark.parametrize("most", [1, pytest.param(2, marks=LONG)], ids=["few", "all"])
+@pytest.mark.parametrize("kind", CHANGES)
+def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else(real, kind, most):
+    changed = tried = 0
+    for contents, dataset, reached in islice(CHANGES[kind][0](real, random.Random(17)), CHANGES[kind][most]):
+        tried += 1
+        with edited(real, contents):
+            try:
+                assert other_keys(real, dataset=dataset) == reached, list(contents)[:3]
+                changed += 1
+            except InputError:
+                assert kind == "a line of a module", "a line may make a default that is refused"
+    note("reruns", kind, changed)
+    assert changed > 0.7 * tried
 
 
-def of_no_account(text):
-    """By what was done: texts that say the same to Python."""
-    lines, tree = text.splitlines(keepends=True), ast.parse(text)
-    tokens = list(tokenize.generate_tokens(io.StringIO(text).readline))
-    alone = {t.start[0] for t in tokens if t.type == tokenize.COMMENT and not t.line[: t.start[1]].strip()}
-    ends = {t.end[0] for t in tokens if t.type == tokenize.NEWLINE}
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body and ast.get_docstring(node):
-            body[0].value.value = "Other words."
-    yield "comments", "".join(line for k, line in enumerate(lines, 1) if k not in alone) + "# a remark\n"
-    yield "layout", "".join(line + ("\n" if k in ends else "") for k, line in enumerate(lines, 1))
-    yield "docstrings, formatted anew", ast.unparse(tree)
+def test_an_edit_that_keeps_size_and_time_is_noticed(real):
+    """Of a file of the data set, of a module and of a file of a package; all are old enough to be remembered."""
+    for name, old, new in (
+        ("data/synthetic/masks/study.png", b"IEND", b"IENE"),
+        ("factorlib/urm/merge.py", b"return ", b"return-"),
+        ("factorlib/reflection/kernel.c", b"int ", b"long"),
+    ):
+        path, before = real.root / name, (real.root / name).read_bytes()
+        os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns - 10**10))
+        known, stat = keys(real), path.stat()
+        with edited(real, {name: before.replace(old, new, 1)}):
+            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+            assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
+            assert keys(real) != known, name
+        note("reruns", "an edit that keeps size and time")
+    assert other_keys(real) == set()
 
 
-@pytest.mark.parametrize("share", [8, pytest.param(1, marks=pytest.mark.long)])
-def test_comments_docstrings_and_layout_change_no_key(project, share):
-    """Of many modules at once: what changes no key together changes none alone."""
-    changes = {}
-    for module in list(modules())[::share]:
-        for what, text in of_no_account(text_of(module)):
-            changes.setdefault(what, {})[modules()[module]] = text
-    for contents in changes.values():
-        with edited(project, contents):
-            assert other_keys(project) == set()
-    note("reruns", "comments, docstrings and layout, modules", sum(map(len, changes.values())))
+@cache
+def packages():
+    """Distributions that any stage imports, and the names they are imported by."""
+    distributions, found = packages_distributions(), {}
+    for name in set().union(*map(reached_by, STAGES)) - modules().keys():
+        for distribution in distributions.get(name, []):
+            found.setdefault(distribution, set()).add(name)
+    return found
+
+
+@pytest.mark.parametrize("share", [6, pytest.param(1, marks=LONG)])
+def test_another_version_of_a_package_reruns_who_imports_it(real, monkeypatch, share):
+    usual(real)
+    version, by, known = importlib.metadata.version, packages_distributions(), real.build / "store/cache/packages.json"
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
+    for distribution in sorted(packages())[::share]:
+        newer = lambda name, it=distribution: f"{version(name)}.1" if name == it else version(name)  # noqa: E731
+        monkeypatch.setattr(importlib.metadata, "version", newer)
+        known.unlink(missing_ok=True)
+        stages = {stage for stage in STAGES if packages()[distribution] & reached_by(stage)}
+        assert stages and other_keys(real) == below(real, steps_of(real, stages)), distribution
+        note("reruns", "a package's version")
+    known.unlink(missing_ok=True)
+
+
+def test_the_form_of_the_reflection_operator_is_in_the_keys_of_what_runs_it(real, monkeypatch):
+    reached = users(real, "factorlib.reflection.fused")
+    assert steps_of(real, {"solve", "render", "refine", "train"}) <= reached
+    for name, value in (("FACTORLIB_FUSED", "0"), ("CC", "no-such-compiler")):
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            assert other_keys(real) == reached
+
+
+def test_no_module_is_named_only_at_run_time():
+    """`import_module(name)` hides a module from the keys of the steps that run it; the runner alone loads stages so.
+
+    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it.
+    """
+    loaders = {"import_module", "__import__", "run_path", "run_module", "spec_from_file_location"}
+    files = {*(LIBRARY / "factorlib").rglob("*.py"), *(LIBRARY / "stages").rglob("*.py")}
+    for path in files - {LIBRARY / "factorlib" / "__init__.py", *(LIBRARY / "factorlib" / "runner").rglob("*.py")}:
+        nodes = ast.walk(ast.parse(path.read_text()))
+        assert not {getattr(node, "id", getattr(node, "attr", "")) for node in nodes} & loaders, path
+    assert not [p for p in (LIBRARY / "stages").glob("*.py") if "load_result" in p.read_text()]
 
 
 # ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@cache
 def params_of(stage):
     return load_stage(Code(LIBRARY, "stages", stage, {}, LIBRARY / "pipeline.yaml")).Params
 
@@ -259,11 +346,6 @@ def params_of(stage):
 def leaves(values, above=""):
     for name, value in values.items():
         yield from leaves(value, f"{above}{name}.") if isinstance(value, dict) else [(above + name, value)]
-
-
-def defaults(stage):
-    """The default of every parameter, as the struct itself has it."""
-    return dict(leaves(msgspec.to_builtins(params_of(stage)())))
 
 
 def another(value):
@@ -284,22 +366,6 @@ def record_of(project, stage, settings=()):
     return next(p.record for p in planned(project, settings) if p.step.stage == stage)
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_each_parameter_of_a_stage_reruns_it_and_what_is_below_and_its_default_nothing(project, stage):
-    values = defaults(stage)
-    assert other_keys(project, words_of(stage, values)) == set(), "set to their defaults"
-    others = {name: another(value) for name, value in values.items()}
-    after = record_of(project, stage, words_of(stage, others))
-    lines, reached = "\n".join(difference(record_of(project, stage), after)), below(project, steps_of(project, {stage}))
-    alone = [
-        name for name in values if f"parameter {name}: " not in lines
-    ]  # the others each stand in the key by themselves
-    for some in (others, *({name: others[name]} for name in alone)):
-        assert not some or other_keys(project, words_of(stage, some)) == reached, some
-    note("reruns", "a parameter", len(values))
-    note("reruns", "a parameter set to its default", len(values))
-
-
 def without_fields(text, class_, fields):
     """The source of a module whose class has lost some fields."""
     tree = ast.parse(text)
@@ -308,165 +374,176 @@ def without_fields(text, class_, fields):
     return ast.unparse(tree)
 
 
-@pytest.mark.parametrize("stage", [stage for stage in STAGES if defaults(stage)])
-def test_parameters_that_are_removed_are_noticed_named_and_refused(project, stage):
-    """Of each class in which fields of the parameters are written, all of them."""
-    classes = {}
-    for field in {name.partition(".")[0] for name in defaults(stage)}:
+WITH = [stage for stage in STAGES if [*leaves(msgspec.to_builtins(params_of(stage)()))]]
+
+
+@pytest.mark.parametrize("stage", [
+    pytest.param(stage, marks=() if stage in ("urm", "solve") else LONG) for stage in WITH
+])  # fmt: skip
+def test_each_parameter_reruns_its_stage_and_what_is_below_its_default_nothing_and_one_removed_is_named(real, stage):
+    values, before = dict(leaves(msgspec.to_builtins(params_of(stage)()))), record_of(real, stage)
+    assert other_keys(real, words_of(stage, values)) == set(), "set to their defaults"
+    others = {name: another(value) for name, value in values.items()}
+    lines = "\n".join(difference(before, record_of(real, stage, words_of(stage, others))))
+    unnamed = [name for name in values if f"parameter {name}: " not in lines]  # the others each stand in the key
+    for some in (others, *({name: others[name]} for name in unnamed)):
+        assert other_keys(real, words_of(stage, some)) == below(real, steps_of(real, {stage})), some
+    classes = {}  # in which fields of the parameters are written
+    for field in {name.partition(".")[0] for name in values}:
         owner = next(c for c in params_of(stage).__mro__ if field in getattr(c, "__annotations__", {}))
         classes.setdefault((owner.__module__, owner.__name__), []).append(field)
-    before = record_of(project, stage)
     for (module, class_), fields in classes.items():
-        with edited(project, {modules()[module]: without_fields(text_of(module), class_, fields)}):
-            assert other_keys(project) == below(project, steps_of(project, users(module)))
-            lines = difference(before, record_of(project, stage))
+        with edited(real, {modules()[module]: without_fields(text_of(module), class_, fields)}):
+            assert other_keys(real) == users(real, module)
+            lines = difference(before, record_of(real, stage))
             assert all(any(line.startswith(f"default of parameter {field}:") for line in lines) for field in fields)
             with pytest.raises(InputError, match=f"has no parameter '{fields[0]}'"):
-                keys(project, [f"{stage}.{fields[0]}=1"])
+                keys(real, [f"{stage}.{fields[0]}=1"])
         note("reruns", "a parameter removed", len(fields))
+    note("reruns", "a parameter", len(values))
+    note("reruns", "a parameter set to its default", len(values))
 
 
-def test_a_parameter_taken_out_of_pipeline_yaml_is_noticed(project):
-    text = (project.root / "pipeline.yaml").read_text()
+def test_a_parameter_taken_out_of_pipeline_yaml_is_noticed(real):
+    text = (real.root / "pipeline.yaml").read_text()
     more = text.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1)
-    with edited(project, {"pipeline.yaml": more}):
-        assert other_keys(project) == below(project, steps_of(project, {"solve"}))
-    assert other_keys(project) == set()
+    with edited(real, {"pipeline.yaml": more}):
+        assert other_keys(real) == below(real, steps_of(real, {"solve"}))
+    assert other_keys(real) == set()
 
 
-GIVEN = [(stage, param) for stage, found in PIPELINE.stages.items() for param in found.given]
-
-
-@pytest.mark.parametrize("stage, param", GIVEN)
-def test_a_folder_that_is_given_reruns_its_stage_and_what_is_below_by_content(project, tmp_path, stage, param):
+@pytest.mark.parametrize("stage, param", [(s, param) for s, found in PIPELINE.stages.items() for param in found.given])
+def test_a_folder_that_is_given_reruns_its_stage_and_what_is_below_by_content(real, tmp_path, stage, param):
     for folder in ("one", "same"):
-        (tmp_path / folder).mkdir()
         for file in PIPELINE.stages[stage].given[param]:
-            (tmp_path / folder / file).write_text("{}")
+            write(tmp_path / folder / file, "{}")
     given, same = ([f"{stage}.{param}={tmp_path / folder}"] for folder in ("one", "same"))
-    assert other_keys(project, given) == below(project, steps_of(project, {stage})) and keys(project, given) == keys(
-        project, same
-    )
-    note("reruns", "a folder that is given", 1)
+    assert other_keys(real, given) == below(real, steps_of(real, {stage})) and keys(real, given) == keys(real, same)
+    note("reruns", "a folder that is given")
 
 
-# ── files, packages and the environment ──────────────────────────────────────────────────────────────────────────────
+def test_a_default_that_the_source_does_not_tell_for_certain_is_no_default(project):
+    """A key that is too new costs time; one that is too old would give the result of another parameter."""
+    uncertain = toy.TABLE.replace("class Params", "GAIN = 1\nif msgspec:\n    GAIN = 2\nclass Params", 1)
+    write(project.root / "stages" / "table.py", uncertain.replace("scale: int = 2", "scale: int = GAIN"))
+    assert make(project) == 0 and (project.build / "set" / "total" / "total.txt").read_text() == "total: 18"
+    assert {state(project, settings=(f"table.scale={scale}",))["table"] for scale in (1, 2)} == {"to run"}
 
 
-def readers(project, dataset, file):
-    """The steps that are handed a file of a data set, by what dataset.yaml says of it."""
-    folder, found = LIBRARY / "data" / dataset, set()
-    spec = yaml.safe_load((folder / "dataset.yaml").read_text())
-    for photo in spec["photos"]:
-        masks = photo["masks"] if isinstance(photo["masks"], dict) else {"": photo["masks"]}
-        own = {obj.get("mask") for obj in photo["objects"]}
-        meshes = {spec["meshes"][obj["mesh"]]["file"] for obj in photo["objects"]}
-        texts = {mesh: (folder / mesh).read_text().splitlines() for mesh in meshes if mesh.endswith(".obj")}
-        near = {
-            str(Path(mesh).parent / line.split()[1])
-            for mesh in texts
-            for line in texts[mesh]
-            if line.startswith("mtllib ")
-        }
-        if file in {photo["image"], *masks.values(), *own}:
-            found |= takers(project, "dataset.photo", photo["name"], dataset)
-        if file in meshes | near | own:
-            found |= takers(project, "dataset.objects", photo["name"], dataset)
-    truth = yaml.safe_load((folder / spec["truth"]).read_text()) if spec.get("truth") else {}
-    maps = {*truth.get("illumination", {}).values(), *truth.get("normals", {}).values()}
-    return found | (takers(project, "dataset.truth", None, dataset) if file in maps else set())
+# ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def takers(project, slice_, photo, dataset):
-    steps = (step.partition("/") for step in usual(project, dataset))
-    taking = ((stage, mid, of) for stage, mid, of in steps if slice_ in PIPELINE.stages[stage].inputs)
-    return {stage + mid + of for stage, mid, of in taking if PIPELINE.stages[stage].over != "photo" or of == photo}
+def test_every_file_in_the_package_of_a_module_counts_but_what_python_or_an_editor_leaves(project):
+    counting = ["kernel.c", "table", "weights/w.json", "README.md", "lib.so"]
+    others = [".letters.py.swp", "letters.py~", "#letters.py#", ".hidden/x.c", "letters.pyc"]
+    for name in [*others, "__pycache__/letters.cpython-311.pyc"]:
+        write(project.root / "toylib" / name, "1")
+    assert set(state(project).values()) == {"current"}
+    for name in counting:
+        write(project.root / "toylib" / name, "1")
+    assert make(project) == 0
+    for name in counting:
+        write(project.root / "toylib" / name, "2")
+    assert reasons(project, "count/a") == [f"package data toylib:{name}: changed" for name in sorted(counting)]
+    for name in counting:
+        write(project.root / "toylib" / name, "1")
+    (project.root / "toylib" / "table").unlink()
+    assert reasons(project, "count/a") == ["package data toylib:table: gone"]
 
 
-@pytest.mark.parametrize("dataset", ["synthetic", "eames"])
-def test_a_file_of_a_data_set_reruns_who_is_handed_it_and_what_is_below(project, dataset):
-    folder = project.root / "data" / dataset
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".yaml")
-    for path in files:
-        with edited(project, {str(path.relative_to(project.root)): path.read_bytes() + b"\n"}):
-            direct = readers(project, dataset, str(path.relative_to(folder)))
-            assert other_keys(project, dataset=dataset) == below(project, direct, dataset), path
-    note("reruns", "a file of a data set", len(files))
+SPEAKING = 'import os\nENVIRONMENT = ("TOY_FORM",)\nPROGRAMS = {"TOY_CC": "sh"}\ndef letters(text):\n    return len(text) if os.environ.get("TOY_FORM") == "0" else 1\n'
 
 
-def test_remarks_and_layout_of_a_data_sets_yaml_change_no_key(project):
-    for name in ("data/synthetic/dataset.yaml", "data/synthetic/truth/truth.yaml"):
-        spec = yaml.safe_load((project.root / name).read_text())
-        with edited(project, {name: "# a remark\n" + yaml.safe_dump(spec, default_flow_style=True, sort_keys=False)}):
-            assert other_keys(project) == set()
+def test_an_environment_variable_and_a_program_that_a_module_declares_are_in_the_key(fresh, monkeypatch):
+    monkeypatch.delenv("TOY_FORM", raising=False), monkeypatch.delenv("TOY_CC", raising=False)
+    letters, total = fresh.root / "toylib" / "letters.py", fresh.build / "set" / "total" / "total.txt"
+    write(letters, SPEAKING)
+    assert make(fresh) == 0 and total.read_text() == "total: 4"
+    monkeypatch.setenv("TOY_FORM", "0")
+    assert reasons(fresh, "count/a") == ['environment variable TOY_FORM: none -> "0"']
+    assert state(fresh)["upper/a"] == "current", "only what runs that module"
+    assert make(fresh) == 0 and total.read_text() == "total: 18"
+    monkeypatch.delenv("TOY_FORM")
+    assert set(state(fresh).values()) == {"current"}, "the other form's results are still there"
+    monkeypatch.setenv("TOY_CC", "no-such-program")
+    assert 'program TOY_CC: "sh" -> none' in reasons(fresh, "count/a")
+    monkeypatch.setenv("TOY_CC", "/bin/sh")
+    assert set(state(fresh).values()) == {"current"}, "where it lies is no matter"
+    monkeypatch.setenv("TOY_CC", "sh 'open")
+    with pytest.raises(InputError, match="is no command") as caught:
+        state(fresh)
+    assert caught.value.key == "TOY_CC"
+    write(letters, SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
+    with pytest.raises(InputError, match=r"(?s)letters\.py.*ENVIRONMENT"):
+        state(fresh)
 
 
-def test_a_file_of_a_package_reruns_who_runs_that_package(project):
-    """Weights, templates, kernels: whatever lies in the folder of a module that is run."""
-    names = [str(p.relative_to(project.root)) for p in sorted((project.root / "factorlib").rglob("*")) if p.is_file()]
-    data = [name for name in names if not name.endswith(".py")]
-    counting = 0
-    for name in data:
-        folder = next(f for f in (project.root / name).parents if (f / "__init__.py").exists())
-        package = ".".join(folder.relative_to(project.root).parts)
-        stages = {
-            s for s in STAGES if package in reached_by(s) or any(m.rpartition(".")[0] == package for m in reached_by(s))
-        }
-        with edited(project, {name: (project.root / name).read_bytes() + b"\n"}):
-            assert other_keys(project) == below(project, steps_of(project, stages)), name
-        counting += bool(stages)
-    assert counting > 10 and "factorlib/reflection/kernel.c" in data
-    note("reruns", "a file of a package", counting)
+# ── why ──────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+CHAIR = {"file": "chair.obj", "parts": {"shell": "red", "legs": "white"}}
+C, V = {"name": "c", "mesh": "chair"}, {"name": "v", "mesh": "vase"}
+KITCHEN = {"name": "kitchen", "image": "kitchen.jpg", "masks": "mask.png", "objects": [C]}
+HALL = {"name": "hall", "image": "hall.jpg", "masks": {"red": "mask.png"}, "objects": [C, V]}
+MESHES = {"chair": CHAIR, "vase": {"file": "vase.ply", "material": "white"}}
+SET = {"format": 1, "materials": ["red", "white"], "meshes": MESHES, "photos": [KITCHEN, HALL]}
+FIELDS = [  # where something is set, and the line that says so
+    ("photos.0.encoding", "linear", 'dataset.yaml: photos.*.encoding: not given -> "linear"'),
+    ("photos.0.camera", {"focal_px": 812.0}, "dataset.yaml: photos.*.camera.focal_px: not given -> 812.0"),
+    ("photos.0.illumination", "hall", 'dataset.yaml: photos.*.illumination: "kitchen" -> "hall"'),
+    ("photos.0.illumination", "one", 'photos.kitchen.illumination: "kitchen" -> "one"'),
+    ("photos.0.masks", "own.png", 'dataset.yaml: photos.*.masks: "mask.png" -> "own.png"'),
+    ("photos.1.objects.1.mask", "own.png", 'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"'),
+    ("photos.1.objects.0.materials", {"legs": "red"}, 'photos.*.objects[0].materials.legs: not given -> "red"'),
+    ("meshes.chair.parts.legs", "red", 'dataset.yaml: meshes.chair.parts.legs: "white" -> "red"'),
+    ("materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' came"),
+    ("materials", ["white", "red"], 'dataset.yaml: materials: ["red", "white"] -> ["white", "red"]'),
+]  # fmt: skip
 
 
-def test_an_edit_that_keeps_size_and_time_is_noticed(project):
-    """Of a file of the data set, of a module and of a file of a package; all are old enough to be remembered."""
-    for name, old, new in (("data/synthetic/masks/study.png", b"IEND", b"IENE"),
-    ("factorlib/urm/merge.py", b"return ", b"return-"),
-                           ("factorlib/reflection/kernel.c", b"int ", b"long")):  # fmt: skip
-        path = project.root / name
-        for _ in range(2):  # an edit, and back again
-            os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns - 10**10))
-            before, stat = keys(project), path.stat()
-            path.write_bytes(path.read_bytes().replace(old, new, 1))
-            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-            assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
-            assert keys(project) != before, name
-            old, new = new, old
-        note("reruns", "an edit that keeps size and time", 1)
-    assert other_keys(project) == set()
+def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(real, project, tmp_path):
+    """As `make why` would print, if all had been made, then dataset.yaml changed."""
+    for name in ("kitchen.jpg", "hall.jpg", "mask.png", "own.png", "chair.obj", "vase.ply"):
+        write(tmp_path / "set" / name, "")
+
+    def planned_with(spec=SET, settings=(), made=()):
+        write(tmp_path / "set" / "dataset.yaml", yaml.safe_dump(spec))
+        seen = survey(real, str(tmp_path / "set"), None, list(settings))
+        listing = Listing({p.key: p.output for p in made}, {str(p.step): p.record for p in made})
+        return plan(seen.spec, seen.records, listing if made else Listing(Everything(), {}))
+
+    def why(made, spec=SET, settings=()):
+        return "\n".join(words.why_lines(planned_with(spec, settings, made)))
+
+    made, lobes = planned_with(), ["solve.lobes=48"]
+    for place, value, line in FIELDS:
+        text = why(made, edited_data(SET, *(int(w) if w.isdigit() else w for w in place.split(".")), value=value))
+        assert line in text and "changed" not in text.replace("file ", "")
+    linear = edited_data(SET, "photos", value=[photo | {"encoding": "linear"} for photo in SET["photos"]])
+    assert why(made, linear).count("encoding") == 1, "what changed in every photo is said once"
+    assert "parameter lobes: 72 (the default) -> 48" in why(made, settings=lobes)
+    assert "parameter lobes: 48 -> 72 (the default)" in why(planned_with(settings=lobes))
+    write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
+    assert reasons(project, "table") == ["default of parameter scale: 2 -> 3", "source of stages.table: changed"]
 
 
-@cache
-def packages():
-    """Distributions that any stage imports, and the names they are imported by."""
-    distributions, found = packages_distributions(), {}
-    for name in {name for stage in STAGES for name in reached_by(stage)} - modules().keys():
-        for distribution in distributions.get(name, []):
-            found.setdefault(distribution, set()).add(name)
-    return found
+# ── many photos ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("share", [5, pytest.param(1, marks=pytest.mark.long)])
-def test_another_version_of_a_package_reruns_who_imports_it(project, monkeypatch, share):
-    usual(project, "synthetic")
-    version, by = importlib.metadata.version, packages_distributions()
-    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
-    for distribution in sorted(packages())[::share]:
-        newer = lambda name, it=distribution: f"{version(name)}.1" if name == it else version(name)  # noqa: E731
-        monkeypatch.setattr(importlib.metadata, "version", newer)
-        (project.build / "store" / "cache" / "packages.json").unlink(missing_ok=True)
-        stages = {stage for stage in STAGES if packages()[distribution] & reached_by(stage)}
-        assert stages and other_keys(project) == below(project, steps_of(project, stages)), distribution
-        note("reruns", "a package's version", 1)
-    (project.build / "store" / "cache" / "packages.json").unlink(missing_ok=True)
+def work(function):
+    """How many calls a call makes."""
+    profile = cProfile.Profile()
+    profile.runcall(function)
+    return sum(entry.callcount for entry in profile.getstats())
 
 
-def test_the_form_of_the_reflection_operator_is_in_the_keys_of_what_runs_it(project, monkeypatch):
-    usual(project, "synthetic")
-    stages = users("factorlib.reflection.fused")
-    assert {"solve", "render", "refine", "train"} <= stages
-    for name, value in (("FACTORLIB_FUSED", "0"), ("CC", "no-such-compiler")):
-        with monkeypatch.context() as patch:
-            patch.setenv(name, value)
-            assert other_keys(project) == below(project, steps_of(project, stages))
+@pytest.mark.parametrize("outputs", [{}, Everything()])
+def test_a_plan_is_linear_in_the_number_of_photos(outputs):
+    """By the work that is done, not by a clock."""
+
+    def planning(photos):
+        spec = Spec(PIPELINE, [f"p{k}" for k in range(photos)])
+        own = {step: {"stage": step.stage, "photo": step.photo} for step in spec.steps()}
+        return lambda: plan(spec, own, Listing(outputs, {str(step): own[step] for step in own}))
+
+    works = [work(planning(photos)) for photos in (20, 40, 80)]
+    assert works[2] - works[1] < 2.1 * (works[1] - works[0])

@@ -1,7 +1,8 @@
 """The whole pipeline on data/synthetic, by the runner as a user runs it.
 
-Its numbers are compared with those stored of the last run and what seeds change of them (`studies.measured.reference`), and with the
-bounds of `evaluate.table`, which are how good it must be at worst.  The run uses the project's own build/, so that what is
+Its numbers are compared with those stored of the last run and what seeds change of them (`studies.measured.reference`): of
+a small run, stage by stage, in `make test`; of the data set as it is in `make test-long`, also with the bounds of
+`evaluate.table`, which are how good it must be at worst.  The long run uses the project's own build/, so that what is
 current there is not made again: keys are by content.
 """
 
@@ -11,19 +12,27 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from factorlib.evaluate.table import SYNTHETIC, rows_of, table_text
 from factorlib.jsonfile import read_json
 from factorlib.runner.project import LIBRARY
-from studies.measured.reference import complaint, differences, read_stored
+from studies.measured.reference import complaint, differences, of_metrics, read_stored, run_small
 
 
+def test_every_number_of_a_small_run_is_as_stored_stage_by_stage(tmp_path):
+    moved = differences(run_small(tmp_path), read_stored("small"))
+    assert not moved, complaint(moved)
+
+
+@pytest.mark.long
 def test_every_number_is_as_stored_and_every_bound_holds():
     command = [sys.executable, "-m", "factorlib", "all", "--dataset", "synthetic"]
     environment = {k: v for k, v in os.environ.items() if k not in ("DATASET", "FACTORLIB_ROOT")}
     done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     metrics = read_json(LIBRARY / "build" / "synthetic" / "evaluate" / "metrics.json")
-    moved, rows = differences(metrics, read_stored()), rows_of(metrics, SYNTHETIC)
+    moved, rows = differences(of_metrics(metrics), read_stored()), rows_of(metrics, SYNTHETIC)
     assert not moved, complaint(moved)
     print(text := table_text(rows))
     assert all(row.ok for row in rows), f"data/synthetic misses its bounds:\n{text}"

@@ -14,7 +14,8 @@ from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
-from tests.faults.battered import done, make, start, wait_until
+from tests.faults.battered import make
+from tests.faults.test_nothing_lost import done, start, wait_until
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, reasons, state, write
 

@@ -1,0 +1,290 @@
+"""What a user can write, and what can befall build/, ends in words; `clean` deletes what the runner made alone."""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from itertools import cycle
+from pathlib import Path
+
+import pytest
+
+from factorlib.errors import InputError
+from factorlib.runner import verbs
+from factorlib.runner.project import LIBRARY
+from tests.faults.battered import call, make
+from tests.runner import toy
+from tests.runner.toy import files_of, state, write
+
+# ── DATASET ──────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+NO_NAMES = [
+    "", "/", "//", ".", "..", "./", "../", "../..", "store", "bench", "studies", "compare", "data/..", "build/store",
+    "loop", "data/loop", "loop/set", "x" * 256, "data/" + "y" * 300, "a/" * 3000, "nul\0", "data/nul\0/x", "\udcff",
+]  # fmt: skip
+NOBODYS = ["mine", "data", "nowhere", "elsewhere/set", "/nowhere/set", "../set", "data/elsewhere/../../set", "stages"]
+
+
+@pytest.fixture
+def checkout(project, monkeypatch):
+    """The toy, everything current, with a .git, links in circles and a folder beside the results; the user stands in it."""
+    write(project.root / ".git" / "HEAD", "ref: refs/heads/main")
+    write(project.build / "bench" / "times.json", "{}")
+    write(project.build / "mine" / "notes.txt", "not the runner's")
+    for folder in (project.root, project.root / "data"):
+        (folder / "loop").symlink_to("loop")
+    monkeypatch.chdir(project.root)
+    return project
+
+
+def everything(project):
+    """Every path of the checkout, but for the locks that tell who is using the store."""
+    paths = (Path(folder) / name for folder, names, files in os.walk(project.root) for name in names + files)
+    return sorted(str(p) for p in paths if p.name != "door.lock" and p != project.build / "store" / "tmp")
+
+
+def clean(project, dataset):
+    """What `make clean` returns or refuses with."""
+    try:
+        return verbs.clean(project, dataset)
+    except InputError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("verb", ["all", "validate", "clean"])
+def test_every_verb_refuses_what_is_no_name_and_deletes_nothing(checkout, verb):
+    before = everything(checkout)
+    for word in NO_NAMES:
+        last = call(checkout, verb, "--dataset", word)
+        assert last.startswith("error: ") and "DATASET" in last, word
+    os.mkdir(os.fsencode(checkout.root / "data") + b"/\xff\xfe")
+    assert "not UTF-8" in call(checkout, verb, "--dataset", os.fsdecode(b"\xff\xfe"))
+    os.rmdir(os.fsencode(checkout.root / "data") + b"/\xff\xfe")
+    assert everything(checkout) == before
+
+
+def test_clean_deletes_nobody_elses_what_a_user_put_beside_the_results_stays_and_no_link_is_followed(
+    checkout, tmp_path, capsys
+):
+    shutil.copytree(checkout.root / "data" / "set", tmp_path / "other" / "set")
+    home, precious = checkout.build / "set", tmp_path / "precious" / "photo.txt"
+    write(home / "notes.txt", "mine"), write(precious, "p"), write(checkout.root / "data" / "new" / "a.txt", "text")
+    for link in ("errors", "album"):
+        (home / link).symlink_to(precious.parent)
+    (home / "log.jsonl").unlink()
+    (home / "log.jsonl").symlink_to(precious)
+    before, trees = everything(checkout), files_of(checkout.build / "store" / "trees")
+    for word in [*NOBODYS, "new"]:
+        clean(checkout, word)
+    assert "holds the results of" in clean(checkout, str(tmp_path / "other" / "set")) and everything(checkout) == before
+    capsys.readouterr()
+    assert clean(checkout, "data/../data/set") == 0
+    text = capsys.readouterr().out
+    assert all(words in text for words in ("deleted build/set/total\n", "deleted build/set/dataset.txt\n"))
+    assert "left    build/set/notes.txt" in text and {"notes.txt", "album"} <= {p.name for p in home.iterdir()}
+    assert files_of(checkout.build / "store" / "trees") == trees
+    outside = [path for path in everything(checkout) if not path.startswith(str(checkout.build / "store"))]
+    assert clean(checkout, None) == 0 and everything(checkout) == outside
+    left = capsys.readouterr().out.splitlines()
+    assert {"deleted build/store", "left    build/bench", "left    build/mine"} <= {*left}
+    assert files_of(precious.parent) == {"photo.txt": b"p"}
+
+
+def test_a_data_set_that_is_gone_is_cleaned_by_its_path_and_a_home_that_is_a_link_is_not_taken(checkout, tmp_path):
+    (checkout.build / "set").rename(tmp_path / "moved")
+    (checkout.build / "set").symlink_to(tmp_path / "moved")
+    before = files_of(tmp_path / "moved")
+    assert "is a link" in clean(checkout, "set") and clean(checkout, None) == 0
+    assert files_of(tmp_path / "moved") == before
+    (checkout.build / "set").unlink()
+    (tmp_path / "moved").rename(checkout.build / "set")
+    shutil.rmtree(checkout.root / "data" / "set")
+    assert clean(checkout, str(checkout.root / "data" / "set")) == 0 and not (checkout.build / "set").exists()
+
+
+# ── pipeline.yaml and SET ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_name_in_the_pipeline_that_leads_elsewhere_is_refused(project):
+    for name in ("../up", ".", "a/b", "", "Store x", "log.jsonl", "errors"):
+        write(project.root / "pipeline.yaml", toy.PIPELINE + f"  ? {name!r}\n  : {{}}\n")
+        assert "stage" in call(project, "graph")
+    write(project.root / "pipeline.yaml", toy.PIPELINE.replace("gather: sizes.json", "gather: ../../sizes.json"))
+    assert "gathered file" in call(project, "graph")
+
+
+SETTINGS = [f"table.scale={value}" for value in (
+    ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, 2**63, "0x" + "f" * 30,
+    "[" * 500 + "]" * 500, "[" * 2400, "{a: " * 1000, "'\"\\0\"'", "'\"\\ud800\"'", "'", '"', "&a [*a]",
+    "!!python/object:os.system x", "'{a: 1, a: 2}'", "\udcff",
+)] + ["upper.sleep=.inf", "table" + ".a" * 3000 + "=1", "=", ".=", "table.=1", "\udcff.scale=1"]  # fmt: skip
+NO_FOLDERS = ["loop", "x" * 300, "a/" * 1000, "'\"\\0\"'", "3", "[1]", "{a: b}"]
+
+
+def test_a_setting_that_is_none_and_a_given_folder_that_leads_nowhere(checkout, capsys):
+    before = state(checkout)
+    for setting in SETTINGS:
+        last = call(checkout, "table", "--dataset", "set", "--set", setting)
+        text = capsys.readouterr().err if last == 1 else last
+        assert text.startswith("error: ") and len(text) < 600 and "Traceback" not in text, setting
+    assert state(checkout) == before and not list((checkout.build / "set").glob("errors/*"))
+    write(checkout.root / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {given: {start: [seed.txt]}}"))
+    for path in NO_FOLDERS:
+        assert call(checkout, "plan", "--dataset", "set", "--set", f"table.start={path}").startswith("error: "), path
+
+
+# ── what lies in build/ ──────────────────────────────────────────────────────────────────────────────────────────────
+
+DAMAGED = [
+    b"{", b"[]", b"5", b'"x"', b"\xff\xfe", b'{"total": 5}', b'{"total": "../../x"}', b'{"a": {"b": []}}', b"[" * 5000, b"",
+]  # fmt: skip
+OF_CACHES = [*DAMAGED, b'{"contents": [], "sources": 5}', b'{"contents": {"a": 5}, "sources": {"a": [[1], 2]}}']
+OF_MARKS = [b"", b"\xff\xfe", b"x" * 5000, b"a\0b", b"/nowhere/set\n"]
+
+
+def test_damaged_files_of_the_runner_lose_nothing_and_are_made_anew(project, caplog):
+    home, store = project.build / "set", project.build / "store"
+    mark, names = home / "current.json", sorted((store / "trees").iterdir())
+    before = json.loads(mark.read_bytes())
+    for content in DAMAGED:
+        mark.write_bytes(content)
+        caplog.clear()
+        if content:
+            last = call(project, "gc")
+            assert "current.json" in last and "delete it" in last and sorted((store / "trees").iterdir()) == names
+        assert set(state(project).values()) == {"current"} and "current.json" in caplog.text
+    assert make(project) == 0 and json.loads(mark.read_bytes()) == before
+    caches = {store / "cache" / name for name in ("files.json", "packages.json")} | {*(store / "cache").glob("*.json")}
+    for path, contents in [*((cache, OF_CACHES) for cache in caches), (home / "dataset.txt", OF_MARKS)]:
+        for content in contents:
+            path.write_bytes(content)
+            assert set(state(project).values()) == {"current"}, (path, content)
+
+
+LINES = [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b"[" * 5000]
+
+
+def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, capsys):
+    write(project.root / "data" / "set" / "a.txt", "odd")
+    assert make(project) == 0
+    logs = {path: path.read_bytes() for path in (project.build / "store" / "logs").glob("*.jsonl")}
+    for line in [b'{"event": "warning", "text": [1]}', *LINES]:
+        for log, content in logs.items():
+            log.write_bytes(line + b"\n" + content + line)
+        assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out, line
+    for log, content in logs.items():
+        log.write_bytes(b"\n".join([*LINES, content, *LINES]))
+    assert make(project, targets=["total"], force=True) == 0 and "damaged line" in caplog.text
+    assert (project.build / "set" / "total" / "log.txt").read_text() == "6", "what the report is handed"
+
+
+# ── rights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+CLOSED = [
+    "data/set", "data", "build", "build/set", "build/store/keys", "build/set/current.json", "pipeline.yaml", "stages",
+]  # fmt: skip
+
+
+def test_of_a_build_that_may_only_be_read_another_user_sees_everything_and_changes_nothing(
+    made_once, open_folder, as_other_user, capsys
+):
+    foreign = toy.copy(made_once, open_folder / "checkout")
+
+    def by_another(*words):
+        with as_other_user():
+            return call(foreign, *words)
+
+    assert call(foreign, "plan", "-d", "set") == 0  # loads what another user may not, as Python in root's home
+    for verb in ("plan", "why", "status", "validate"):
+        assert by_another(verb, "-d", "set") == 0 and capsys.readouterr().out
+    for words in ("table -d set --set table.scale=3", "all -d set --force", "gc", "clean", "clean -d set"):
+        last = by_another(*words.split()).lower()
+        assert last.startswith("error: ") and "permission denied" in last and str(foreign.build) in last, words
+    for place in CLOSED:
+        mode = (foreign.root / place).stat().st_mode
+        (foreign.root / place).chmod(0)
+        for verb in ("all", "plan", "status", "clean"):
+            last = by_another(verb, "-d", "set")
+            assert last == 0 or last.startswith("error: "), (place, verb)
+        (foreign.root / place).chmod(mode)
+
+
+# ── make and the shell: what is given as NAME=value reaches programs as it was written ───────────────────────────────
+
+PWNED = "pwned"
+TRIES = [
+    f"$(shell touch {PWNED})", f"${{shell touch {PWNED}}}", f"$$(touch {PWNED})", f"`touch {PWNED}`",
+    f'"; touch {PWNED}; "', f"'; touch {PWNED}; '", f"x; touch {PWNED}", f"x\ntouch {PWNED}",
+    f"$(eval X:=$(shell touch {PWNED}))", f"x #\\\n| touch {PWNED}", f"$(info $(shell touch {PWNED}))",
+]  # fmt: skip
+VARIABLES = ["DATASET", "SET", "FORCE", "DATASETS", "RECIPE", "PYTHON", "TORCH_INDEX", "EXTRAS", "OTHER"]
+OWN = ["PY", "STAGES", "GOAL"]  # the Makefile's own
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A checkout that has this one's code, and data sets and results of its own."""
+    root = tmp_path / "a checkout"
+    (root / "data").mkdir(parents=True)
+    for name in ("Makefile", "pipeline.yaml", "requirements.lock", "factorlib", "stages"):
+        (root / name).symlink_to(LIBRARY / name)
+    set_root = f"export FACTORLIB_ROOT={shlex.quote(str(root))}"
+    write(root / ".venv" / "bin" / "python", f'#!/bin/sh\n{set_root}\nexec {shlex.quote(sys.executable)} "$@"\n')
+    (root / ".venv" / "bin" / "python").chmod(0o755)
+    (root / ".venv" / "ready").touch()
+    return root
+
+
+def by_make(checkout, *words, **environment):
+    clean = {k: v for k, v in os.environ.items() if k not in (*VARIABLES, *OWN, "MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
+    options = {"capture_output": True, "text": True, "timeout": 600, "check": False}
+    done = subprocess.run(["make", *words], cwd=checkout, env=clean | environment, **options)
+    assert not [p for p in checkout.rglob(PWNED) if p.name == PWNED], "a command was run"
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def test_no_variable_is_expanded_on_its_way(made):
+    """Each variable holds another try, on the command line and, shifted, in the environment."""
+    spy = f"#!{sys.executable}\nimport json, os, sys\nprint(json.dumps([sys.argv[1:], dict(os.environ)]))\n"
+    write(made / ".venv" / "bin" / "python", spy)
+    for shift in (0, 5):
+        given = dict(zip((*VARIABLES, *OWN), cycle(TRIES[shift:] + TRIES[:shift])))
+        done = by_make(made, "plan", *(map("=".join, given.items()) if not shift else ()), **(given if shift else {}))
+        arguments, environment = json.loads(done.stdout)
+        assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
+        assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}
+
+
+def test_no_goal_and_no_path_to_python_is_a_command(made):
+    goals = ["x;touch pwned", "$(shell touch pwned)", "`touch pwned`", "x\ntouch pwned", '"$(touch pwned)"']
+    spy = made / ".venv" / "bin" / "python"
+    write(spy, "#!/bin/sh\nexit 1\n")
+    assert by_make(made, "--keep-going", *goals).returncode != 0
+    shutil.rmtree(made / ".venv")
+    (made / "factorlib").unlink()
+    write(made / "factorlib" / "setup.py", "print('set up')")
+    assert "set up" in by_make(made, "setup", f"PYTHON={TRIES[4]}").stdout
+
+
+def test_the_program_refuses_what_is_no_dataset_and_what_is_neither_0_nor_1(project, monkeypatch):
+    for words, verb, given in (
+        ("error: ", "plan", {"DATASET": TRIES[0], "SET": TRIES[1], "FORCE": "0"}),
+        ("FORCE: 'yes' is neither 1 nor 0", "plan", {"DATASET": "set", "FORCE": "yes"}),
+        ("DATASET", "clean", {"DATASET": ""}),  # an empty name is not none
+    ):
+        with monkeypatch.context() as patch:
+            for name, value in given.items():
+                patch.setenv(name, value)
+            assert words in str(call(project, verb))
+    assert (project.build / "set").exists() and not (project.root / PWNED).exists()
+
+
+def test_who_reads_no_further_gets_no_traceback():
+    """As `make params | head -1` does."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([sys.executable, "-m", "factorlib", "params"], cwd=LIBRARY, **pipes)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 1
