@@ -575,7 +575,7 @@ def test_a_stage_over_the_set_reads_no_damaged_view_and_verify_names_it(project,
     replace(in_set(project, "count/a.json"), '{"letters": 100}')
     assert not is_sound(project, "set")
     text = capsys.readouterr().out
-    assert all(words in text for words in ("build/set/count", "counts.json: other content", "a.json: other content"))
+    assert all(words in text for words in ("count (set)", "counts.json: other content", "a.json: other content"))
     assert new_runs(project, "table.scale=3") == ["table", "total"]
     assert in_set(project, "total/total.txt").read_text() == "total: 27"
     overwrite(tree_of(project, "total", "total.txt"), "4")
