@@ -20,8 +20,6 @@ from factorlib.results.materials import Reflectance, Vec3
 from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialErrors
 
 DARKEST = 0.01
-
-
 GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
 
 
@@ -63,12 +61,8 @@ def _albedos(material: Reflectance) -> Float[np.ndarray, "2 3"]:
     return np.array([material.diffuse, material.specular], float)
 
 
-def _floored(material: Reflectance) -> Float[np.ndarray, "2 3"]:
-    return np.maximum(_albedos(material), DARKEST)
-
-
 def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialError:
-    relative = (_albedos(estimate) * factor - _albedos(truth)) / _floored(truth)
+    relative = (_albedos(estimate) * factor - _albedos(truth)) / np.maximum(_albedos(truth), DARKEST)
     diffuse, specular = (tuple(float(v) for v in row) for row in relative)
     return MaterialError(roughness=abs(estimate.roughness - truth.roughness), diffuse=diffuse, specular=specular)
 
