@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
-from factorlib.export.mitsuba import ALL_BOUNCES
+from factorlib.export.scene import ALL_BOUNCES
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh

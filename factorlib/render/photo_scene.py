@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
+from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
 from factorlib.light.lobes import Lobes

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
 from factorlib.errors import InputError
-from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
+from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
