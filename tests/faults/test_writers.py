@@ -17,7 +17,6 @@ from factorlib.checkpoint import Checkpoint
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
-from factorlib.export.materialx import write_materialx
 from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
@@ -66,7 +65,6 @@ WRITERS = {
     "train and solve: what they go on from": ("a.pt", lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)})),
     "export: PLY": ("a.ply", lambda path: write_ply(path, MESH)),
     "export: glTF": ("a.glb", lambda path: write_glb(path, MESH, ["red", "wood"], GLOSS)),
-    "export: MaterialX": ("a.mtlx", lambda path: write_materialx(path, GLOSS)),
     "export: USD": ("a.usda", lambda path: write_usd_mesh(path, MESH)),
     "export and report: text": ("a.html", lambda path: write_text(path, "a page " * 500)),
     "generate: JPEG": ("a.jpg", lambda path: write_codes(path, CODES, {"Compression": "jpeg:95"})),
