@@ -19,10 +19,8 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.ball import ball, observed_cells
-from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import TAIL, Reflector
-from factorlib.render.resynthesis import Surroundings, resynthesised
+from factorlib.render.resynthesis import Surroundings, ball, light_of, observed_cells, resynthesised
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels

@@ -67,13 +67,6 @@ class PhotoScene(msgspec.Struct, frozen=True):
         return NEAR * float(np.linalg.norm(self.middle))
 
 
-def world_from_camera_frame(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """world_from_object of cam_from_object."""
-    turn = np.eye(4)
-    turn[:3, :3] = YUP_FROM_CAMERA
-    return turn @ matrix
-
-
 def light_entry(light: Light) -> dict[str, Any]:
     """The light as Mitsuba's `envmap`."""
     if isinstance(light, Lobes):

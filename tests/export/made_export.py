@@ -6,7 +6,11 @@ axis, turned, in a light fixed to the world.  The meshes are fine enough that th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -109,6 +113,24 @@ def make_exported(folder: Path) -> Inputs:
     (folder / "export").mkdir()
     export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
     return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
+
+
+@cache
+def shared() -> tuple[Inputs, TemporaryDirectory]:
+    """What `make_exported` returns, once for all tests of a session; who changes a file puts it back (`instead`)."""
+    folder = TemporaryDirectory()
+    return make_exported(Path(folder.name) / "set"), folder
+
+
+@contextmanager
+def instead(file: Path, write: Callable[[Path], object]) -> Iterator[None]:
+    """The file is written anew, and put back afterwards."""
+    before = file.read_bytes()
+    try:
+        write(file)
+        yield
+    finally:
+        file.write_bytes(before)
 
 
 def make_result(root: Path, name: str = "set") -> Path:

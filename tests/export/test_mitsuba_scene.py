@@ -16,9 +16,8 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
-from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import resynthesised
+from factorlib.render.resynthesis import light_of, resynthesised
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
