@@ -4,8 +4,6 @@ Writes metrics.json; its keys are documented in `factorlib.results.metrics`.  On
 the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

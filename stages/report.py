@@ -5,8 +5,6 @@ figures/photos/<photo>.png: photo, materials, re-synthesis and difference side b
 to run but for its section on cost.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

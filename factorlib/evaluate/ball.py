@@ -14,8 +14,6 @@ Glossy    ∫ L(i) D G / (4 n·o) di                  a wide lobe (α > 0.2) as 
 Mirror    L(2(n·o)n − o)                           averaged over the solid angle that a pixel of the ball sees
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -6,8 +6,6 @@ Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the dista
          a symmetry can be far off in rotation and right in every pixel: normals tell.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float
 

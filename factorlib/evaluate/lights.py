@@ -9,8 +9,6 @@ Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black score
 Null           a constant light of the true map's mean colour: a generous null, for no method knows that colour.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

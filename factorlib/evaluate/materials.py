@@ -9,8 +9,6 @@ Colours       diffuse and specular, relative to the truth, after one factor per 
 Null          a grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

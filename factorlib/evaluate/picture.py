@@ -8,8 +8,6 @@ Tone map   clip(exposure · radiance, 0, 1)^(1/2.2) with exposure = 1 / white: l
 White      the 99th percentile, over the mask, of the truth's brightest channel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import TypeVar

@@ -21,8 +21,6 @@ A pair's radiance is linear in its reflectances and in its light, so the factor 
 So balls are made without it, and it is stated for what is compared apart: materials × factor, lights / factor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """How good the metrics of data/synthetic must be at worst, and how numbers in metrics.json are named: by dotted paths."""
 
-from __future__ import annotations
-
 import msgspec
 
 

@@ -10,8 +10,6 @@ be written and would not be the same bytes twice.  The JSON is a `factorlib.expo
     max_depth  2 direct light alone, −1 all bounces
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 from typing import Any

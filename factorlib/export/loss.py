@@ -7,8 +7,6 @@ Difference |shown − solved| / max(solved, 0.001), per channel; in the sky a wh
            all lit pixels, channels and lights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -6,8 +6,6 @@ material exceeds that, one factor for the whole set moves from all reflectances 
 every light keeps its radiance, also across photos that share nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import msgspec

@@ -12,8 +12,6 @@ Different from what was solved: MaterialX's renderers shadow with the height-cor
 energy of multiple scattering (`factorlib.export.viewers`, measured by `factorlib.export.loss`).
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """The mesh files that scenes refer to: PLY and OpenUSD, a file for each part of one material."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

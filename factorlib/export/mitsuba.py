@@ -6,8 +6,6 @@ Light      As it was solved for: seen directly, without bounces between objects 
            `mitsuba -D max_depth=-1 scene.xml` traces them in any case; `-D spp=…` sets the samples per pixel.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path

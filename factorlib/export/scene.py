@@ -4,8 +4,6 @@ Frame     The camera frame turned y-up (x right, y up, z toward the viewer), the
           places an object.  Maps of lights have OpenEXR's layout in that frame, so that only a light fixed to the world turns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import msgspec

@@ -11,8 +11,6 @@ Meshes    A file for each part of one material, beside the PLY file, to which sc
 Names     Every prim bears the name of the data set as displayName; its identifier is that name where USD allows it (`identifiers`).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, count

@@ -12,8 +12,6 @@ All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, a
     usd                  UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader; V, not specified, as solved
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 

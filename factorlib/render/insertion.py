@@ -18,8 +18,6 @@ The ground is a disc about the object, its diffuse reflectance that which makes 
 the photo shows, and shadows fade out toward its rim.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

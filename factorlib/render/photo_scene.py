@@ -5,8 +5,6 @@ Light    infinitely far, given in the photo's camera axes (lobes) or in the worl
 Upright  the camera's own y.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ A ball is seen from the front, orthographically: every normal that faces the vie
 Frame: the photo's camera (x right, y down, z forward); a ball's view is (0, 0, −1).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A solved data set as pictures are made of it: scenes of its photos, their lights, grounds and materials."""
 
-from __future__ import annotations
-
 import logging
 
 import msgspec

@@ -1,7 +1,5 @@
 """What the other stages wrote, read when it is asked for, one photo at a time; a file that is not there reads as None."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from functools import cached_property

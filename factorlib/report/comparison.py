@@ -1,7 +1,5 @@
 """Two runs side by side: parameters, numbers, materials in standard errors, lights and re-syntheses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace

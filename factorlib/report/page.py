@@ -1,7 +1,5 @@
 """Everything on the page, gathered and set into the template."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Pictures inside the page: each photo beside its re-synthesis, balls, reflectance maps, lights, and one of the whole run."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any

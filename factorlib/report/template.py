@@ -1,7 +1,5 @@
 """Templates of this package: they hold the words of the pages, and this module prints numbers into them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files

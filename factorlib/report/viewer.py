@@ -5,8 +5,6 @@ The viewer evaluates the same integral as the pipeline, Lambert + GGX without sh
 interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any

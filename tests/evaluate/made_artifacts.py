@@ -3,8 +3,6 @@
 Each photo shows, side by side, one ball of each material it contains; the "estimate" is a perturbed truth.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

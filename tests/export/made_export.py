@@ -4,8 +4,6 @@ The first photo shows a ball, principal point off centre; the second an ellipsoi
 axis, turned, in a light fixed to the world.  The meshes are fine enough that their facets do not show.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache

@@ -190,6 +190,7 @@ def test_light_of_one_texel_gives_the_radiance_it_should(balls, form, name, mode
     (expected, ni), picture = closed_form(name, model), balls[form][name]
     lit = (ni > 0.3) & (picture[..., 3] == 1)
     error = np.abs(picture[lit][:, :3] / expected[lit] - 1)
+    print(f"{name}: difference {np.median(error):.2%} (median), {np.percentile(error, 90):.2%} (90th percentile)")
     assert lit.sum() >= 15 and np.median(error) < 0.01 and np.percentile(error, 90) < 0.05
     dark = binary_erosion(ni == 0, np.ones((5, 5)))
     assert form or picture[dark][:, :3].max() < 0.01 * picture[..., :3].max()  # nor is the light itself shown
@@ -217,6 +218,7 @@ def test_round_trip_shows_what_mitsuba_shows(exported):
         expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
         mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
         error = np.abs(found[photo][mask][:, :3] / expected[mask] - 1)
+        print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
         assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
         assert found[photo][mask][:, 3].min() == 1.0
 

@@ -1,7 +1,5 @@
 """The page for ordinary and odd sets: whole, self-contained, the same bytes, and drawn by a browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """The relighting viewer and the page's controls: what they are handed, and what a browser makes of it."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
